@@ -1,0 +1,51 @@
+# `make help` lists everything. Targets need only Python 3.11+, make and git; they make their own .venv.
+PYTHON ?= python3
+PROFILE ?= smoke
+OUT ?= build/$(PROFILE)
+ROOT ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+CODE := icrl4aht_data generation benchmarks tests
+
+.PHONY: help install demo generate verify test check format bench-env clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: $(STAMP) ## make .venv and install the project into it, editable, with the dev extra
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, found %d.%d" % sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: install ## from nothing to a verified dataset: generate smoke, verify, sample, draw (at most 10 minutes)
+	$(BIN)/python -m generation demo
+
+generate: install ## rebuild a dataset: PROFILE=smoke|mini|paper, OUT=folder
+	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT)
+
+verify: install ## verify a release, every byte and the physics: ROOT=folder (default: the bundled mini release)
+	$(BIN)/icrl4aht-data verify --deep $(ROOT)
+
+test: check ## lint, types and all tests
+	$(BIN)/python -m pytest
+
+check: install ## lint, formatting and types
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/ruff format --check $(CODE)
+	$(BIN)/basedpyright
+
+format: install ## format the code and mend what the linter can
+	$(BIN)/ruff check --fix $(CODE)
+	$(BIN)/ruff format $(CODE)
+
+bench-env: install ## environment steps/s beside JaxMARL's, JSON lines
+	$(BIN)/python -m benchmarks.bench_env
+
+clean: ## remove what the targets above made
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,1 @@
+"""Rebuilds the ICRL4AHT dataset from the environment and the teammates."""

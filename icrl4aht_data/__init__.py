@@ -1,0 +1,1 @@
+"""Learning histories of the ICRL4AHT benchmark: read, sample, fetch, verify."""

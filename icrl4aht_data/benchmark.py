@@ -1,0 +1,63 @@
+"""Facts of the benchmark: actions, tracks, splits, teammate families, and which layout belongs where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+from icrl4aht_data.errors import UnknownNameError
+
+ACTIONS = ("up", "down", "left", "right", "stay", "interact")
+"""Action names in id order (paper, App. D, table of dataset fields)."""
+
+UP, DOWN, LEFT, RIGHT, STAY, INTERACT = range(6)
+
+PUBLISHED_ACTIONS = ("right", "down", "left", "up", "stay", "interact")
+"""Action names in the id order of the published code's files; they are remapped on reading."""
+
+EGO, TEAMMATE = 0, 1
+"""Seats. The ego learns or is evaluated (drawn blue); the teammate is fixed and unknown (drawn red)."""
+
+TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
+    "teammate": {
+        "train": ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide"),
+        "test": ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide"),
+    },
+    "layout": {"train": ("asymm_both", "cramped_up"), "test": ("asymm_right", "cramped_down")},
+}
+"""track -> split -> layouts (paper, App. A)."""
+
+SPLITS = ("train", "test")
+
+FAMILIES = ("rl", "H1", "H2", "H3", "H4")
+"""Teammate families: learned policies, and the four heuristics (paper, App. B)."""
+
+HEURISTIC_KINDS = {
+    "recipe_aware_button": "H1",
+    "territory": "H2",
+    "assembly_line": "H3",
+    "utility_greedy": "H4",
+}
+"""teammate kind -> family, for the heuristics."""
+
+EPISODE_STEPS = 400
+"""Steps of an episode in training (paper, App. C)."""
+
+KEPT_STEPS = 100
+"""Steps kept of each training episode, and steps of an evaluation episode (paper, App. C and Sec. 4.3)."""
+
+
+def track_of(layout: str) -> str:
+    """The track whose train or test layouts include `layout` (short name)."""
+    for track, splits in TRACKS.items():
+        if any(layout in layouts for layouts in splits.values()):
+            return track
+    raise unknown("layout", layout, [name for splits in TRACKS.values() for s in splits.values() for name in s])
+
+
+def unknown(what: str, found: str, valid: Iterable[str]) -> UnknownNameError:
+    """The error for a name that does not exist: lists the valid names and the nearest one."""
+    names = list(dict.fromkeys(valid))
+    nearest = get_close_matches(str(found), names, n=1, cutoff=0.4)
+    hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
+    return UnknownNameError(f"unknown {what} {found!r}; valid: {', '.join(names)}.{hint}")

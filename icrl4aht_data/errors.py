@@ -1,0 +1,62 @@
+"""Every error this package raises on bad input, from one base class.
+
+Messages name the file or value, what was expected, what was found, and what to do next.
+"""
+
+from __future__ import annotations
+
+
+class Icrl4ahtError(Exception):
+    """Base class: catch this to catch every error of the package that is about input, not about a bug."""
+
+
+class UnknownNameError(Icrl4ahtError, ValueError):
+    """A layout, split, track, family, field or option that does not exist."""
+
+
+class EmptySelectionError(Icrl4ahtError, ValueError):
+    """The filter is valid but no history matches it."""
+
+
+class OptionError(Icrl4ahtError, ValueError):
+    """An option has an impossible value (a window longer than memory allows, mixed observation shapes)."""
+
+
+class LabelsMissingError(Icrl4ahtError):
+    """Expert actions were asked of histories that carry none."""
+
+
+class ReleaseError(Icrl4ahtError):
+    """A release folder cannot be read as it is: the base of the errors below."""
+
+
+class RootNotFoundError(ReleaseError, FileNotFoundError):
+    """The root is not a release folder."""
+
+
+class IndexFormatError(ReleaseError):
+    """meta/info.json, a line of meta/histories.jsonl, or a chunk table is malformed."""
+
+
+class ShardMissingError(ReleaseError, FileNotFoundError):
+    """A shard named by the index does not exist."""
+
+
+class ShardCorruptError(ReleaseError):
+    """A shard is truncated, is not HDF5, or a chunk's checksum is wrong."""
+
+
+class ShardMismatchError(ReleaseError):
+    """Index, chunk table and shard disagree."""
+
+
+class FormatTooNewError(ReleaseError):
+    """The release was written in a newer format than this package reads."""
+
+
+class FormatTooOldError(ReleaseError):
+    """The release was written in an older format than this package reads."""
+
+
+class TaskFormatError(Icrl4ahtError, ValueError):
+    """A task line is malformed."""

@@ -1,0 +1,1 @@
+"""The game: maps, state record, rules, observations, frames. Batch first, NumPy or JAX, no randomness of its own."""

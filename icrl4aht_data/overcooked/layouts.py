@@ -1,0 +1,287 @@
+"""The ten kitchens: maps, recipes, aliases, and the lookup tables computed from them.
+
+A cell is (x, y), x = column, y = row, origin top-left; its flat number is y * width + x.
+Map letters: W wall (= counter), A agent, X goal, B plate pile, P pot, R recipe indicator, L button,
+a digit = ingredient pile, a space = floor. Source: paper, App. A.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from icrl4aht_data.benchmark import ACTIONS, unknown
+
+EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
+"""What stands on a cell. A wall is a counter that holds one item; PLATES and PILE are endless."""
+
+FACINGS = ("up", "down", "right", "left")
+"""Facing names in the order of the observation's facing channels."""
+
+PLATE, COOKED = 1, 2
+"""Flag bits of an item byte. The counts of the layout's piled ingredients follow, two bits each."""
+
+WINDOW = 5
+"""Side of the square observation window."""
+
+NOWHERE = 255
+"""Table entry for 'no such column' or 'not in view'."""
+
+_LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
+_STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
+_TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """One kitchen. Everything below `indicates_delivery` is derived from the map.
+
+    Args:
+        name: the paper's short name.
+        alias: the environment name used by OvercookedV2 and by the published manifests.
+        rows: the map, one string a row, all of one width.
+        recipes: triples of ingredient ids; the current recipe is drawn uniformly from them.
+        indicates_delivery: whether the observation has the delivery channel.
+
+    Raises:
+        ValueError: if the map is not rectangular, has an unknown letter, has not exactly two agents, piles more
+            than three ingredient types (an item is one byte), or lets a chef reach the map's edge.
+    """
+
+    name: str
+    alias: str
+    rows: tuple[str, ...]
+    recipes: tuple[tuple[int, int, int], ...] = _TWO_RECIPES
+    indicates_delivery: bool = False
+
+    def __post_init__(self) -> None:
+        if len({len(row) for row in self.rows}) != 1:
+            raise ValueError(f"layout {self.name}: rows have widths {[len(row) for row in self.rows]}, expected one")
+        wrong = {c for row in self.rows for c in row if c not in _LETTERS and not c.isdigit()}
+        if wrong:
+            raise ValueError(f"layout {self.name}: unknown map letters {sorted(wrong)}")
+        if len(self.agent_cells) != 2:
+            raise ValueError(f"layout {self.name}: {len(self.agent_cells)} agents 'A' in the map, expected 2")
+        if self.cells > NOWHERE - 1 or len(self.ingredients) > 3:
+            raise ValueError(
+                f"layout {self.name}: {self.cells} cells and {len(self.ingredients)} piled ingredient types; "
+                f"a state record holds at most {NOWHERE - 1} cells and 3 types"
+            )
+        missing = {i for recipe in self.recipes for i in recipe} - set(self.ingredients)
+        if missing:
+            raise ValueError(f"layout {self.name}: recipes use ingredients {sorted(missing)} that have no pile")
+        for cell in self.walkable.nonzero()[0]:
+            x, y = cell % self.width, cell // self.width
+            if x in (0, self.width - 1) or y in (0, self.height - 1):
+                raise ValueError(f"layout {self.name}: a chef can stand on the map's edge at ({x}, {y})")
+
+    @property
+    def width(self) -> int:
+        return len(self.rows[0])
+
+    @property
+    def height(self) -> int:
+        return len(self.rows)
+
+    @property
+    def cells(self) -> int:
+        return self.width * self.height
+
+    @cached_property
+    def agent_cells(self) -> tuple[int, ...]:
+        """Cells of `A` in reading order: the ego's, then the teammate's."""
+        return tuple(i for i, c in enumerate("".join(self.rows)) if c == "A")
+
+    @cached_property
+    def kinds(self) -> np.ndarray:
+        """uint8 (cells,): what stands on each cell."""
+        return np.array([PILE if c.isdigit() else _LETTERS[c] for c in "".join(self.rows)], np.uint8)
+
+    @cached_property
+    def ingredients(self) -> tuple[int, ...]:
+        """Ids of the ingredients that have a pile, ascending. The k-th uses bits 2 + 2k of an item byte."""
+        return tuple(sorted({int(c) for c in "".join(self.rows) if c.isdigit()}))
+
+    @cached_property
+    def ingredient_types(self) -> int:
+        """n, the number of ingredient channels: highest pile id + 1."""
+        return max(self.ingredients) + 1
+
+    @cached_property
+    def piles(self) -> np.ndarray:
+        """uint8 (cells,): the item byte that a pile gives, 0 elsewhere."""
+        items = [PLATE if c == "B" else self.ingredient_item(int(c)) if c.isdigit() else 0 for c in "".join(self.rows)]
+        return np.array(items, np.uint8)
+
+    @cached_property
+    def channels(self) -> int:
+        """C, the number of observation channels: 25 + 5n, + 1 with the delivery indicator."""
+        return 25 + 5 * self.ingredient_types + int(self.indicates_delivery)
+
+    @property
+    def obs_shape(self) -> tuple[int, int, int]:
+        return (WINDOW, WINDOW, self.channels)
+
+    def ingredient_item(self, ingredient: int) -> int:
+        """The item byte of one piece of `ingredient`."""
+        return 4 << (2 * self.ingredients.index(ingredient))
+
+    def recipe_item(self, recipe: tuple[int, int, int]) -> int:
+        """The item byte of a recipe: the sum of its three ingredients, no flags."""
+        return sum(self.ingredient_item(i) for i in recipe)
+
+    @cached_property
+    def recipe_items(self) -> np.ndarray:
+        """uint8 (R,): the item bytes of the layout's recipes."""
+        return np.array([self.recipe_item(recipe) for recipe in self.recipes], np.uint8)
+
+    @cached_property
+    def rooms(self) -> tuple[np.ndarray, np.ndarray]:
+        """For each agent, the floor cells of the connected room in which the map puts it, ascending."""
+        first, second = (self._room(cell) for cell in self.agent_cells)
+        return first, second
+
+    def _room(self, start: int) -> np.ndarray:
+        seen, queue = {start}, deque([start])
+        while queue:
+            cell = queue.popleft()
+            for dx, dy in _STEP.values():
+                x, y = cell % self.width + dx, cell // self.width + dy
+                inside = 0 <= x < self.width and 0 <= y < self.height
+                neighbour = y * self.width + x
+                if inside and self.kinds[neighbour] == EMPTY and neighbour not in seen:
+                    seen.add(neighbour)
+                    queue.append(neighbour)
+        return np.array(sorted(seen), np.uint8)
+
+    @cached_property
+    def walkable(self) -> np.ndarray:
+        """bool (cells,): floor that some agent can reach."""
+        floor = np.zeros(self.cells, bool)
+        floor[np.concatenate(self.rooms)] = True
+        return floor
+
+    @cached_property
+    def ahead(self) -> np.ndarray:
+        """uint8 (cells, 4): the cell that an agent on a walkable cell faces, by facing; 0 elsewhere."""
+        table = np.zeros((self.cells, 4), np.uint8)
+        for facing, name in enumerate(FACINGS):
+            dx, dy = _STEP[name]
+            table[self.walkable, facing] = self.walkable.nonzero()[0] + dy * self.width + dx
+        return table
+
+    @cached_property
+    def moves(self) -> np.ndarray:
+        """uint8 (cells, 6): the cell that an action leads to when nobody is in the way."""
+        table = np.repeat(np.arange(self.cells, dtype=np.uint8)[:, None], len(ACTIONS), axis=1)
+        for action, name in enumerate(ACTIONS):
+            if name in FACINGS:
+                target = self.ahead[:, FACINGS.index(name)]
+                open_ = self.walkable & self.walkable[target]
+                table[open_, action] = target[open_]
+        return table
+
+    @cached_property
+    def pots(self) -> tuple[int, ...]:
+        """Cells of the pots, in reading order."""
+        return tuple(int(c) for c in (self.kinds == POT).nonzero()[0])
+
+    @cached_property
+    def buttons(self) -> tuple[int, ...]:
+        """Cells of the buttons, in reading order."""
+        return tuple(int(c) for c in (self.kinds == BUTTON).nonzero()[0])
+
+    @cached_property
+    def counters(self) -> tuple[int, ...]:
+        """Cells of the walls that some agent can face, in reading order: the only ones that can hold an item."""
+        reach = np.unique(self.ahead[self.walkable])
+        return tuple(int(c) for c in reach if self.kinds[c] == WALL)
+
+    @cached_property
+    def window(self) -> np.ndarray:
+        """int16 (cells, 25): the cells of the 5 x 5 window centred on a cell, in reading order; -1 outside the map."""
+        table = np.full((self.cells, WINDOW * WINDOW), -1, np.int16)
+        reach = WINDOW // 2
+        for cell in range(self.cells):
+            for k in range(WINDOW * WINDOW):
+                x, y = cell % self.width + k % WINDOW - reach, cell // self.width + k // WINDOW - reach
+                if 0 <= x < self.width and 0 <= y < self.height:
+                    table[cell, k] = y * self.width + x
+        return table
+
+    def __repr__(self) -> str:
+        return f"Layout({self.name!r}, {self.width}x{self.height}, C={self.channels})"
+
+
+_ALL = (
+    Layout("coord_simple", "grounded_coord_simple", ("WW2WWWWW", "W  WB  0", "R ALPA X", "W  WB  1", "WW2WWWWW")),
+    Layout(
+        "coord_ring",
+        "grounded_coord_ring",
+        (
+            "WWW2R2WWW",
+            "W       W",
+            "W WWLWW W",
+            "2 0   B 2",
+            "RAXAP X R",
+            "2 1   B 2",
+            "W WWLWW W",
+            "W       W",
+            "WWW2R2WWW",
+        ),
+    ),
+    Layout(
+        "test_simple",
+        "test_time_simple",
+        ("WW2WWWWW", "W  WB  0", "R AWPA X", "W  WB  1", "WW2WWWWW"),
+        indicates_delivery=True,
+    ),
+    Layout(
+        "test_wide",
+        "test_time_wide",
+        ("WWXBWW", "0 A  0", "1    1", "WPWPWW", "3 A  3", "W    W", "WWRWWW"),
+        indicates_delivery=True,
+    ),
+    Layout(
+        "demo_simple",
+        "demo_cook_simple",
+        ("WWWWWR2W0WW", "0      W  B", "W     APA X", "1      W  B", "WWWWWR2W1WW"),
+    ),
+    Layout(
+        "demo_wide",
+        "demo_cook_wide",
+        ("WWWWBXBWWWW", "WWW0 A 1WWW", "WWWWWPWWWWW", "W    A    W", "0  W3R3W  0", "W1WWWWWWW1W"),
+    ),
+    Layout(
+        "asymm_both",
+        "asymm_advantages_recipes_both",
+        ("WWWWWWWWW", "0 WXW01 X", "1   P   R", "R A PA  W", "WWWBWBWWW"),
+    ),
+    Layout(
+        "asymm_right",
+        "asymm_advantages_recipes_right",
+        ("WWWWWWWWW", "0 WXW01 X", "1   P   R", "W A PA  W", "WWWBWBWWW"),
+    ),
+    Layout("cramped_up", "cramped_room_up", ("WWPWW", "0A A1", "W   R", "WBWXW")),
+    Layout("cramped_down", "cramped_room_down", ("WBWXW", "0A A1", "W   R", "WWPWW")),
+)
+
+LAYOUTS: dict[str, Layout] = {layout.name: layout for layout in _ALL}
+"""Every layout of the benchmark by its short name."""
+
+_BY_ALIAS = {layout.alias: layout for layout in _ALL}
+
+
+def get_layout(name: str) -> Layout:
+    """The layout of that short name, or of that environment name.
+
+    Raises:
+        UnknownNameError: lists the valid names and the nearest.
+    """
+    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name)
+    if layout is None:
+        raise unknown("layout", name, [*LAYOUTS, *_BY_ALIAS])
+    return layout

@@ -1,0 +1,165 @@
+"""State records -> 5 x 5 observations, batch first, for NumPy and JAX alike (paper, App. A.2 and App. D).
+
+Channels, in order, for n ingredient types:
+
+    self        7 + n   position 1, facing 4 (up, down, right, left), item in hand 2 + n (plate, cooked, counts)
+    other       7 + n   the same of the other agent
+    static      6       wall, goal, pot, recipe indicator, button, plate pile
+    piles       n       ingredient piles
+    item        2 + n   the item on the cell, also a pot's content
+    recipe      2 + n   on recipe indicators always, on buttons while lit; plate and cooked stay 0
+    pot timer   1       0..19
+    delivery    1       on goal cells in the step after a correct delivery; only test_simple and test_wide
+
+Cells outside the map are all zero. Every value is an integer in 0..19: uint8 holds it without loss.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.overcooked.layouts import (
+    BUTTON,
+    GOAL,
+    INDICATOR,
+    NOWHERE,
+    PILE,
+    PLATES,
+    POT,
+    WALL,
+    WINDOW,
+    Layout,
+)
+from icrl4aht_data.overcooked.rules import look_up
+from icrl4aht_data.overcooked.state import Array, unpack
+
+_STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
+_VISIBLE = WINDOW * WINDOW
+_CENTRE = _VISIBLE // 2
+
+# A visible cell is one 32-bit word: item 8 bits, pot timer 5, recipe 6, delivery 1, static 6, piles 3 (one for each
+# piled type). A second word holds the agents on it: self 13 bits (position 1, facing 4, hand 8), then other 13 bits.
+_TIMER, _RECIPE, _DELIVERY, _FIXED, _PILES = 8, 13, 19, 20, 26
+_AGENT_BITS = 13
+
+
+class _Tables(NamedTuple):
+    view: np.ndarray  # int32 (cells, 25): column of the cell's changing word | fixed word's bits from _FIXED up
+    relative: np.ndarray  # uint8 (cells * cells,): where in the first cell's window the second one is, or NOWHERE
+    shift: np.ndarray  # uint32 (C,)
+    mask: np.ndarray  # uint32 (C,); 0 for an ingredient type without a pile
+    agent_channels: int
+
+
+def observe(layout: Layout, record: Array, agent: int) -> Array:
+    """What one agent sees.
+
+    Args:
+        layout: the kitchen.
+        record: uint8 (B, S), state records.
+        agent: 0 (ego) or 1 (teammate).
+
+    Returns:
+        uint8 (B, 5, 5, C). Equal bytes from NumPy and JAX.
+    """
+    return _expand(layout, *_words(layout, record, agent))
+
+
+def observe_both(layout: Layout, record: Array) -> Array:
+    """uint8 (B, 2, 5, 5, C): the observations of ego and teammate; see `observe`."""
+    xp = record.__array_namespace__()
+    ego, teammate = (_words(layout, record, agent) for agent in (0, 1))
+    return _expand(layout, *(xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True)))
+
+
+def _expand(layout: Layout, agents: Array, cells: Array) -> Array:
+    """uint32 (B, 25) twice -> uint8 (B, 5, 5, C): every channel is some bits of one of the two words."""
+    xp = agents.__array_namespace__()
+    tables = _tables(layout)
+    of_agents = xp.asarray(np.arange(layout.channels) < tables.agent_channels)
+    word = xp.where(of_agents, agents[..., None], cells[..., None])
+    values = xp.astype(word >> xp.asarray(tables.shift) & xp.asarray(tables.mask), xp.uint8)
+    return xp.reshape(values, (*agents.shape[:-1], *layout.obs_shape))
+
+
+def _words(layout: Layout, record: Array, agent: int) -> tuple[Array, Array]:
+    """uint32 (B, 25) twice: who is on each visible cell, and what is on it."""
+    xp = record.__array_namespace__()
+    tables = _tables(layout)
+    state = unpack(layout, record)
+    me, other = state.positions[..., agent], state.positions[..., 1 - agent]
+
+    view = look_up(tables.view, me)
+    changing = _changing_words(xp, state)
+    cells = xp.take_along_axis(changing, view & NOWHERE, axis=-1) | xp.astype(view >> 8, xp.uint32) << _FIXED
+
+    bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
+    bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
+    relative = look_up(tables.relative, xp.astype(me, xp.int32) * layout.cells + other)
+    place = xp.arange(_VISIBLE, dtype=xp.uint8)
+    none = xp.zeros_like(cells)
+    agents = xp.where(place == _CENTRE, bodies[..., agent, None], none) | xp.where(
+        place == relative[..., None], bodies[..., 1 - agent, None] << _AGENT_BITS, none
+    )
+    return agents, cells
+
+
+def _changing_words(xp, state) -> Array:
+    """uint32 (B, 3 + P + L + K): the words that cells point to: nothing, indicator, goal, pots, buttons, counters."""
+    recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << _RECIPE
+    delivered = xp.astype(state.delivered, xp.uint32)[..., None] << _DELIVERY
+    pots = xp.astype(state.pot_items, xp.uint32) | xp.astype(state.pot_timers, xp.uint32) << _TIMER
+    buttons = xp.astype(state.buttons > 0, xp.uint32) * recipe
+    return xp.concat(
+        [xp.zeros_like(recipe), recipe, delivered, pots, buttons, xp.astype(state.counters, xp.uint32)], axis=-1
+    )
+
+
+@lru_cache(maxsize=64)
+def _tables(layout: Layout) -> _Tables:
+    column = np.zeros(layout.cells, np.int32)
+    column[layout.kinds == INDICATOR] = 1
+    column[layout.kinds == GOAL] = 2
+    for number, cell in enumerate((*layout.pots, *layout.buttons, *layout.counters)):
+        column[cell] = 3 + number
+    fixed = np.zeros(layout.cells, np.int32)
+    for bit, kind in enumerate(_STATIC):
+        fixed |= (layout.kinds == kind) << bit
+    for bit, ingredient in enumerate(layout.ingredients):
+        pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
+        fixed |= pile.astype(np.int32) << (_PILES - _FIXED + bit)
+    inside = layout.window >= 0
+    view = np.where(inside, (column | fixed << 8)[layout.window], 0)
+
+    relative = np.full((layout.cells, layout.cells), NOWHERE, np.uint8)
+    cell, place = inside.nonzero()
+    relative[cell, layout.window[cell, place]] = place
+
+    agent = [(0, 1), *((1 + facing, 1) for facing in range(4)), *_item_bits(layout, 5)]
+    shifts = [
+        *agent,
+        *((_AGENT_BITS + shift, mask) for shift, mask in agent),
+        *((_FIXED + bit, 1) for bit in range(len(_STATIC))),
+        *_ingredient_bits(layout, _PILES, 1, 1),
+        *_item_bits(layout, 0),
+        (0, 0),
+        (0, 0),
+        *_ingredient_bits(layout, _RECIPE, 2, 3),
+        (_TIMER, 31),
+        *([(_DELIVERY, 1)] if layout.indicates_delivery else []),
+    ]
+    shift, mask = np.array(shifts, np.uint32).T
+    return _Tables(view.astype(np.int32), relative.reshape(-1), shift, mask, 2 * len(agent))
+
+
+def _item_bits(layout: Layout, first: int) -> list[tuple[int, int]]:
+    return [(first, 1), (first + 1, 1), *_ingredient_bits(layout, first + 2, 2, 3)]
+
+
+def _ingredient_bits(layout: Layout, first: int, width: int, mask: int) -> list[tuple[int, int]]:
+    """(shift, mask) of each ingredient channel; mask 0 for a type that has no pile."""
+    order = {ingredient: number for number, ingredient in enumerate(layout.ingredients)}
+    return [(first + width * order[i], mask) if i in order else (0, 0) for i in range(layout.ingredient_types)]

@@ -1,0 +1,211 @@
+"""The rules: one step of the game as a pure function of its arguments, batch first, for NumPy and JAX alike.
+
+Order of a step (paper, App. A.1; constants checked against OvercookedV2): move, collide, swap, agent 0 interacts,
+agent 1 interacts on what agent 0 left, timers tick, the recipe changes after a correct delivery.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.benchmark import INTERACT
+from icrl4aht_data.overcooked.layouts import BUTTON, COOKED, FACINGS, GOAL, PLATE, POT, WALL, Layout
+from icrl4aht_data.overcooked.state import (
+    BUTTON_STEPS,
+    POT_STEPS,
+    Array,
+    State,
+    ingredient_count,
+    pack,
+    unpack,
+)
+
+DELIVERY_REWARD = 20.0
+WRONG_DELIVERY_REWARD = -20.0
+PRESS_REWARD = -5.0
+SHAPED_PLACEMENT = 3.0
+SHAPED_DISH_PICKUP = 5.0
+SHAPED_PLATE_PICKUP = 3.0
+
+CORRECT, WRONG, PRESSED, PLACED, USEFUL_PLACEMENT, TOOK_DISH, USEFUL_DISH, USEFUL_PLATE = (1 << i for i in range(8))
+"""Event bits of one agent in one step: it delivered correctly or wrongly, pressed a button, put an ingredient into a
+pot (one the recipe still needs), took a dish out of a pot (the current recipe's), took a plate that is needed."""
+
+
+class Step(NamedTuple):
+    """What a step gives. `B` denotes the batch dimensions."""
+
+    state: Array  # uint8 (B, S)
+    reward: Array  # float32 (B,), the team's
+    shaped: Array  # float32 (B, 2), each agent's own, apart from the team's
+    events: Array  # uint8 (B, 2), event bits of each agent
+
+
+def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> Step:
+    """One step of the game.
+
+    Args:
+        layout: the kitchen.
+        record: uint8 (B, S), the state record.
+        actions: integers (B, 2), action ids 0..5 of ego and teammate.
+        next_recipe: uint8 (B,), item byte of the recipe that a correct delivery in this step brings.
+
+    Returns:
+        A `Step`. Equal bytes from NumPy and JAX.
+    """
+    xp = record.__array_namespace__()
+    state = unpack(layout, record)
+    state = _move(layout, xp, state, actions)
+    plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
+    recipe = state.recipe
+    events = []
+    for agent in (0, 1):
+        acting = actions[..., agent] == INTERACT
+        state, event = _interact(layout, xp, state, agent, acting, plates_in_hand)
+        events.append(event)
+    happened = xp.stack(events, axis=-1)
+    correct = xp.any((happened & CORRECT) > 0, axis=-1)
+
+    ticking = state.pot_timers > 0
+    pot_timers = xp.astype(state.pot_timers - ticking, xp.uint8)
+    pot_items = xp.astype(state.pot_items | ((ticking & (pot_timers == 0)) * np.uint8(COOKED)), xp.uint8)
+    buttons = xp.astype(state.buttons - (state.buttons > 0), xp.uint8)
+    state = state._replace(
+        pot_timers=pot_timers,
+        pot_items=pot_items,
+        buttons=buttons,
+        recipe=xp.where(correct, next_recipe, recipe),
+        delivered=xp.astype(correct, xp.uint8),
+    )
+    return Step(pack(state), team_reward(happened), shaped_rewards(happened), happened)
+
+
+def team_reward(events: Array) -> Array:
+    """float32 (B,): the team reward of the event bits uint8 (B, 2)."""
+    return _score(events, {CORRECT: DELIVERY_REWARD, WRONG: WRONG_DELIVERY_REWARD, PRESSED: PRESS_REWARD}).sum(axis=-1)
+
+
+def shaped_rewards(events: Array) -> Array:
+    """float32 (B, 2): the shaped rewards of the event bits uint8 (B, 2), each agent's own."""
+    return _score(
+        events,
+        {
+            USEFUL_PLACEMENT: SHAPED_PLACEMENT,
+            USEFUL_DISH: SHAPED_DISH_PICKUP,
+            USEFUL_PLATE: SHAPED_PLATE_PICKUP,
+        },
+    )
+
+
+def _score(events: Array, values: dict[int, float]) -> Array:
+    xp = events.__array_namespace__()
+    return sum(xp.astype((events & bit) > 0, xp.float32) * np.float32(value) for bit, value in values.items())
+
+
+def look_up(table: np.ndarray, index: Array) -> Array:
+    """`table[index]` with a NumPy table and an index of either library."""
+    xp = index.__array_namespace__()
+    return xp.take(xp.asarray(table), xp.astype(index, xp.int32), axis=0)
+
+
+def _move(layout: Layout, xp, state: State, actions: Array) -> State:
+    """Steps 1 to 3: a directional action always turns; nobody enters an occupied or contested cell."""
+    moved = look_up(layout.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
+    old0, old1 = state.positions[..., 0], state.positions[..., 1]
+    new0, new1 = moved[..., 0], moved[..., 1]
+    # With two agents, undoing until no conflict remains has a closed form: if the wanted cells coincide both go
+    # back, which leaves no further conflict; exchanging cells sends both back too.
+    undo = (new0 == new1) | ((new0 == old1) & (new1 == old0))
+    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # up, down, left, right -> up, down, right, left
+    return state._replace(
+        positions=xp.where(undo[..., None], state.positions, moved),
+        facings=xp.where(actions < len(FACINGS), facing, state.facings),
+    )
+
+
+def _interact(
+    layout: Layout, xp, state: State, agent: int, acting: Array, plates_in_hand: Array
+) -> tuple[State, Array]:
+    """Step 4 for one agent where `acting` (B,): the new state and the agent's event bits uint8 (B,)."""
+    hand = state.hands[..., agent]
+    place = xp.astype(state.positions[..., agent], xp.int32) * 4 + state.facings[..., agent]
+    faced = look_up(_faced(layout), place)
+    kind, pile, slot = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
+    # One-hot over the few cells that hold items: reads and writes without a scatter, in either library.
+    at_pot = (slot[..., None] == _range(xp, len(layout.pots))) & (acting & (kind == POT))[..., None]
+    at_counter = (slot[..., None] == _range(xp, len(layout.counters))) & (acting & (kind == WALL))[..., None]
+    at_button = (slot[..., None] == _range(xp, len(layout.buttons))) & (acting & (kind == BUTTON))[..., None]
+    content = _read(xp, at_pot, state.pot_items) | _read(xp, at_counter, state.counters)
+    timer = _read(xp, at_pot, state.pot_timers)
+
+    facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
+    empty_hand = hand == 0
+    takes_pile = acting & (pile > 0) & empty_hand
+    takes_item = facing_counter & (content > 0) & empty_hand
+    puts_down = facing_counter & (content == 0) & ~empty_hand
+    cooked = facing_pot & ((content & COOKED) > 0)
+    is_ingredient = (hand >> 2 > 0) & ((hand & PLATE) == 0)
+    adds = facing_pot & (timer == 0) & ~cooked & is_ingredient & (ingredient_count(content) < 3)
+    takes_dish = cooked & (hand == PLATE)
+    delivers = acting & (kind == GOAL) & ((hand & COOKED) > 0)
+    presses = acting & (kind == BUTTON) & empty_hand
+
+    dish = state.recipe | np.uint8(PLATE | COOKED)
+    correct = delivers & (hand == dish)
+    same_type = hand | hand << 1  # both count bits of the type in hand
+    useful_placement = adds & ((content & same_type) < (state.recipe & same_type))
+    useful_dish = takes_dish & ((content | PLATE) == dish)
+    pots_in_use = xp.sum(state.pot_items > 0, axis=-1, dtype=xp.uint8)
+    plates_lie = xp.any(state.counters == PLATE, axis=-1)
+    useful_plate = takes_pile & (pile == PLATE) & (plates_in_hand < pots_in_use) & ~plates_lie
+
+    nothing = xp.zeros_like(hand)
+    new_content = xp.where(adds, content + hand, xp.where(puts_down, hand, content))
+    new_content = xp.where(takes_item | takes_dish, nothing, new_content)
+    new_hand = xp.where(takes_pile, pile, xp.where(takes_item, content, hand))
+    new_hand = xp.where(takes_dish, content | np.uint8(PLATE), new_hand)
+    new_hand = xp.where(adds | puts_down | delivers, nothing, new_hand)
+    new_timer = xp.where(adds & (ingredient_count(new_content) == 3), nothing + np.uint8(POT_STEPS), timer)
+
+    other = state.hands[..., 1 - agent]
+    state = state._replace(
+        hands=xp.stack([new_hand, other] if agent == 0 else [other, new_hand], axis=-1),
+        pot_items=xp.where(at_pot, new_content[..., None], state.pot_items),
+        pot_timers=xp.where(at_pot, new_timer[..., None], state.pot_timers),
+        counters=xp.where(at_counter, new_content[..., None], state.counters),
+        buttons=xp.where(at_button & presses[..., None], np.uint8(BUTTON_STEPS), state.buttons),
+    )
+    bits = {
+        CORRECT: correct,
+        WRONG: delivers & ~correct,
+        PRESSED: presses,
+        PLACED: adds,
+        USEFUL_PLACEMENT: useful_placement,
+        TOOK_DISH: takes_dish,
+        USEFUL_DISH: useful_dish,
+        USEFUL_PLATE: useful_plate,
+    }
+    return state, sum(xp.astype(happened, xp.uint8) * np.uint8(bit) for bit, happened in bits.items())
+
+
+def _faced(layout: Layout) -> np.ndarray:
+    """int32 (cells * 4,): kind | pile << 8 | slot << 16 of the cell that an agent faces, by position and facing.
+
+    The slot is the cell's number among the pots, the counters or the buttons.
+    """
+    slot = np.zeros(layout.cells, np.int32)
+    for cells in (layout.pots, layout.counters, layout.buttons):
+        slot[list(cells)] = range(len(cells))
+    ahead = layout.ahead.reshape(-1)
+    return layout.kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | slot[ahead] << 16
+
+
+def _range(xp, n: int) -> Array:
+    return xp.arange(n, dtype=xp.int32)
+
+
+def _read(xp, at: Array, values: Array) -> Array:
+    """uint8 (B,): the one value (B, K) where `at`, else 0."""
+    return xp.sum(xp.where(at, values, xp.zeros_like(values)), axis=-1, dtype=xp.uint8)

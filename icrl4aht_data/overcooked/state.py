@@ -1,0 +1,172 @@
+"""The state record: everything the rules and the observations need, in S bytes (uint8), S = 22..40 by layout.
+
+Columns, in order (a = agent 0, the ego, then agent 1, the teammate):
+
+    positions   2   flat cell number, y * width + x
+    facings     2   0 up, 1 down, 2 right, 3 left
+    hands       2   item byte
+    recipe      1   item byte of the current recipe (three ingredients, no flags)
+    delivered   1   1 in the step after a correct delivery, else 0
+    pot_items   P   item byte of each pot's content, pots in reading order
+    pot_timers  P   steps until cooked, 0..20
+    buttons     L   steps that each button's lamp stays lit, 0..10
+    counters    K   item byte on each wall that an agent can face, in reading order
+
+Item byte: bit 0 plate, bit 1 cooked, then two bits (a count 0..3) for each ingredient type that has a pile, in
+ascending id. A recipe is the sum of three ingredients; a finished dish is recipe + plate + cooked.
+The clock is not part of the record: the rules do not depend on it.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.overcooked.layouts import COOKED, EMPTY, FACINGS, PLATE, Layout
+
+Array = Any
+"""A NumPy or JAX array: the code in this package runs on either, through `__array_namespace__`."""
+
+POT_STEPS = 20
+"""Steps that a full pot cooks (paper, App. A.1)."""
+
+BUTTON_STEPS = 10
+"""Timer that a press sets (paper, App. A.1)."""
+
+
+class State(NamedTuple):
+    """A state record's columns, uint8. `B` denotes the batch dimensions, which come first everywhere."""
+
+    positions: Array  # (B, 2)
+    facings: Array  # (B, 2)
+    hands: Array  # (B, 2)
+    recipe: Array  # (B,)
+    delivered: Array  # (B,)
+    pot_items: Array  # (B, P)
+    pot_timers: Array  # (B, P)
+    buttons: Array  # (B, L)
+    counters: Array  # (B, K)
+
+
+def columns(layout: Layout) -> State:
+    """Where each field stands in the record: slices, and an int for the two single columns."""
+    pots, buttons, counters = len(layout.pots), len(layout.buttons), len(layout.counters)
+    ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
+    rest = [slice(a, b) for a, b in pairwise(ends)]
+    return State(slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, *rest)
+
+
+def record_size(layout: Layout) -> int:
+    """S, the bytes of a state record."""
+    return 8 + 2 * len(layout.pots) + len(layout.buttons) + len(layout.counters)
+
+
+def unpack(layout: Layout, record: Array) -> State:
+    """uint8 (B, S) -> its columns."""
+    return State(*(record[..., column] for column in columns(layout)))
+
+
+def pack(state: State) -> Array:
+    """The columns -> uint8 (B, S)."""
+    xp = state.positions.__array_namespace__()
+    single = (state.recipe[..., None], state.delivered[..., None])
+    return xp.concat([*state[:3], *single, *state[5:]], axis=-1)
+
+
+def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Array:
+    """The record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
+
+    Args:
+        layout: the kitchen.
+        positions: uint8 (B, 2), flat cells of the two agents.
+        facings: uint8 (B, 2).
+        recipe: uint8 (B,), item byte of the first recipe.
+
+    Returns:
+        uint8 (B, S).
+    """
+    xp = positions.__array_namespace__()
+    empty = xp.zeros((*recipe.shape, record_size(layout) - 7), dtype=xp.uint8)
+    hands = xp.zeros_like(positions)
+    return xp.concat([positions, facings, hands, recipe[..., None], empty], axis=-1)
+
+
+def faults(layout: Layout, record: np.ndarray) -> list[str]:
+    """What is impossible in the records uint8 (B, S); empty if every value is in range.
+
+    Checks ranges only (positions on floor and apart, item bytes that the rules can make, timers, recipe made of three
+    ingredients), not whether the state can be reached.
+    """
+    state = unpack(layout, record)
+    items = possible_items(layout)
+    in_hand = items & ((np.arange(256) & PLATE > 0) | (ingredient_count(np.arange(256)) <= 1))
+    in_pot = items & (np.arange(256) & PLATE == 0)
+    recipes = items & (np.arange(256) & (PLATE | COOKED) == 0) & (ingredient_count(np.arange(256)) == 3)
+    cooking = state.pot_timers > 0
+    checks = {
+        "a position that is not reachable floor": ~layout.walkable[np.minimum(state.positions, layout.cells - 1)]
+        | (state.positions >= layout.cells),
+        "two agents on one cell": state.positions[..., 0] == state.positions[..., 1],
+        "an unknown facing": state.facings >= len(FACINGS),
+        "an impossible item in hand": ~in_hand[state.hands],
+        "an impossible item on a counter": ~in_hand[state.counters],
+        "an impossible item in a pot": ~in_pot[state.pot_items],
+        "an impossible recipe": ~recipes[state.recipe],
+        "a delivery flag that is not 0 or 1": state.delivered > 1,
+        "a pot timer above its limit": state.pot_timers > POT_STEPS,
+        "a pot that cooks without three raw ingredients": cooking
+        & ((ingredient_count(state.pot_items) != 3) | (state.pot_items & COOKED > 0)),
+        "a button timer above its limit": state.buttons > BUTTON_STEPS,
+    }
+    return [what for what, wrong in checks.items() if np.any(wrong)]
+
+
+def ingredient_count(item: Array) -> Array:
+    """The number of ingredients in an item byte."""
+    return ((item >> 2) & 3) + ((item >> 4) & 3) + ((item >> 6) & 3)
+
+
+def possible_items(layout: Layout) -> np.ndarray:
+    """bool (256,): the item bytes that the rules can make: nothing, a plate, 1..3 ingredients, soups, dishes."""
+    item = np.arange(256)
+    count = ingredient_count(item)
+    known = item >> (2 + 2 * len(layout.ingredients)) == 0
+    raw = (item & (PLATE | COOKED) == 0) & (count <= 3)
+    soup = (item & COOKED > 0) & (count == 3)
+    return known & (raw | soup | (item == PLATE))
+
+
+def describe_item(layout: Layout, item: int) -> str:
+    """An item byte in words: 'nothing', 'plate', '0', '0+0+1', 'cooked 0+0+0', 'dish 1+1+1'."""
+    pieces = [str(i) for k, i in enumerate(layout.ingredients) for _ in range(item >> (2 + 2 * k) & 3)]
+    content = "+".join(pieces)
+    if item & COOKED:
+        return ("dish " if item & PLATE else "cooked ") + content
+    return "plate" if item & PLATE else content or "nothing"
+
+
+def draw_text(layout: Layout, record: np.ndarray) -> str:
+    """One record uint8 (S,) as text: the map with agents as arrows, and what is held where. For people and messages."""
+    state = unpack(layout, record)
+    grid = [" " if kind == EMPTY else c for kind, c in zip(layout.kinds, "".join(layout.rows), strict=True)]
+    for agent in (0, 1):
+        grid[int(state.positions[agent])] = "^v><"[int(state.facings[agent])]
+    rows = ["".join(grid[y * layout.width : (y + 1) * layout.width]) for y in range(layout.height)]
+    held = [describe_item(layout, int(item)) for item in state.hands]
+    things = [
+        f"({cell % layout.width}, {cell // layout.width}) {describe_item(layout, int(item))}"
+        for cell, item in [
+            *zip(layout.pots, state.pot_items, strict=True),
+            *zip(layout.counters, state.counters, strict=True),
+        ]
+        if item
+    ]
+    lines = [
+        f"recipe {describe_item(layout, int(state.recipe))}",
+        f"ego holds {held[0]}, teammate holds {held[1]}",
+        f"pot timers {state.pot_timers.tolist()}, buttons {state.buttons.tolist()}",
+        *things,
+    ]
+    return "\n".join([*rows, *lines])
