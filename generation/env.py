@@ -95,7 +95,11 @@ class Environment:
 
     def next_recipe(self, state: EnvState) -> UInt8[Array, " N"]:
         """The recipe that a correct delivery in this step would bring."""
-        return self._recipe(_fold(_fold(state.key, state.episode), state.clock + 1))
+        return self._recipe(_fold(self.episode_key(state), state.clock + 1))
+
+    def episode_key(self, state: EnvState) -> Key[Array, " N"]:
+        """The key of each running episode: a function of the environment's key and the episode's number."""
+        return _fold(state.key, state.episode)
 
     def first_record(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> UInt8[Array, "N S"]:
         """Start records: recipe and facings uniform; agents placed one after the other, each uniformly on a free

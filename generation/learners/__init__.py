@@ -1,0 +1,1 @@
+"""The one network and the one PPO; each algorithm adds only what differs."""

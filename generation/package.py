@@ -1,0 +1,87 @@
+"""Artefacts -> a release folder: the best streams of each task, labelled."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from generation import record
+from generation.collect import METADATA
+from generation.curate import best_streams, relabel
+from generation.learners.checkpoint import load_policy
+from generation.profiles import Profile
+from icrl4aht_data.release import NewHistory, NewTask, write_release
+from icrl4aht_data.schema import Kind
+from icrl4aht_data.tasks import Task
+
+DATA_VERSION = "0.1.0"
+
+
+def package(
+    artefacts: Path,
+    target: Path,
+    tasks: Sequence[Task],
+    profile: Profile,
+    kind: Kind,
+    done: Callable[[Task], None] = lambda task: None,
+) -> Path:
+    """Write a release of these tasks' artefacts; see `write_release`."""
+    new = [_new_task(artefacts / task.task_id, task, profile) for task in tasks]
+    return write_release(target, kind, new, data_version=DATA_VERSION, card=_card(profile, tasks), done=done)
+
+
+def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
+    metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+    provenance = {
+        "profile": metadata["profile"],
+        "ego": metadata["ego"],
+        "ego_hash": metadata["ego_hash"],
+        "code_version": metadata["code_version"],
+        "streams_recorded": metadata["ego"]["environments"],
+        "streams_kept": profile.keep,
+        "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
+    }
+    return NewTask(task, provenance, lambda: _histories(folder, task, profile))
+
+
+def _histories(folder: Path, task: Task, profile: Profile) -> list[NewHistory]:
+    arrays = record.Histories(
+        **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in record.Histories._fields}
+    )
+    streams = best_streams(np.asarray(arrays.rewards), profile.keep)
+    network, params, _ = load_policy(folder)
+    labels = relabel(task.layout, network, params, arrays.state[streams])
+    dones = record.dones(arrays.actions.shape[1])
+    return [
+        NewHistory(
+            int(stream),
+            {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}
+            | {"dones": dones, "expert_actions": expert},
+        )
+        for stream, expert in zip(streams, labels, strict=True)
+    ]
+
+
+def _card(profile: Profile, tasks: Sequence[Task]) -> str:
+    layouts = ", ".join(dict.fromkeys(task.layout.name for task in tasks))
+    return f"""# ICRL4AHT learning histories, profile `{profile.name}`
+
+Learning histories of ego agents (recurrent PPO, from scratch) in OvercookedV2, each beside one fixed teammate.
+
+* Layouts: {layouts}.
+* Tasks: {len(tasks)}; of each, the best {profile.keep} of {profile.ego.environments} streams by end + improvement.
+* Each history: {profile.ego.episodes} episodes, the first 100 of 400 steps of each; T = {profile.ego.episodes * 100:,}.
+* Expert actions: the final ego's greedy action, its recurrent state carried through the episode.
+
+## What it is not
+
+* The teammates are presets of the heuristic H4 (`utility_greedy`), not the learned ones of the paper's training split,
+  and the presets act alike. H4 is also a family of the benchmark's test side: do not report teammate generalisation
+  from a model trained on this release.
+* On coord_simple and test_simple the ego's room shares nothing with the teammate's: the ego cannot raise the return, it
+  can only avoid the button's cost. A flat, high curve there is the teammate's work.
+* Streams of one task come from one learner: they are not independent runs.
+"""

@@ -1,0 +1,101 @@
+"""Profiles: everything that sizes a rebuild, in TOML. Unknown keys fail."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from generation.learners.network import Widths
+from generation.learners.ppo import PPOConfig
+from generation.teammates.registry import heuristic_teammate
+from icrl4aht_data.benchmark import track_of, unknown
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.tasks import Task, make_task
+
+FOLDER = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How large a rebuild is."""
+
+    name: str
+    ego: PPOConfig
+    keep: int  # streams of each task that the release keeps, best first
+    layouts: tuple[str, ...]
+    presets: tuple[str, ...]  # of the teammate H4 utility_greedy
+
+    def tasks(self) -> list[Task]:
+        """One training task per layout and teammate, each with a seed of its own."""
+        pairs = [(layout, number, preset) for layout in self.layouts for number, preset in enumerate(self.presets)]
+        return [
+            make_task(track_of(layout), "train", layout, heuristic_teammate("utility_greedy", preset, number), seed)
+            for seed, (layout, number, preset) in enumerate(pairs)
+        ]
+
+    @property
+    def ego_hash(self) -> str:
+        """Of what decides an artefact beyond its task; a change makes artefacts anew."""
+        return hashlib.sha256(json.dumps(asdict(self.ego), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def names() -> list[str]:
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load_profile(name: str) -> Profile:
+    """A profile by name, or by the path of a TOML file.
+
+    Raises:
+        UnknownNameError: for a name that is neither.
+        OptionError: for unknown or missing keys and for values that do not fit; names the file and the key.
+    """
+    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    if not path.is_file():
+        raise unknown("profile", name, names())
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        _only(content, "", {"ego", "release", "tasks"})
+        _only(content["release"], "release.", {"keep"})
+        _only(content["tasks"], "tasks.", {"layouts", "presets"})
+        tasks = content["tasks"]
+        profile = Profile(
+            name=path.stem,
+            ego=_ego(dict(content["ego"])),
+            keep=content["release"]["keep"],
+            layouts=tuple(get_layout(layout).name for layout in tasks["layouts"]),
+            presets=tuple(tasks["presets"]),
+        )
+        profile.tasks()
+    except tomllib.TOMLDecodeError as error:
+        raise OptionError(f"{path}: not TOML: {error}") from error
+    except KeyError as error:
+        raise OptionError(f"{path}: missing key {error}") from error
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"{path}: {error}") from error
+    if not 0 < profile.keep <= profile.ego.environments:
+        raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
+    if profile.ego.episodes < 5:
+        raise OptionError(
+            f"{path}: ego.total_steps gives {profile.ego.episodes} episodes a stream, expected at least 5"
+        )
+    return profile
+
+
+def _ego(table: dict[str, Any]) -> PPOConfig:
+    _only(table, "ego.", {field.name for field in fields(PPOConfig)})
+    if "widths" in table:
+        _only(table["widths"], "ego.widths.", {field.name for field in fields(Widths)})
+        table["widths"] = Widths.from_table(table["widths"])
+    return PPOConfig(**table)
+
+
+def _only(table: dict[str, Any], prefix: str, known: set[str]) -> None:
+    for key in table:
+        if key not in known:
+            raise unknown("key", prefix + key, [prefix + name for name in sorted(known)])

@@ -1,0 +1,3 @@
+from icrl4aht_data.cli import main
+
+main()

@@ -1,0 +1,156 @@
+"""`icrl4aht-data`: thin commands; the only place where exceptions become exit codes.
+
+Exit codes: 0 done and, for `verify`, whole; 1 an error, or a release that is not whole; 2 a misused command.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.errors import Icrl4ahtError
+
+_root = click.argument("root", required=False, type=click.Path(path_type=Path))
+_json = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+
+
+def _filters(command: Any) -> Any:
+    for name in ("teammate-kind", "teammate-family", "track", "split", "layout"):
+        command = click.option(f"--{name}", multiple=True, help=f"Only this {name}; may be given again.")(command)
+    return command
+
+
+def _load(root: Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
+    return load_icrl4aht(root, **{name: list(values) or None for name, values in filters.items()})  # type: ignore[arg-type]
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="icrl4aht-data")
+def cli() -> None:
+    """Learning histories of the ICRL4AHT benchmark. ROOT is a release folder; the bundled mini release by default."""
+
+
+@cli.command("list")
+@_root
+@_filters
+@_json
+def list_(root: Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
+    """List the tasks of a release: histories, transitions, returns at the start and at the end of learning."""
+    dataset = _load(root, filters)
+    tasks: dict[str, dict[str, Any]] = {}
+    for entry in dataset.entries:
+        row = tasks.setdefault(
+            entry.task_id,
+            {
+                "task_id": entry.task_id,
+                "layout": entry.layout,
+                "track": entry.track,
+                "split": entry.split,
+                "teammate": f"{entry.teammate_family}/{entry.teammate_kind}",
+                "histories": 0,
+                "transitions": 0,
+                "return_start": 0.0,
+                "return_end": 0.0,
+            },
+        )
+        row["histories"] += 1
+        row["transitions"] += entry.T
+        for name in ("return_start", "return_end"):
+            row[name] += (getattr(entry, name) - row[name]) / row["histories"]
+    if as_json:
+        click.echo(json.dumps(list(tasks.values()), indent=2))
+        return
+    table = Table("layout", "track", "split", "teammate", "histories", "transitions", "return", "task")
+    for row in tasks.values():
+        returns = f"{row['return_start']:.1f} -> {row['return_end']:.1f}"
+        table.add_row(
+            *(row[name] for name in ("layout", "track", "split", "teammate")),
+            str(row["histories"]),
+            f"{row['transitions']:,}",
+            returns,
+            row["task_id"],
+        )
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+@cli.command()
+@_root
+@_filters
+@click.option("--history", "history_id", type=int, help="Show one history instead.")
+@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw the learning curves into this PNG.")
+@_json
+def show(
+    root: Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
+) -> None:
+    """Show what a release or one of its histories is."""
+    dataset = _load(root, filters)
+    if history_id is None:
+        facts = {"root": str(dataset.root), **dataset.info}
+    else:
+        dataset = dataset.select([history_id])
+        facts = {
+            **dataset[0].entry.to_json(),
+            "environment": dataset.recover_environment(history_id),
+            "teammate": dataset.recover_teammate(history_id),
+        }
+    if plot is not None:
+        from icrl4aht_data.figures import plot_learning_curves
+
+        plot_learning_curves(dataset, plot)
+        facts["plot"] = str(plot)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+        return
+    if history_id is None:
+        click.echo(repr(dataset))
+    for name, value in facts.items():
+        click.echo(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
+
+
+@cli.command()
+@_root
+@click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@_json
+def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
+    """Verify a release: hashes, chunk checksums, counts, ranges. Exits with 1 if anything is wrong."""
+    from icrl4aht_data.verify import verify_release
+
+    console = Console(stderr=True)
+    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
+        tasks = {name: bars.add_task(name, total=None) for name in ("files", "histories")}
+        report = verify_release(
+            root, deep=deep, advance=lambda what, done, total: bars.update(tasks[what], completed=done, total=total)
+        )
+    if as_json:
+        click.echo(json.dumps(report.to_json(), indent=2))
+    else:
+        for finding in report.findings:
+            click.echo(f"{finding.file}: {finding.problem}")
+        if not quiet:
+            looked = (
+                f"{report.files} files, {report.chunks} chunks, {report.histories} histories, "
+                f"{report.transitions:,} transitions"
+            )
+            verdict = "whole" if report.ok else f"{len(report.findings)} problems"
+            click.echo(f"{report.root}: {verdict}; checked {looked}{' and their physics' if deep else ''}")
+    sys.exit(0 if report.ok else 1)
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        cli()
+    except Icrl4ahtError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except BrokenPipeError:
+        sys.exit(1)

@@ -1,0 +1,363 @@
+"""`load_icrl4aht`, and what it gives: a `Dataset` of learning histories with lazy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from icrl4aht_data.benchmark import EGO, unknown
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError
+from icrl4aht_data.index import Index, read_index
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.release import episode_returns
+from icrl4aht_data.schema import FIELDS, TASKS, Entry, Field
+from icrl4aht_data.shard import Shard
+from icrl4aht_data.tasks import Task, read_tasks
+
+if TYPE_CHECKING:
+    from icrl4aht_data.sampling import ADSampler, ContextOrder, DPTSampler
+
+ObsDtype = Literal["float32", "uint8", "state"]
+OBS_DTYPES: tuple[ObsDtype, ...] = ("float32", "uint8", "state")
+"""How observations are presented: float32 (the paper's contract), uint8 (the same integers), or the state records
+from which `icrl4aht_data.overcooked.observe` renders them."""
+
+MINI = Path(__file__).parent / "mini"
+"""The bundled mini release."""
+
+_RENDER_ROWS = 4096  # rendering in slabs keeps the working memory small
+
+Names = str | Sequence[str] | None
+
+
+def load_icrl4aht(
+    root: str | Path | None = None,
+    *,
+    split: Names = None,
+    layout: Names = None,
+    track: Names = None,
+    teammate_family: Names = None,
+    teammate_kind: Names = None,
+    task_id: Names = None,
+    obs_dtype: ObsDtype = "float32",
+) -> Dataset:
+    """Open a release and select histories.
+
+    Args:
+        root: a release folder; the bundled mini release by default.
+        split: "train" or "test".
+        layout: a short name (coord_simple) or an environment name (grounded_coord_simple); or several.
+        track: "teammate" or "layout".
+        teammate_family: "rl" or "H1".."H4".
+        teammate_kind: an algorithm or a heuristic, such as "utility_greedy".
+        task_id: one task's histories, or several tasks'.
+        obs_dtype: see `OBS_DTYPES`.
+
+    Raises:
+        UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
+        EmptySelectionError: if nothing matches; says what exists.
+        ReleaseError: if the release cannot be read.
+    """
+    if obs_dtype not in OBS_DTYPES:
+        raise unknown("obs_dtype", obs_dtype, OBS_DTYPES)
+    index = read_index(MINI if root is None else Path(root))
+    everything = np.array([entry.history_id for entry in index.entries])
+    dataset = Dataset(index, everything, obs_dtype, _Shards(index))
+    return dataset.filter(
+        split=split,
+        layout=layout,
+        track=track,
+        teammate_family=teammate_family,
+        teammate_kind=teammate_kind,
+        task_id=task_id,
+    )
+
+
+class _Shards:
+    """The release's shards, opened when first read."""
+
+    def __init__(self, index: Index) -> None:
+        self._index = index
+        self._open: dict[str, Shard] = {}
+
+    @cached_property
+    def _members(self) -> dict[str, list[Entry]]:
+        members: dict[str, list[Entry]] = {}
+        for entry in self._index.entries:
+            members.setdefault(entry.shard, []).append(entry)
+        return members
+
+    def names(self) -> list[str]:
+        return list(self._members)
+
+    def open(self, name: str) -> Shard:
+        if name not in self._open:
+            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], self._members[name])
+        return self._open[name]
+
+
+class Dataset:
+    """A selection of learning histories. Opening one reads the index alone; arrays are read when asked for.
+
+    `len(dataset)` counts histories, `dataset[i]` is the i-th, iteration yields them in order.
+    """
+
+    def __init__(self, index: Index, ids: np.ndarray, obs_dtype: ObsDtype, shards: _Shards) -> None:
+        self.index = index
+        self.ids = ids
+        self.obs_dtype: ObsDtype = obs_dtype
+        self._shards = shards
+
+    @property
+    def root(self) -> Path:
+        return self.index.root
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """meta/info.json: versions, kind, environment, totals."""
+        return self.index.info
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, position: int) -> History:
+        return self.history(int(self.ids[position]))
+
+    def __iter__(self) -> Iterator[History]:
+        return (self.history(int(i)) for i in self.ids)
+
+    def __repr__(self) -> str:
+        entries = self.entries
+        layouts = list(dict.fromkeys(entry.layout for entry in entries))
+        tasks = len({entry.task_id for entry in entries})
+        return (
+            f"Dataset({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
+            f"{sum(entry.T for entry in entries):,} transitions, obs {self.obs_dtype}; "
+            f"{self.info['kind']} release {self.info['data_version']} at {self.root})"
+        )
+
+    @cached_property
+    def entries(self) -> list[Entry]:
+        """The index entries of the selection."""
+        return [self.index.entry(int(i)) for i in self.ids]
+
+    def filter(self, **wanted: Names) -> Dataset:
+        """The histories of this selection whose fields have one of the wanted values; see `index.QUERY_FIELDS`."""
+        matching = self.index.query(**wanted)
+        ids = self.ids[np.isin(self.ids, matching)]
+        if not len(ids):
+            raise EmptySelectionError(f"{self.root}: no history of this selection has {wanted}; it is {self!r}")
+        return Dataset(self.index, ids, self.obs_dtype, self._shards)
+
+    def select(self, ids: Sequence[int] | np.ndarray) -> Dataset:
+        """The histories with these ids, in this order.
+
+        Raises:
+            UnknownNameError: for an id that the release does not have.
+        """
+        if not len(ids):
+            raise EmptySelectionError(f"{self.root}: select was given no history id")
+        chosen = np.array([self.index.entry(int(i)).history_id for i in ids])
+        return Dataset(self.index, chosen, self.obs_dtype, self._shards)
+
+    def history(self, history_id: int) -> History:
+        """One history of the release, by id."""
+        entry = self.index.entry(history_id)
+        return History(entry, self._shards.open(entry.shard), self.obs_dtype)
+
+    @cached_property
+    def _tasks(self) -> dict[str, Task]:
+        return {task.task_id: task for task in read_tasks(self.root / TASKS)}
+
+    def recover_environment(self, history_id: int) -> dict[str, Any]:
+        """What rebuilds the environment a history was made in: layout names, map, recipes, episode lengths."""
+        entry = self.index.entry(history_id)
+        layout = get_layout(entry.layout)
+        return {
+            "layout": layout.name,
+            "environment_name": layout.alias,
+            "map": list(layout.rows),
+            "recipes": [list(recipe) for recipe in layout.recipes],
+            **self.info["environment"],
+        }
+
+    def recover_teammate(self, history_id: int) -> dict[str, Any]:
+        """What rebuilds the teammate of a history: the task's teammate entry, `kind`, `family`, `theta`, ..."""
+        entry = self.index.entry(history_id)
+        if entry.task_id not in self._tasks:
+            raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
+        return dict(self._tasks[entry.task_id].teammate)
+
+    def ad(self, *, batch_size: int, length: int, seed: int = 0, teammate_actions: bool = False) -> ADSampler:
+        """Algorithm Distillation windows; see `sampling.ADSampler`."""
+        from icrl4aht_data.sampling import ADSampler
+
+        return ADSampler(self, batch_size=batch_size, length=length, seed=seed, teammate_actions=teammate_actions)
+
+    def dpt(
+        self,
+        *,
+        batch_size: int,
+        context: int,
+        seed: int = 0,
+        order: ContextOrder = "contiguous",
+        teammate_actions: bool = False,
+    ) -> DPTSampler:
+        """Decision-Pretrained Transformer queries with contexts; see `sampling.DPTSampler`."""
+        from icrl4aht_data.sampling import DPTSampler
+
+        return DPTSampler(
+            self, batch_size=batch_size, context=context, seed=seed, order=order, teammate_actions=teammate_actions
+        )
+
+
+class History:
+    """One learning history: an ego that learns beside one teammate, T steps of E episodes.
+
+    `history.actions`, `.rewards`, `.obs`, ... are lazy arrays: slicing reads only the chunks it needs.
+    """
+
+    def __init__(self, entry: Entry, shard: Shard, obs_dtype: ObsDtype) -> None:
+        self.entry = entry
+        self._shard = shard
+        self._obs_dtype: ObsDtype = obs_dtype
+
+    def __len__(self) -> int:
+        return self.entry.T
+
+    def __repr__(self) -> str:
+        e = self.entry
+        return (
+            f"History({e.history_id}: {e.layout} with {e.teammate_kind}, T={e.T}, {e.episodes} episodes, "
+            f"return {e.return_start:.1f} -> {e.return_end:.1f})"
+        )
+
+    def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
+
+        Raises:
+            LabelsMissingError: if expert actions are asked of a history without them.
+            ShardCorruptError: names the chunk whose checksum is wrong.
+        """
+        field = self._field(name)
+        rows = self.entry.rows(field)
+        start, stop, _ = slice(start, stop).indices(rows)
+        if name != "obs" or self._shard.kind == "full":
+            return self._shard.read(self.entry.history_id, field, start, stop) if stop > start else self._no_rows(field)
+        return render(self.entry, self.read("state", start, stop), "uint8")
+
+    def _no_rows(self, field: Field) -> np.ndarray:
+        row = self._shard.read(self.entry.history_id, field, 0, 1)
+        return row[:0]
+
+    def _field(self, name: str) -> Field:
+        if name not in FIELDS:
+            raise unknown("field", name, FIELDS)
+        if name == "expert_actions" and not self.entry.has_expert_actions:
+            raise LabelsMissingError(
+                f"history {self.entry.history_id} ({self.entry.task_id}) has no expert actions: its index entry says "
+                f"has_expert_actions = false; choose histories that are labelled"
+            )
+        return FIELDS[name]
+
+    @property
+    def obs(self) -> LazyArray:
+        """(T, 5, 5, C) float32 or uint8, or the state records (T, S) uint8, as the dataset's `obs_dtype` says."""
+        return LazyArray(self, "state" if self._obs_dtype == "state" else "obs", self._obs_dtype)
+
+    @property
+    def state(self) -> LazyArray:
+        """(T, S) uint8: the state record before each step; see `overcooked.state`."""
+        return LazyArray(self, "state")
+
+    @property
+    def actions(self) -> LazyArray:
+        """(T,) int32: the ego's actions, 0..5."""
+        return LazyArray(self, "actions")
+
+    @property
+    def rewards(self) -> LazyArray:
+        """(T,) float32: the team's reward, unshaped."""
+        return LazyArray(self, "rewards")
+
+    @property
+    def dones(self) -> LazyArray:
+        """(T,) bool: the last kept step of each episode."""
+        return LazyArray(self, "dones")
+
+    @property
+    def teammate_actions(self) -> LazyArray:
+        """(T,) int32: the teammate's actions, 0..5."""
+        return LazyArray(self, "teammate_actions")
+
+    @property
+    def expert_actions(self) -> LazyArray:
+        """(T,) int32: what the converged ego would do (paper, App. D.1)."""
+        return LazyArray(self, "expert_actions")
+
+    @property
+    def episode_end_state(self) -> LazyArray:
+        """(E, S) uint8: the state after each episode's last kept step."""
+        return LazyArray(self, "episode_end_state")
+
+    def returns(self) -> np.ndarray:
+        """float64 (E,): return of each episode over its kept steps: the learning curve."""
+        return episode_returns(self.read("rewards"), self.read("dones"))
+
+
+class LazyArray:
+    """One field of one history, read on indexing. Takes what a NumPy array's first axis takes."""
+
+    def __init__(self, history: History, name: str, obs_dtype: ObsDtype | None = None) -> None:
+        self._history, self._name = history, name
+        entry, field = history.entry, history._field(name)
+        self.dtype = np.dtype(field.dtype)
+        if name == "obs" and obs_dtype == "float32":
+            self.dtype = np.dtype("float32")
+        row = {"scalar": (), "obs": entry.obs_shape}.get(field.row)
+        if row is None:
+            row = field.element(get_layout(entry.layout), "full").shape
+        self.shape = (entry.rows(field), *row)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __repr__(self) -> str:
+        return f"LazyArray({self._name}, shape={self.shape}, dtype={self.dtype})"
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
+        if isinstance(first, slice):
+            start, stop, step = first.indices(len(self))
+            low, high = (start, stop) if step > 0 else (stop + 1, start + 1)
+            rows = self._read(max(low, 0), max(high, low, 0))
+            rows = rows[::step] if step > 0 else rows[::-1][::-step]
+        elif isinstance(first, (int, np.integer)):
+            position = range(len(self))[first]
+            rows = self._read(position, position + 1)[0]
+        else:
+            rows = self._read(0, len(self))[np.asarray(first)]
+        if not rest:
+            return rows
+        return rows[rest] if isinstance(first, (int, np.integer)) else rows[(slice(None), *rest)]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self[:].astype(dtype or self.dtype, copy=False)
+
+    def _read(self, start: int, stop: int) -> np.ndarray:
+        return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)
+
+
+def render(entry: Entry, states: np.ndarray, dtype: str) -> np.ndarray:
+    """Ego observations (B, 5, 5, C) of state records uint8 (B, S) on the entry's layout."""
+    layout = get_layout(entry.layout)
+    flat = states.reshape(-1, states.shape[-1])
+    out = np.empty((len(flat), *layout.obs_shape), dtype)
+    for start in range(0, len(flat), _RENDER_ROWS):
+        out[start : start + _RENDER_ROWS] = observe(layout, flat[start : start + _RENDER_ROWS], EGO)
+    return out.reshape(*states.shape[:-1], *layout.obs_shape)

@@ -1,0 +1,47 @@
+"""Pictures of a dataset. Needs the extra `plot`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import OptionError
+
+
+def plot_learning_curves(dataset: Dataset, path: Path) -> None:
+    """Return per episode of every task in the selection: mean over streams, band between the 10th and 90th percentile.
+
+    Raises:
+        OptionError: if matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OptionError("drawing needs matplotlib: pip install icrl4aht-data[plot]") from error
+    tasks: dict[str, list[np.ndarray]] = {}
+    titles = {}
+    for history in dataset:
+        entry = history.entry
+        tasks.setdefault(entry.task_id, []).append(history.returns())
+        titles[entry.task_id] = f"{entry.layout} with {entry.teammate_kind}"
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.3 * rows), layout="constrained")
+    for number, (task_id, streams) in enumerate(tasks.items(), start=1):
+        axes = figure.add_subplot(rows, columns, number)
+        length = min(map(len, streams))
+        returns = np.stack([stream[:length] for stream in streams])
+        episodes = np.arange(1, length + 1)
+        low, high = np.percentile(returns, (10, 90), axis=0)
+        axes.fill_between(episodes, low, high, alpha=0.25, linewidth=0, label="10th to 90th percentile")
+        axes.plot(episodes, returns.mean(axis=0), label=f"mean of {len(streams)} streams")
+        axes.set_title(titles[task_id], fontsize=10)
+        axes.set_xlabel("episode")
+        axes.set_ylabel("return of the kept steps")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8, frameon=False)
+    partial = path.with_name(f".{path.name}.partial")
+    figure.savefig(partial, dpi=120, format=path.suffix.lstrip(".") or "png")
+    partial.replace(path)

@@ -1,0 +1,355 @@
+"""Pictures of state records, for people: a frame as an array or PNG, an episode as an animated GIF.
+
+Places and lengths are in cells, (0, 0) the map's top left corner. Drawn enlarged, then shrunk, for smooth edges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrl4aht_data.benchmark import EGO, TEAMMATE
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked import layouts
+from icrl4aht_data.overcooked.layouts import COOKED, PLATE, WINDOW, Layout
+from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, record_size, unpack
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+_ENLARGE, _FOOTER, _SMALLEST_CELL, _GIF_COLOURS = 4, 0.8, 16, 128
+
+_INK, _STEEL, _DARK_STEEL, _WHITE = (43, 48, 58), (124, 133, 146), (58, 64, 75), (255, 255, 255)
+_FLOOR, _FAR_WALL, _PAPER = ((248, 245, 238), (239, 234, 224)), (199, 193, 184), (255, 252, 240)
+_COUNTER, _COUNTER_TOP, _CRATE, _CRATE_INSIDE = (168, 131, 92), (205, 171, 130), (133, 92, 54), (92, 62, 38)
+_HEAT, _READY, _LAMP, _PLATE_RIM = (255, 140, 40), (67, 190, 95), (255, 205, 40), (160, 178, 200)
+_CHEF = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
+_CHEF_EDGE = {EGO: (17, 58, 133), TEAMMATE: (122, 14, 27)}
+_SKIN, _PLEAT, _LEAF = (250, 214, 180), (196, 204, 216), (62, 132, 60)
+_BROWN, _GOLD, _SHINE = (176, 120, 20), (246, 190, 50), (255, 228, 145)
+
+_SIDES = (-1, 1)
+_AROUND = [(math.cos(turn), math.sin(turn)) for turn in (k * math.tau / 7 for k in range(7))]
+_INGREDIENTS = {
+    0: [  # an onion
+        *((0.34, _BROWN, (0, -0.98), (side * 0.36, -0.3)) for side in _SIDES),
+        *((0.12, _BROWN, (0, 0.8), (side * 0.3, 1)) for side in (-1, 0, 1)),
+        *((thick, colour, (-0.12, 0.14), (0.12, 0.14)) for thick, colour in ((1.64, _BROWN), (1.4, _GOLD))),
+        *((0.14, _GOLD, (0, -0.95), (side * 0.36, -0.3)) for side in _SIDES),
+        *((0.13, _SHINE, (side * 0.14, -0.4), (side * 0.42, 0.1), (side * 0.16, 0.6)) for side in _SIDES),
+    ],
+    1: [  # a tomato
+        *((thick, colour, (0, 0.08)) for thick, colour in ((1.84, (164, 40, 20)), (1.58, (240, 84, 48)))),
+        *((0.24, _LEAF, (0, -0.45), end) for end in ((-0.45, -0.55), (0.45, -0.55), (0, -0.95))),
+    ],
+    2: [  # a lettuce
+        *((0.9, _LEAF, (0.52 * x, 0.52 * y)) for x, y in _AROUND),
+        *((0.68, (140, 205, 85), (0.52 * x, 0.52 * y)) for x, y in _AROUND),
+        (0.8, (196, 235, 140), (0, 0)),
+    ],
+    3: [  # an aubergine
+        *((0.86, (66, 28, 96), (-0.3, 0.32), (0.35, -0.3)), (1.16, (66, 28, 96), (-0.28, 0.3))),
+        *((0.62, (165, 95, 205), (-0.3, 0.32), (0.35, -0.3)), (0.92, (165, 95, 205), (-0.28, 0.3))),
+        (0.4, _LEAF, (0.5, -0.45), (0.72, -0.72)),
+    ],
+}
+"""How each ingredient is drawn: strokes, see `_Canvas.strokes`, within a radius of 1."""
+
+
+def draw_frame(
+    layout: Layout, record: np.ndarray, *, cell: int = 48, caption: str = "", view: bool = True
+) -> np.ndarray:
+    """A picture of one state: the ego blue, the teammate red, below the map the current recipe and the caption.
+
+    Args:
+        layout: the kitchen.
+        record: uint8 (S,), the state record.
+        cell: side of a map cell in pixels, at least 16.
+        caption: one line for the footer; a long one is written smaller.
+        view: whether to outline the cells that the ego observes.
+
+    Returns:
+        uint8 (height, width, 3), RGB: cell pixels for each of the map's columns and rows, and 0.8 cells of footer.
+
+    Raises:
+        OptionError: no Pillow, a record of another shape or dtype or with impossible values, or too small a cell.
+    """
+    return np.array(_picture(layout, _checked(layout, record, 1, cell), cell, caption, view))
+
+
+def save_frame(path: str | Path, layout: Layout, record: np.ndarray, **options: Any) -> None:
+    """Write the picture of one state as PNG; record uint8 (S,), options and errors as in `draw_frame`."""
+    frame = draw_frame(layout, record, **options)
+    _write(Path(path), _pillow()[0].fromarray(frame), format="PNG")
+
+
+def save_episode(
+    path: str | Path,
+    layout: Layout,
+    records: np.ndarray,
+    rewards: np.ndarray | None = None,
+    *,
+    cell: int = 32,
+    fps: int = 8,
+) -> None:
+    """Write an episode as an animated GIF of T frames that loops endlessly. The file appears complete or not at all.
+
+    Args:
+        path: the file to write.
+        layout: the kitchen.
+        records: uint8 (T, S), the states in order.
+        rewards: real (T,), the reward of the step from each record; the captions then show the return so far.
+        cell: side of a map cell in pixels, at least 16.
+        fps: frames a second, 1 to 50.
+
+    Raises:
+        OptionError: as in `draw_frame`, or there is no record, or rewards or fps do not fit.
+    """
+    records = _checked(layout, records, 2, cell)
+    rewards = np.full(len(records), np.nan) if rewards is None else np.asarray(rewards)
+    _require(rewards.shape == (len(records),), f"rewards ({len(records)},), one a record", rewards.shape)
+    _require(1 <= fps <= 50, "fps from 1 to 50", fps)
+    frames, earned = [], 0.0
+    for step, (record, reward) in enumerate(zip(records, rewards.tolist(), strict=True)):
+        caption = f"step {step}" if math.isnan(reward) else f"step {step}   return {earned:g}"
+        frames.append(_picture(layout, record, cell, caption, True))
+        earned += reward
+    palette, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
+    first, *rest = (frame.quantize(palette=palette, dither=dither) for frame in frames)
+    _write(Path(path), first, format="GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
+
+
+def _pillow():
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ImportError as error:
+        raise OptionError("drawing needs Pillow: pip install icrl4aht-data[plot]") from error
+    return Image, ImageDraw, ImageFont
+
+
+def _require(fulfilled: bool, expected: str, found: object) -> None:
+    if not fulfilled:
+        raise OptionError(f"expected {expected}, found {found}")
+
+
+def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) -> np.ndarray:
+    records, size = np.asarray(records), record_size(layout)
+    fits = records.dtype == np.uint8 and records.ndim == dimensions and records.shape[-1] == size and records.size > 0
+    expected = f"uint8 ({size},)" if dimensions == 1 else f"uint8 (T, {size})"
+    _require(fits, f"{expected} for layout {layout.name}", f"{records.dtype} {records.shape}")
+    wrong = faults(layout, records)
+    _require(not wrong, f"possible states of layout {layout.name}", "; ".join(wrong))
+    _require(cell >= _SMALLEST_CELL, f"cell of at least {_SMALLEST_CELL} pixels", cell)
+    return records
+
+
+def _write(path: Path, image: Image.Image, **options: Any) -> None:
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        image.save(partial, **options)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _shared_palette(frames: list[Image.Image]) -> Image.Image:
+    """The colours that are most frequent in any one frame, so that a short flash keeps its colour."""
+    most = Counter()
+    for frame in frames:
+        most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
+    palette = _pillow()[0].new("P", (1, 1))
+    palette.putpalette([value for colour, _ in most.most_common(_GIF_COLOURS) for value in colour])
+    return palette
+
+
+@lru_cache(maxsize=32)
+def _font(pixels: int) -> Any:
+    return _pillow()[2].load_default(pixels)
+
+
+class _Canvas:
+    """Shapes in cell units on an enlarged picture."""
+
+    def __init__(self, width: float, height: float, cell: int) -> None:
+        image, draw, _ = _pillow()
+        self.unit = cell * _ENLARGE
+        self.image = image.new("RGB", (round(width * cell) * _ENLARGE, round(height * cell) * _ENLARGE), _PAPER)
+        self.pen = draw.Draw(self.image)
+
+    def box(self, x: float, y: float, width: float, height: float, fill: tuple, radius: float = 0) -> None:
+        left, top, wide, high = (self.unit * v for v in (x - width / 2, y - height / 2, width, height))
+        self.pen.rounded_rectangle((left, top, left + wide - 1, top + high - 1), self.unit * radius, fill)
+
+    def disc(self, x: float, y: float, radius: float, fill: tuple, part: float = 1) -> None:
+        """A disc, or the first `part` (0..1) of one, clockwise from the top."""
+        bounds = [self.unit * v for v in (x - radius, y - radius, x + radius, y + radius)]
+        self.pen.pieslice(bounds, -90, 360 * part - 90, fill)
+
+    def strokes(self, parts: Iterable, x: float, y: float, size: float = 1, turn: tuple[float, float] = (1, 0)) -> None:
+        """Lines with round ends, of one point a disc: (thickness, fill, *points), the first axis pointing to `turn`."""
+        for thick, fill, *points in parts:
+            ends = [(x + size * (a * turn[0] - b * turn[1]), y + size * (a * turn[1] + b * turn[0])) for a, b in points]
+            self.pen.line([self.unit * v for end in ends for v in end], fill, round(self.unit * size * thick))
+            for end in ends:
+                self.disc(*end, size * thick / 2, fill)
+
+    def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor="mm", room: float = 99) -> None:
+        """Text, smaller than `size` where that is wider than `room`."""
+        width = self.pen.textlength(words, _font(round(self.unit * size))) / self.unit
+        font = _font(max(1, int(self.unit * size * room / max(room, width))))
+        self.pen.text((self.unit * x, self.unit * y), words, fill, font, anchor, stroke_width=font.size / 40)
+
+
+def _picture(layout: Layout, record: np.ndarray, cell: int, caption: str, view: bool) -> Image.Image:
+    canvas = _Canvas(layout.width, layout.height + _FOOTER, cell)
+    state = unpack(layout, record)
+    recipe = _contents(layout, int(state.recipe))
+    for place in range(layout.cells):
+        _draw_fixture(canvas, layout, place, recipe, bool(state.delivered))
+    for place, item, timer in zip(layout.pots, state.pot_items.tolist(), state.pot_timers.tolist(), strict=True):
+        _draw_pot(canvas, *_centre(layout, place), _contents(layout, item), timer, item & COOKED > 0)
+    for place, timer in zip(layout.buttons, state.buttons.tolist(), strict=True):
+        _draw_button(canvas, *_centre(layout, place), recipe, timer)
+    for place, item in zip(layout.counters, state.counters.tolist(), strict=True):
+        _draw_item(canvas, layout, item, *_centre(layout, place), 0.33)
+    if view:
+        _draw_view(canvas, layout, int(state.positions[EGO]))
+    for agent in (EGO, TEAMMATE):
+        _draw_chef(canvas, layout, agent, *(int(field[agent]) for field in state[:3]))
+    middle = layout.height + _FOOTER / 2
+    canvas.text(0.15, middle, "Recipe", 0.34, _INK, "lm")
+    for number, ingredient in enumerate(recipe):
+        _draw_ingredient(canvas, ingredient, 1.52 + 0.42 * number, middle, 0.2)
+    canvas.text(layout.width - 0.15, middle, caption, 0.34, _INK, "rm", room=layout.width - 2.9)
+    return canvas.image.reduce(_ENLARGE)
+
+
+def _centre(layout: Layout, cell: int) -> tuple[float, float]:
+    return cell % layout.width + 0.5, cell // layout.width + 0.5
+
+
+def _contents(layout: Layout, item: int) -> list[int]:
+    """The ingredient ids in an item byte, with repeats, ascending."""
+    return [i for i in layout.ingredients for _ in range(item // layout.ingredient_item(i) & 3)]
+
+
+def _draw_fixture(canvas: _Canvas, layout: Layout, cell: int, recipe: list[int], delivered: bool) -> None:
+    """What never moves on a cell; under pots and buttons only the counter."""
+    (x, y), kind = _centre(layout, cell), layout.kinds[cell]
+    floor, far_wall = kind == layouts.EMPTY, kind == layouts.WALL and cell not in layout.counters
+    canvas.box(x, y, 1, 1, _FLOOR[int(x + y) % 2] if floor else _FAR_WALL if far_wall else _COUNTER)
+    if floor or far_wall:
+        return
+    canvas.box(x, y, 0.94, 0.94, _COUNTER_TOP, 0.08)
+    if kind == layouts.GOAL:  # a serving bell, its hatch lit in the step after a correct delivery
+        hatch = _LAMP if delivered else _READY
+        canvas.box(x, y, 0.88, 0.88, hatch, 0.08)
+        canvas.strokes([(0.56, _WHITE, (0, 0.12)), (0.12, _WHITE, (0, -0.2))], x, y)
+        canvas.box(x, y + 0.28, 0.6, 0.3, hatch)
+        canvas.strokes([(0.07, _WHITE, (-0.3, 0.2), (0.3, 0.2))], x, y)
+    elif kind == layouts.INDICATOR:
+        canvas.box(x, y, 0.86, 0.86, _INK, 0.08)
+        canvas.box(x, y, 0.74, 0.74, _PAPER, 0.04)
+        _draw_trio(canvas, recipe, x, y, 0.17)
+    elif kind == layouts.PLATES:
+        for lift in (0.14, 0.07, 0, -0.07):
+            _draw_item(canvas, layout, PLATE, x, y + lift, 0.32)
+    elif kind == layouts.PILE:
+        canvas.box(x, y, 0.86, 0.86, _CRATE, 0.06)
+        canvas.box(x, y, 0.7, 0.7, _CRATE_INSIDE, 0.03)
+        for dx, dy in ((-0.16, -0.16), (0.16, -0.16), (-0.16, 0.16), (0.16, 0.16)):
+            _draw_item(canvas, layout, int(layout.piles[cell]), x + dx, y + dy, 0.2)
+
+
+def _draw_pot(canvas: _Canvas, x: float, y: float, contents: list[int], timer: int, cooked: bool) -> None:
+    """A pot: empty places as rings; while cooking an orange rim and the steps left; when cooked green and ticked."""
+    canvas.box(x, y, 0.9, 0.9, _DARK_STEEL, 0.08)
+    canvas.strokes([(0.12, _STEEL, (-0.4, 0), (0.4, 0))], x, y - 0.05)
+    canvas.disc(x, y - 0.05, 0.38, _READY if cooked else _STEEL)
+    if timer:
+        canvas.disc(x, y - 0.05, 0.38, _HEAT, 1 - timer / POT_STEPS)
+    canvas.disc(x, y - 0.05, 0.31, _INK)
+    _draw_trio(canvas, contents, x, y - 0.08, 0.14, empty=_STEEL)
+    if timer:
+        canvas.box(x, y + 0.26, 0.5, 0.34, _HEAT, 0.1)
+        canvas.text(x, y + 0.26, str(timer), 0.34, _WHITE)
+    if cooked:
+        canvas.disc(x, y + 0.25, 0.2, _WHITE)
+        canvas.disc(x, y + 0.25, 0.17, _READY)
+        canvas.strokes([(0.06, _WHITE, (-0.08, 0), (-0.02, 0.07), (0.09, -0.07))], x, y + 0.25)
+
+
+def _draw_button(canvas: _Canvas, x: float, y: float, recipe: list[int], timer: int) -> None:
+    """A knob with a question mark; while lit a lamp that shows the recipe, its ring the time left."""
+    canvas.box(x, y, 0.88, 0.88, _DARK_STEEL, 0.2)
+    canvas.disc(x, y, 0.42, _LAMP, timer / BUTTON_STEPS)
+    canvas.disc(x, y, 0.35, _PAPER if timer else _STEEL)
+    if timer:
+        _draw_trio(canvas, recipe, x, y, 0.15)
+    else:
+        canvas.text(x, y, "?", 0.5, _WHITE)
+
+
+def _draw_item(canvas: _Canvas, layout: Layout, item: int, x: float, y: float, radius: float) -> None:
+    """An item byte: nothing, one ingredient, or a plate with what is on it."""
+    contents = _contents(layout, item)
+    if item & PLATE:
+        for part, colour in ((1, _PLATE_RIM), (0.88, _WHITE), (0.7, _PLATE_RIM), (0.62, _WHITE)):
+            canvas.disc(x, y, radius * part, colour)
+        _draw_trio(canvas, contents, x, y, radius * 0.42)
+    elif contents:
+        _draw_ingredient(canvas, contents[0], x, y, radius * 0.85)
+
+
+def _draw_trio(canvas: _Canvas, contents: list[int], x: float, y: float, radius: float, empty=None) -> None:
+    """Up to three ingredients in a triangle, and rings of the colour `empty` on the free places."""
+    for number, (dx, dy) in enumerate(((0, -0.95), (-1.02, 0.75), (1.02, 0.75))):
+        place = (x + dx * radius, y + dy * radius)
+        if number < len(contents):
+            _draw_ingredient(canvas, contents[number], *place, radius)
+        elif empty:
+            canvas.disc(*place, radius * 0.8, empty)
+            canvas.disc(*place, radius * 0.6, _INK)
+
+
+def _draw_ingredient(canvas: _Canvas, ingredient: int, x: float, y: float, radius: float) -> None:
+    canvas.strokes(_INGREDIENTS.get(ingredient, [(1.8, _STEEL, (0, 0))]), x, y, radius)
+    if ingredient not in _INGREDIENTS:
+        canvas.text(x, y, str(ingredient), 1.2 * radius, _WHITE)
+
+
+def _draw_view(canvas: _Canvas, layout: Layout, cell: int) -> None:
+    """The outline of the ego's window, as far as it is on the map."""
+    x, y = _centre(layout, cell)
+    corners = np.array([x, y, x, y]) + np.array([-1, -1, 1, 1]) * WINDOW / 2
+    bounds = canvas.unit * np.clip(corners, 0, [layout.width, layout.height] * 2)
+    for thick, colour in ((0.1, _WHITE), (0.065, _CHEF[EGO])):
+        canvas.pen.rectangle(bounds.tolist(), outline=colour, width=round(canvas.unit * thick))
+
+
+def _draw_chef(canvas: _Canvas, layout: Layout, agent: int, cell: int, facing: int, hand: int) -> None:
+    """A chef from above: coat in the agent's colour, white hat; eyes, arms and what it holds on the side it faces."""
+    x, y = _centre(layout, cell)
+    front_x, front_y = _centre(layout, int(layout.ahead[cell, facing]))
+    forward = front_x - x, front_y - y
+    coat, edge = _CHEF[agent], _CHEF_EDGE[agent]
+    back, arms = ((-0.16, -0.2), (-0.16, 0.2)), [((-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in _SIDES]
+    parts = [
+        *((0.42 + grow, colour, *back) for grow, colour in ((0.07, edge), (0, coat))),
+        *((0.15 + grow, colour, *arm) for grow, colour in ((0.07, edge), (0, coat)) for arm in arms),
+        (0.42, coat, *back),
+        *((0.17, _SKIN, (0.34, 0.24 * side)) for side in _SIDES),
+        *((thick, colour, (0.02, 0)) for thick, colour in ((0.46, edge), (0.42, _SKIN))),
+        *((0.075, _INK, (0.15, 0.08 * side)) for side in _SIDES),
+        *((0.24, _PLEAT, (0.13 * a - 0.1, 0.13 * b)) for a, b in _AROUND),
+        *((0.2, _WHITE, (0.13 * a - 0.1, 0.13 * b)) for a, b in [*_AROUND, (0, 0)]),
+        *((0.025, _PLEAT, (0.05 * a - 0.1, 0.05 * b), (0.15 * a - 0.1, 0.15 * b)) for a, b in _AROUND),
+    ]
+    canvas.strokes(parts, x, y, turn=forward)
+    _draw_item(canvas, layout, hand, x + 0.38 * forward[0], y + 0.38 * forward[1], 0.22)

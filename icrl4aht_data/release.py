@@ -1,0 +1,248 @@
+"""Writes a release folder: shards, chunk tables, index, tasks, statistics, manifest. All of it appears or none."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.benchmark import ACTIONS, EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.schema import (
+    ACTION_DIM,
+    FORMAT_VERSION,
+    HISTORIES,
+    INFO,
+    MANIFEST,
+    PROVENANCE,
+    TASKS,
+    Entry,
+    Kind,
+    curve_ends,
+    stream_score,
+)
+from icrl4aht_data.shard import write_shard
+from icrl4aht_data.tasks import Task, write_tasks
+
+
+@dataclass(frozen=True)
+class NewHistory:
+    """One history to be written.
+
+    Args:
+        env_idx: stream within the learner's parallel roll-out.
+        arrays: field name -> array for every field of `schema.FIELDS` but `obs`, which is rendered from the state.
+    """
+
+    env_idx: int
+    arrays: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class NewTask:
+    """One task with its histories. `load` is called once, when its shard is written."""
+
+    task: Task
+    provenance: dict[str, Any]
+    load: Callable[[], list[NewHistory]]
+
+
+def write_release(
+    target: Path,
+    kind: Kind,
+    tasks: Iterable[NewTask],
+    *,
+    data_version: str,
+    card: str,
+    shard_histories: int = 1024,
+    done: Callable[[Task], None] = lambda task: None,
+) -> Path:
+    """Write a release folder; an existing one at `target` is replaced when the new one is complete.
+
+    Args:
+        target: the folder to make.
+        kind: "full" (observations stored) or "lite" (observations rendered from the states on reading).
+        tasks: what to write; histories are numbered in this order.
+        data_version: SemVer of the data.
+        card: README.md of the release.
+        shard_histories: at most this many histories a shard.
+        done: called after each shard's task, for progress.
+
+    Raises:
+        OptionError: if there is no task, or a history's arrays are of unequal length or lossy.
+    """
+    partial = target.with_name(f"{target.name}.partial-{os.getpid()}")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        _fill(partial, kind, list(tasks), data_version, card, shard_histories, done)
+        _swap(partial, target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return target
+
+
+def _swap(new: Path, target: Path) -> None:
+    """Put `new` in the place of `target`, which never holds half a release."""
+    if target.exists():
+        if not (target / INFO).exists() and any(target.iterdir()):
+            raise OptionError(f"{target}: exists and is not a release; give another folder or remove it")
+        old = target.with_name(f"{target.name}.old-{os.getpid()}")
+        target.rename(old)
+        new.rename(target)
+        shutil.rmtree(old)
+    else:
+        new.rename(target)
+
+
+def _fill(
+    root: Path,
+    kind: Kind,
+    tasks: list[NewTask],
+    data_version: str,
+    card: str,
+    shard_histories: int,
+    done: Callable[[Task], None],
+) -> None:
+    if not tasks:
+        raise OptionError("a release needs at least one task")
+    entries: list[Entry] = []
+    groups: dict[tuple[str, str, str], list[NewTask]] = defaultdict(list)
+    for new in tasks:
+        groups[new.task.track, new.task.layout.name, new.task.split].append(new)
+    for (track, layout, split), members in groups.items():
+        histories = [(new.task, history) for new in members for history in _loaded(new, done)]
+        shards = -(-len(histories) // shard_histories)
+        for number in range(shards):
+            part = histories[number * shard_histories : (number + 1) * shard_histories]
+            name = f"data/{track}/{layout}/{split}-{number:05}-of-{shards:05}.h5"
+            new_entries = _placed([_entry(task, history, name) for task, history in part], kind, len(entries))
+            write_shard(root, name, kind, new_entries, [_with_obs(task, h, kind) for task, h in part])
+            entries += new_entries
+    with (root / HISTORIES).open("w", encoding="utf-8") as stream:
+        stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
+    write_tasks(root / TASKS, [new.task for new in tasks])
+    _write_json(root / PROVENANCE, {new.task.task_id: new.provenance for new in tasks})
+    _write_json(root / INFO, describe(kind, data_version, entries))
+    (root / "README.md").write_text(card, encoding="utf-8")
+    write_manifest(root)
+
+
+def _loaded(new: NewTask, done: Callable[[Task], None]) -> list[NewHistory]:
+    histories = new.load()
+    done(new.task)
+    return histories
+
+
+def _entry(task: Task, history: NewHistory, shard: str) -> Entry:
+    arrays = history.arrays
+    returns = episode_returns(arrays["rewards"], arrays["dones"])[None]
+    start, end = curve_ends(returns)
+    return Entry(
+        history_id=-1,
+        task_id=task.task_id,
+        env_idx=history.env_idx,
+        T=len(arrays["actions"]),
+        obs_shape=task.layout.obs_shape,
+        action_dim=ACTION_DIM,
+        track=task.track,
+        split=task.split,
+        layout=task.layout.name,
+        teammate_family=task.teammate_family,
+        teammate_kind=task.teammate_kind,
+        h5_group="",
+        has_teammate_actions=True,
+        has_expert_actions="expert_actions" in arrays,
+        h5_row=None,
+        shard=shard,
+        seed=task.seed,
+        episodes=returns.shape[1],
+        score=float(stream_score(returns)[0]),
+        return_start=float(start[0]),
+        return_end=float(end[0]),
+        return_mean=float(returns.mean()),
+    )
+
+
+def _placed(entries: list[Entry], kind: Kind, first_id: int) -> list[Entry]:
+    """Give ids and places: a group each in a full shard, rows of one group per shape in a lite one."""
+    placed: list[Entry] = []
+    groups: dict[tuple, list[int]] = defaultdict(list)
+    for number, entry in enumerate(entries):
+        shape = number if kind == "full" else (entry.T, entry.episodes, entry.has_expert_actions)
+        rows = groups.setdefault((shape,), [])
+        group = f"/{list(groups).index((shape,))}"
+        placed.append(
+            replace(entry, history_id=first_id + number, h5_group=group, h5_row=None if kind == "full" else len(rows))
+        )
+        rows.append(number)
+    return placed
+
+
+def _with_obs(task: Task, history: NewHistory, kind: Kind) -> dict[str, np.ndarray]:
+    if kind == "lite":
+        return history.arrays
+    return history.arrays | {"obs": observe(task.layout, history.arrays["state"], 0)}
+
+
+def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
+    """float64 (E,): the sum of rewards (T,) of each episode; `dones` (T,) marks last steps."""
+    ends = np.flatnonzero(dones) + 1
+    return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
+
+
+def describe(kind: Kind, data_version: str, entries: list[Entry]) -> dict[str, Any]:
+    """The content of meta/info.json."""
+    layouts = {}
+    for name in dict.fromkeys(entry.layout for entry in entries):
+        mine = [entry for entry in entries if entry.layout == name]
+        layout = get_layout(name)
+        layouts[name] = {
+            "environment_name": layout.alias,
+            "map": list(layout.rows),
+            "recipes": [list(recipe) for recipe in layout.recipes],
+            "obs_shape": list(layout.obs_shape),
+            "histories": len(mine),
+            "tasks": len({entry.task_id for entry in mine}),
+            "transitions": sum(entry.T for entry in mine),
+            "mean_final_return": round(float(np.mean([entry.return_end for entry in mine])), 3),
+        }
+    return {
+        "format_version": FORMAT_VERSION,
+        "data_version": data_version,
+        "kind": kind,
+        "actions": list(ACTIONS),
+        "environment": {"max_steps": EPISODE_STEPS, "kept_steps": KEPT_STEPS},
+        "histories": len(entries),
+        "transitions": sum(entry.T for entry in entries),
+        "layouts": layouts,
+    }
+
+
+def write_manifest(root: Path) -> None:
+    """MANIFEST.sha256 over every other file of the folder, in the format of sha256sum."""
+    files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != MANIFEST)
+    lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
+    partial = root / f"{MANIFEST}.partial"
+    partial.write_text("".join(lines), encoding="utf-8")
+    partial.replace(root / MANIFEST)
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _write_json(path: Path, content: Any) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

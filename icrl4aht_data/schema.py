@@ -1,0 +1,191 @@
+"""What a release contains, said once for reader, writer, verifier and card.
+
+    meta/info.json          versions, kind, environment, totals
+    meta/histories.jsonl    one line per learning history: `Entry`
+    meta/tasks.jsonl        one line per task: see `icrl4aht_data.tasks`
+    meta/provenance.json    task_id -> how its histories were made
+    meta/chunks/**.npy      for each shard: offset, size, rows, crc32 of every chunk
+    data/<track>/<layout>/<split>-00000-of-00001.h5
+    MANIFEST.sha256         every file above, in sha256sum's format
+
+A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard leaves
+`obs` out (it is a function of the state) and stacks the histories of equal length in one group, [history, T] arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import record_size
+
+FORMAT_VERSION = 1
+"""Of the files' layout. A reader takes exactly this one; see `FormatTooOldError` and `FormatTooNewError`."""
+
+MANIFEST = "MANIFEST.sha256"
+INFO, HISTORIES, TASKS, PROVENANCE = (
+    f"meta/{name}" for name in ("info.json", "histories.jsonl", "tasks.jsonl", "provenance.json")
+)
+
+Kind = Literal["full", "lite"]
+KINDS: tuple[Kind, ...] = ("full", "lite")
+
+ACTION_DIM = 6
+
+CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")])
+"""One line of a chunk table: where the stored bytes are, how many of the chunk's rows are the history's (the last chunk
+is padded), and the checksum of the stored bytes. Lines stand in the order of histories in the shard, then of `FIELDS`, then of chunks."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One array of a history.
+
+    Args:
+        name: the HDF5 dataset's name.
+        dtype: what the reader presents, and what a `full` shard stores (paper, App. D.1).
+        compact: what a `lite` shard stores; the writer checks that it is lossless.
+        axis: "T" for one row a step, "E" for one row an episode.
+        row: what a row is: "scalar", "state" (S bytes, one HDF5 element, so that the shuffle filter groups columns) or
+            "obs" (5 x 5 x C).
+        chunk: rows per chunk.
+        optional: whether a history may lack it.
+    """
+
+    name: str
+    dtype: str
+    compact: str
+    axis: Literal["T", "E"]
+    row: Literal["scalar", "state", "obs"]
+    chunk: int
+    optional: bool = False
+
+    def element(self, layout: Layout, kind: Kind) -> np.dtype:
+        """The stored element: a scalar, or the S bytes of a state record."""
+        if self.row == "state":
+            return np.dtype(("u1", (record_size(layout),)))
+        return np.dtype(self.compact if kind == "lite" else self.dtype)
+
+    def row_shape(self, layout: Layout) -> tuple[int, ...]:
+        """The shape of a row in the stored dataset, beyond the element."""
+        return layout.obs_shape if self.row == "obs" else ()
+
+
+FIELDS: dict[str, Field] = {
+    field.name: field
+    for field in (
+        Field("state", "uint8", "uint8", "T", "state", 1000),
+        Field("actions", "int32", "int8", "T", "scalar", 4000),
+        Field("rewards", "float32", "int8", "T", "scalar", 4000),
+        Field("dones", "bool", "bool", "T", "scalar", 4000),
+        Field("teammate_actions", "int32", "int8", "T", "scalar", 4000),
+        Field("expert_actions", "int32", "int8", "T", "scalar", 4000, optional=True),
+        Field("episode_end_state", "uint8", "uint8", "E", "state", 1000),
+        Field("obs", "uint8", "uint8", "T", "obs", 500),
+    )
+}
+"""Every field, in file order. `episode_end_state` is the state after each episode's last kept step."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of meta/histories.jsonl: the paper's 14 fields (App. D.3), then ours."""
+
+    history_id: int
+    task_id: str
+    env_idx: int  # environment stream within the learner's parallel roll-out
+    T: int
+    obs_shape: tuple[int, int, int]
+    action_dim: int
+    track: str
+    split: str
+    layout: str
+    teammate_family: str  # rl, H1..H4
+    teammate_kind: str  # the algorithm or the heuristic's name
+    h5_group: str
+    has_teammate_actions: bool
+    has_expert_actions: bool
+    h5_row: int | None  # row in the group's stacked arrays; null where the group holds this history alone
+    shard: str  # path below the release's root
+    seed: int  # of the learner
+    episodes: int
+    score: float  # end + (end - start), see `curve_ends` (paper, App. F.1)
+    return_start: float  # mean return of the first episodes
+    return_end: float  # mean return of the last episodes
+    return_mean: float
+
+    def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
+        """The fields that this history's shard stores."""
+        return tuple(
+            field
+            for field in FIELDS.values()
+            if (field.name != "obs" or kind == "full") and (not field.optional or self.has_expert_actions)
+        )
+
+    def rows(self, field: Field) -> int:
+        return self.T if field.axis == "T" else self.episodes
+
+    def chunks(self, field: Field) -> int:
+        return -(-self.rows(field) // field.chunk)
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"obs_shape": list(self.obs_shape)}
+
+    @classmethod
+    def from_json(cls, line: Any) -> Entry:
+        """Checks names and types; unknown fields are errors.
+
+        Raises:
+            IndexFormatError: without file and line, which the caller adds.
+        """
+        if not isinstance(line, dict):
+            raise IndexFormatError(f"expected an object, found {type(line).__name__}")
+        missing, extra = _TYPES.keys() - line.keys(), line.keys() - _TYPES.keys()
+        if missing or extra:
+            raise IndexFormatError(f"missing fields {sorted(missing)}, unknown fields {sorted(extra)}")
+        for name, types in _TYPES.items():
+            value = line[name]
+            if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
+                expected = " or ".join(t.__name__ for t in types)
+                raise IndexFormatError(f"field {name!r}: expected {expected}, found {value!r}")
+        shape = line["obs_shape"]
+        if len(shape) != 3 or not all(isinstance(n, int) for n in shape):
+            raise IndexFormatError(f"field 'obs_shape': expected three integers, found {shape!r}")
+        if line["T"] <= 0 or line["episodes"] <= 0:
+            raise IndexFormatError(f"T = {line['T']} and episodes = {line['episodes']}: expected positive numbers")
+        values: dict[str, Any] = {**line, "obs_shape": tuple(shape)}
+        return cls(**values)
+
+
+_JSON_TYPES: dict[str, tuple[type, ...]] = {
+    "int": (int,),
+    "str": (str,),
+    "bool": (bool,),
+    "float": (float, int),
+    "int | None": (int, type(None)),
+    "tuple[int, int, int]": (list,),
+}
+_TYPES = {field.name: _JSON_TYPES[str(field.type)] for field in fields(Entry)}
+
+
+def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean return over the first and over the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
+
+    Args:
+        returns: (B, N), episode returns.
+
+    Returns:
+        float64 (B,) twice: start and end.
+    """
+    window = max(5, returns.shape[-1] // 10)
+    return returns[..., :window].mean(axis=-1), returns[..., -window:].mean(axis=-1)
+
+
+def stream_score(returns: np.ndarray) -> np.ndarray:
+    """float64 (B,): end + (end - start) of learning curves (B, N) (paper, App. F.1)."""
+    start, end = curve_ends(returns)
+    return end + (end - start)

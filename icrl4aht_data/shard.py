@@ -1,0 +1,332 @@
+"""One HDF5 shard: written chunk by chunk, read by stored offsets with a checksum on every chunk.
+
+Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. Our own reads do not go through libhdf5:
+they take a chunk's bytes at the offset in the chunk table, check its crc32 and inflate it, which needs no global lock.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import zlib
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from icrl4aht_data.errors import IndexFormatError, OptionError, ShardCorruptError, ShardMismatchError, ShardMissingError
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
+
+_DEFLATE_LEVEL = 6
+_CACHE_BYTES = 256 * 2**20
+
+
+def chunk_table_path(root: Path, shard: str) -> Path:
+    """Where the chunk table of a shard (`data/...h5`) lies."""
+    return (root / "meta" / "chunks" / Path(shard).relative_to("data")).with_suffix(".npy")
+
+
+def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Sequence[dict]) -> None:
+    """Write a shard and its chunk table; each appears whole or not at all.
+
+    Args:
+        root: the release folder.
+        shard: path below it, as in every entry.
+        kind: "full" or "lite".
+        entries: the histories' index entries; `h5_group` and `h5_row` say where each one goes.
+        histories: for each entry, field name -> array in the field's dtype.
+
+    Raises:
+        OptionError: if a value does not survive the stored dtype, or an array has not the entry's length.
+    """
+    path, table_path = root / shard, chunk_table_path(root, shard)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table_path.parent.mkdir(parents=True, exist_ok=True)
+    layout = get_layout(entries[0].layout)
+    partial, table_partial = path.with_suffix(".partial"), table_path.with_suffix(".partial")
+    checksums: list[int] = []
+    with h5py.File(partial, "w", libver=("v110", "v110")) as file:
+        file.attrs["format_version"] = FORMAT_VERSION
+        file.attrs["layout"] = layout.name
+        for group in dict.fromkeys(entry.h5_group for entry in entries):
+            _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
+        for entry, arrays in zip(entries, histories, strict=True):
+            checksums += _write_history(file[entry.h5_group], layout, kind, entry, arrays)
+    with h5py.File(partial, "r") as file:
+        table = np.zeros(len(checksums), CHUNK_DTYPE)
+        table["crc32"] = checksums
+        places = [place for entry in entries for place in _chunk_places(file, kind, entry)]
+        table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
+    with table_partial.open("wb") as stream:
+        np.save(stream, table, allow_pickle=False)
+    for source, target in ((partial, path), (table_partial, table_path)):
+        _flush(source)
+        source.replace(target)
+
+
+def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
+    """The empty datasets of a group: (T,) for one history, (histories, T) for stacked ones."""
+    first = entries[0]
+    group = file.create_group(first.h5_group)
+    for field in first.stored_fields(kind):
+        row = (first.rows(field), *field.row_shape(layout))
+        chunk = (min(field.chunk, row[0]), *row[1:])
+        stacked = first.h5_row is not None
+        element = field.element(layout, kind)
+        group.create_dataset(
+            field.name,
+            shape=(len(entries), *row) if stacked else row,
+            chunks=(1, *chunk) if stacked else chunk,
+            dtype=element,
+            shuffle=element.itemsize > 1,
+            compression="gzip",
+            compression_opts=_DEFLATE_LEVEL,
+        )
+
+
+def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: dict) -> list[int]:
+    """Write every chunk of a history; their checksums, in table order."""
+    checksums = []
+    for field in entry.stored_fields(kind):
+        element = field.element(layout, kind)
+        stored = _as_stored(field, element, arrays[field.name], entry)
+        step = min(field.chunk, len(stored))
+        for start in range(0, len(stored), step):
+            data = encode_chunk(stored[start : start + step], step, element.itemsize)
+            place = (start, *(0,) * len(field.row_shape(layout)))
+            group[field.name].id.write_direct_chunk(place if entry.h5_row is None else (entry.h5_row, *place), data)
+            checksums.append(zlib.crc32(data))
+    return checksums
+
+
+def _as_stored(field: Field, element: np.dtype, array: np.ndarray, entry: Entry) -> np.ndarray:
+    if len(array) != entry.rows(field):
+        raise OptionError(
+            f"history {entry.history_id}: field {field.name} has {len(array)} rows, expected {entry.rows(field)}"
+        )
+    stored = np.ascontiguousarray(array, element.base)
+    if not np.array_equal(stored, array):
+        raise OptionError(f"history {entry.history_id}: field {field.name} has values that {element.base} cannot hold")
+    return stored
+
+
+def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
+    """What HDF5's shuffle and deflate filters make of a chunk of `length` rows, the missing ones zero."""
+    raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
+    if itemsize > 1:
+        raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
+    return zlib.compress(raw, _DEFLATE_LEVEL)
+
+
+def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
+    """The reverse of `encode_chunk`.
+
+    Raises:
+        ValueError: if the data does not inflate to exactly `size` bytes.
+    """
+    inflater = zlib.decompressobj()
+    try:
+        raw = inflater.decompress(data, size)
+    except zlib.error as error:
+        raise ValueError(str(error)) from error
+    if len(raw) != size or inflater.decompress(inflater.unconsumed_tail, 1) or not inflater.eof:
+        raise ValueError(f"does not inflate to {size} bytes")
+    if itemsize > 1:
+        raw = np.frombuffer(raw, np.uint8).reshape(itemsize, -1).T.tobytes()
+    return raw
+
+
+def _chunk_places(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
+    """(offset, size, rows) of a history's chunks as HDF5 has them, in table order."""
+    places = []
+    for field in entry.stored_fields(kind):
+        dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+        single = (0,) * (dataset.ndim - (1 if entry.h5_row is None else 2))
+        for start in range(0, entry.rows(field), field.chunk):
+            at = (start, *single) if entry.h5_row is None else (entry.h5_row, start, *single)
+            info = dataset.id.get_chunk_info_by_coord(at)
+            places.append((info.byte_offset or 0, info.size, min(field.chunk, entry.rows(field) - start)))
+    return places
+
+
+def _flush(path: Path) -> None:
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+
+
+class Shard:
+    """Reads one shard's histories by offset. Safe to share between threads, to fork and to pickle.
+
+    Args:
+        root: the release folder.
+        name: path of the shard below it.
+        kind: "full" or "lite".
+        entries: all histories of this shard, in index order.
+
+    Raises:
+        ShardMissingError, IndexFormatError, ShardMismatchError: at once, if shard and chunk table do not fit the index.
+    """
+
+    def __init__(self, root: Path, name: str, kind: Kind, entries: Sequence[Entry]) -> None:
+        self.path, self.name = root / name, name
+        self.kind: Kind = kind
+        self.layout = get_layout(entries[0].layout)
+        self._entries = {entry.history_id: entry for entry in entries}
+        self._table = _read_table(root, name)
+        self._first: dict[tuple[int, str], int] = {}
+        total = 0
+        for entry in entries:
+            for field in entry.stored_fields(kind):
+                self._first[entry.history_id, field.name] = total
+                expected, chunks = entry.rows(field), entry.chunks(field)
+                found = int(self._table["rows"][total : total + chunks].sum())
+                if found != expected:
+                    raise ShardMismatchError(
+                        f"{self.path}: history {entry.history_id}: the index says {expected} rows of {field.name}, the "
+                        f"chunk table says {found}; fetch meta/ and the shard again"
+                    )
+                total += chunks
+        if total != len(self._table):
+            raise ShardMismatchError(
+                f"{self.path}: the index implies {total} chunks, the chunk table has {len(self._table)}"
+            )
+        size = self._size()
+        beyond = np.flatnonzero(self._table["offset"].astype(np.int64) + self._table["size"] > size)
+        if len(beyond):
+            raise ShardCorruptError(
+                f"{self.path}: truncated: has {size} bytes, but {self.describe(int(beyond[0]))} ends beyond them; "
+                f"fetch the shard again, then run `icrl4aht-data verify`"
+            )
+        self._cache: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._cached = 0
+        self._lock = threading.Lock()
+
+    def _size(self) -> int:
+        try:
+            return self.path.stat().st_size
+        except FileNotFoundError as error:
+            raise ShardMissingError(f"{self.path}: the index names this shard, but there is no such file") from error
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_cache": OrderedDict(), "_cached": 0, "_lock": None}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
+
+    def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
+        """Rows start..stop of a field, in the field's dtype. The range must lie within the history.
+
+        Raises:
+            ShardCorruptError: names the chunk whose checksum or size is wrong.
+        """
+        first = self._first[history_id, field.name]
+        chunk = self._chunk_rows(history_id, field)
+        parts = []
+        for number in range(start // chunk, -(-stop // chunk)):
+            rows = self._chunk(first + number, history_id, field)
+            parts.append(rows[max(start - number * chunk, 0) : stop - number * chunk])
+        rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return rows.astype(field.dtype, copy=False)
+
+    def _chunk_rows(self, history_id: int, field: Field) -> int:
+        return min(field.chunk, self._entries[history_id].rows(field))
+
+    def _chunk(self, row: int, history_id: int, field: Field) -> np.ndarray:
+        with self._lock:
+            if row in self._cache:
+                self._cache.move_to_end(row)
+                return self._cache[row]
+        rows = self.decode(row, history_id, field)
+        with self._lock:
+            if row not in self._cache:
+                self._cache[row] = rows
+                self._cached += rows.nbytes
+            while self._cached > _CACHE_BYTES and len(self._cache) > 1:
+                self._cached -= self._cache.popitem(last=False)[1].nbytes
+        return rows
+
+    def decode(self, row: int, history_id: int, field: Field) -> np.ndarray:
+        """One chunk by its row in the chunk table, read from the file and checked; padding rows included."""
+        element = field.element(self.layout, self.kind)
+        shape = (self._chunk_rows(history_id, field), *field.row_shape(self.layout), *element.shape)
+        offset, size, expected = (int(value) for value in self._table[row])
+        with self.path.open("rb") as stream:
+            stream.seek(offset)
+            data = stream.read(size)
+        found = zlib.crc32(data)
+        if found != expected or len(data) != size:
+            raise ShardCorruptError(
+                f"{self.path}: {self.describe(row)}: expected crc32 {expected:08x}, found {found:08x}; "
+                f"the file is damaged, fetch the shard again"
+            )
+        try:
+            raw = decode_chunk(data, int(np.prod(shape)) * element.base.itemsize, element.itemsize)
+        except ValueError as error:
+            raise ShardCorruptError(f"{self.path}: {self.describe(row)}: {error}") from error
+        rows = np.frombuffer(raw, element.base).reshape(shape)
+        rows.flags.writeable = False
+        return rows
+
+    def describe(self, row: int) -> str:
+        """A chunk in words: history, field, number, bytes."""
+        (history_id, name), first = max(
+            ((key, first) for key, first in self._first.items() if first <= row), key=lambda item: item[1]
+        )
+        offset, size = int(self._table["offset"][row]), int(self._table["size"][row])
+        return f"chunk {row - first} of {name} in history {history_id} (bytes {offset}..{offset + size})"
+
+    def chunk_rows(self):
+        """Every chunk as (table row, history id, field)."""
+        for history_id, entry in self._entries.items():
+            for field in entry.stored_fields(self.kind):
+                first = self._first[history_id, field.name]
+                for number in range(entry.chunks(field)):
+                    yield first + number, history_id, field
+
+    def check_structure(self) -> list[str]:
+        """What libhdf5 sees that differs from the index and the chunk table; empty if a plain reader gets the same."""
+        try:
+            with h5py.File(self.path, "r") as file:
+                return self._structure_faults(file)
+        except (OSError, KeyError, RuntimeError, ValueError) as error:
+            return [f"not a readable HDF5 file: {error}"]
+
+    def _structure_faults(self, file: h5py.File) -> list[str]:
+        faults = []
+        places: list[tuple[int, int, int]] = []
+        for entry in self._entries.values():
+            stacked = sum(other.h5_group == entry.h5_group for other in self._entries.values())
+            for field in entry.stored_fields(self.kind):
+                dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+                row = (entry.rows(field), *field.row_shape(self.layout))
+                shape = row if entry.h5_row is None else (stacked, *row)
+                element = field.element(self.layout, self.kind)
+                if dataset.shape != shape or dataset.dtype != element:
+                    faults.append(
+                        f"{dataset.name}: expected {shape} of {element}, found {dataset.shape} of {dataset.dtype}"
+                    )
+            if not faults:
+                places += _chunk_places(file, self.kind, entry)
+        table = list(zip(*(self._table[name].tolist() for name in ("offset", "size", "rows")), strict=True))
+        wrong = [row for row, (a, b) in enumerate(zip(places, table, strict=False)) if a != b]
+        if wrong and not faults:
+            faults.append(f"the chunk table places {self.describe(wrong[0])} where HDF5 has {places[wrong[0]]}")
+        return faults
+
+
+def _read_table(root: Path, name: str) -> np.ndarray:
+    path = chunk_table_path(root, name)
+    try:
+        table = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise IndexFormatError(f"{path}: the chunk table of {name} is missing") from error
+    except (ValueError, EOFError, OSError) as error:
+        raise IndexFormatError(f"{path}: not a chunk table: {error}") from error
+    if table.dtype != CHUNK_DTYPE or table.ndim != 1:
+        raise IndexFormatError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
+    return table

@@ -1,0 +1,116 @@
+"""A task: a layout, a teammate, a seed. One JSON line each in manifests and in a release's meta/tasks.jsonl.
+
+    {"task_id": ..., "track": "teammate", "split": "train", "layout_name": "demo_cook_wide", "seed": 0,
+     "teammate": {"kind": "heuristic", "family": "utility_greedy", "theta_id": 0, "base_seed": 0, "theta": {...}}}
+
+The id ends in a hash of the rest, so a task cannot change and keep its name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data.benchmark import HEURISTIC_KINDS, SPLITS, TRACKS, unknown
+from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+
+_FIELDS = ("task_id", "track", "split", "layout_name", "seed", "teammate")
+_HASHED = ("kind", "family", "theta_id", "base_seed", "theta")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task. `layout_name` is the environment name, as in the published manifests.
+
+    Args:
+        teammate: kind "heuristic", family, theta_id, base_seed and theta.
+    """
+
+    task_id: str
+    track: str
+    split: str
+    layout_name: str
+    seed: int
+    teammate: dict[str, Any]
+
+    @property
+    def layout(self) -> Layout:
+        return get_layout(self.layout_name)
+
+    @property
+    def teammate_kind(self) -> str:
+        """The index's `teammate_kind`: the heuristic's or algorithm's name."""
+        return self.teammate["family"]
+
+    @property
+    def teammate_family(self) -> str:
+        """The index's `teammate_family`: H1..H4, or rl."""
+        return HEURISTIC_KINDS.get(self.teammate_kind, "rl")
+
+
+def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:
+    """A task with its id."""
+    alias = get_layout(layout).alias
+    return Task(task_id(track, split, alias, teammate, seed), track, split, alias, seed, teammate)
+
+
+def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], seed: int) -> str:
+    """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
+
+    hash8: the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`.
+    """
+    spec = {name: teammate[name] for name in _HASHED if name in teammate}
+    text = f"{track}:{split}:{layout_name}:{spec!r}:{seed}"
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return f"{track}_{split}_{layout_name}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{seed}_{digest}"
+
+
+def read_tasks(path: Path) -> list[Task]:
+    """The tasks of a JSONL file.
+
+    Raises:
+        TaskFormatError: names the file and the line.
+    """
+    tasks: dict[str, Task] = {}
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            task = _parse(line)
+            if task.task_id in tasks:
+                raise TaskFormatError(f"duplicate task_id {task.task_id!r}")
+        except Icrl4ahtError as error:
+            raise TaskFormatError(f"{path}, line {number}: {error}") from error
+        tasks[task.task_id] = task
+    return list(tasks.values())
+
+
+def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
+    """One line per task."""
+    path.write_text("".join(json.dumps(asdict(task)) + "\n" for task in tasks), encoding="utf-8")
+
+
+def _parse(line: str) -> Task:
+    try:
+        fields = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise TaskFormatError(f"not JSON: {error}") from error
+    if not isinstance(fields, dict) or set(fields) != set(_FIELDS):
+        found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
+        raise TaskFormatError(f"expected the fields {sorted(_FIELDS)}, found {found}")
+    if fields["track"] not in TRACKS:
+        raise unknown("track", fields["track"], TRACKS)
+    if fields["split"] not in SPLITS:
+        raise unknown("split", fields["split"], SPLITS)
+    get_layout(fields["layout_name"])
+    teammate = fields["teammate"]
+    if not isinstance(teammate, dict) or "family" not in teammate or "kind" not in teammate:
+        raise TaskFormatError(f"teammate: expected an object with 'kind' and 'family', found {teammate!r}")
+    task = Task(**fields)
+    expected = task_id(task.track, task.split, task.layout_name, teammate, task.seed)
+    if task.task_id != expected:
+        raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
+    return task

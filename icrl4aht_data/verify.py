@@ -1,0 +1,226 @@
+"""Is a release whole, and does its physics hold? Hashes, checksums, counts, ranges; `deep`: rendering and replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.benchmark import ACTIONS, EGO
+from icrl4aht_data.dataset import MINI, History
+from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.index import Index, read_index
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.rules import step
+from icrl4aht_data.overcooked.state import columns, faults, start
+from icrl4aht_data.release import describe, episode_returns, file_hash
+from icrl4aht_data.schema import MANIFEST, TASKS, Entry, curve_ends, stream_score
+from icrl4aht_data.shard import Shard
+from icrl4aht_data.tasks import read_tasks
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong."""
+
+    file: str  # path below the root
+    problem: str
+
+
+@dataclass
+class Report:
+    """What `verify_release` looked at and found."""
+
+    root: str
+    deep: bool
+    findings: list[Finding] = field(default_factory=list)
+    files: int = 0
+    chunks: int = 0
+    histories: int = 0
+    transitions: int = 0
+
+    @property
+    def ok(self) -> bool:
+        return not self.findings
+
+    def to_json(self) -> dict[str, Any]:
+        return {"ok": self.ok, **asdict(self)}
+
+    def add(self, file: str, problem: str) -> None:
+        self.findings.append(Finding(file, problem))
+
+
+Advance = Callable[[str, int, int], None]
+"""Called with what is being checked, how many are done, and how many there are."""
+
+
+def verify_release(
+    root: str | Path | None = None, *, deep: bool = False, advance: Advance = lambda what, done, total: None
+) -> Report:
+    """Check a release folder; never raises for what is wrong in it.
+
+    Args:
+        root: a release folder; the bundled mini release by default.
+        deep: also check that observations are what the states show, that every recorded step follows from the one
+            before under the rules, with the recorded reward, and that every episode starts as the environment starts.
+        advance: progress.
+    """
+    root = MINI if root is None else Path(root)
+    report = Report(str(root), deep)
+    if not root.is_dir():
+        report.add(".", f"no such folder: {root}")
+        return report
+    _check_manifest(root, report, advance)
+    try:
+        index = read_index(root)
+        tasks = {task.task_id: task for task in read_tasks(root / TASKS)}
+    except (Icrl4ahtError, OSError) as error:
+        report.add("meta", str(error))
+        return report
+    for entry in index.entries:
+        task = tasks.get(entry.task_id)
+        said = (entry.layout, entry.track, entry.split, entry.teammate_kind, entry.teammate_family, entry.seed)
+        if task is None:
+            report.add(TASKS, f"history {entry.history_id}: its task {entry.task_id!r} is missing")
+        elif said != (
+            task.layout.name,
+            task.track,
+            task.split,
+            task.teammate_kind,
+            task.teammate_family,
+            task.seed,
+        ):
+            report.add(TASKS, f"history {entry.history_id}: index and task {entry.task_id!r} disagree")
+    expected = describe(index.info["kind"], str(index.info.get("data_version")), list(index.entries))
+    for name in expected:
+        if index.info.get(name) != expected[name]:
+            report.add("meta/info.json", f"{name}: expected {expected[name]!r}, found {index.info.get(name)!r}")
+    _check_shards(index, report, advance)
+    return report
+
+
+def _check_manifest(root: Path, report: Report, advance: Advance) -> None:
+    path = root / MANIFEST
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        report.add(MANIFEST, f"cannot be read: {error}")
+        return
+    listed = {}
+    for number, line in enumerate(lines, start=1):
+        digest, separator, name = line.partition("  ")
+        if len(digest) != 64 or not separator or not name:
+            report.add(MANIFEST, f"line {number}: expected '<sha256>  <path>', found {line!r}")
+        else:
+            listed[name] = digest
+    present = {p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file()} - {MANIFEST}
+    for name in sorted(listed.keys() - present):
+        report.add(name, "listed in the manifest, but missing")
+    for name in sorted(present - listed.keys()):
+        report.add(name, "not listed in the manifest")
+    both = sorted(listed.keys() & present)
+    for number, name in enumerate(both, start=1):
+        found = file_hash(root / name)
+        if found != listed[name]:
+            report.add(name, f"sha256: expected {listed[name]}, found {found}")
+        report.files += 1
+        advance("files", number, len(both))
+
+
+def _check_shards(index: Index, report: Report, advance: Advance) -> None:
+    members: dict[str, list[Entry]] = {}
+    for entry in index.entries:
+        members.setdefault(entry.shard, []).append(entry)
+    for name, entries in members.items():
+        try:
+            shard = Shard(index.root, name, index.info["kind"], entries)
+        except Icrl4ahtError as error:
+            report.add(name, str(error))
+            continue
+        for fault in shard.check_structure():
+            report.add(name, fault)
+        damaged = _check_chunks(shard, report)
+        for entry in entries:
+            if entry.history_id not in damaged:
+                for problem in _history_problems(History(entry, shard, "uint8"), report.deep):
+                    report.add(name, f"history {entry.history_id}: {problem}")
+                report.transitions += entry.T
+            report.histories += 1
+            advance("histories", report.histories, len(index.entries))
+
+
+def _check_chunks(shard: Shard, report: Report) -> set[int]:
+    """Decode every chunk; the histories that have a damaged one."""
+    damaged = set()
+    for row, history_id, field_ in shard.chunk_rows():
+        try:
+            shard.decode(row, history_id, field_)
+        except Icrl4ahtError as error:
+            report.add(shard.name, str(error))
+            damaged.add(history_id)
+        report.chunks += 1
+    return damaged
+
+
+def _history_problems(history: History, deep: bool) -> Iterator[str]:
+    entry = history.entry
+    layout = get_layout(entry.layout)
+    dones, rewards = history.read("dones"), history.read("rewards")
+    if int(dones.sum()) != entry.episodes or not dones[-1]:
+        yield f"dones: expected {entry.episodes} episodes, the last ending at step {entry.T - 1}, found {dones.sum()}"
+        return
+    names = ["actions", "teammate_actions", *(["expert_actions"] if entry.has_expert_actions else [])]
+    for name in names:
+        values = history.read(name)
+        if values.min() < 0 or values.max() >= len(ACTIONS):
+            yield f"{name}: expected 0..{len(ACTIONS) - 1}, found {values.min()}..{values.max()}"
+    for name in ("state", "episode_end_state"):
+        for fault in faults(layout, history.read(name)):
+            yield f"{name} has {fault}"
+    returns = episode_returns(rewards, dones)[None]
+    first, last = curve_ends(returns)
+    found = {"return_start": first[0], "return_end": last[0], "return_mean": returns.mean()}
+    found["score"] = stream_score(returns)[0]
+    for name, value in found.items():
+        if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
+            yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
+    if deep:
+        yield from _physics_problems(layout, history, dones, rewards)
+
+
+def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
+    states, ends = history.read("state"), history.read("episode_end_state")
+    if history._shard.kind == "full":
+        wrong = np.flatnonzero((history.read("obs") != observe(layout, states, EGO)).any(axis=(1, 2, 3)))
+        if len(wrong):
+            yield f"obs: {len(wrong)} steps differ from what their state shows, first step {wrong[0]}"
+    following = np.concatenate([states[1:], states[:1]])
+    following[dones] = ends
+    recipe = columns(layout).recipe
+    actions = np.stack([history.read("actions"), history.read("teammate_actions")], axis=-1)
+    played = step(layout, states, np.clip(actions, 0, len(ACTIONS) - 1), following[:, recipe])
+    wrong = np.flatnonzero((played.state != following).any(axis=-1))
+    if len(wrong):
+        yield f"replay: {len(wrong)} steps do not lead to the recorded next state, first step {wrong[0]}"
+    wrong = np.flatnonzero(played.reward != rewards)
+    if len(wrong):
+        t = int(wrong[0])
+        yield f"replay: {len(wrong)} rewards differ, first at step {t}: rules {played.reward[t]}, found {rewards[t]}"
+    if not np.isin(states[:, recipe], layout.recipe_items).all():
+        yield "a recipe is not one of the layout's"
+    yield from _start_problems(layout, states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])])
+
+
+def _start_problems(layout: Layout, starts: np.ndarray) -> Iterator[str]:
+    where = columns(layout)
+    positions = starts[:, where.positions]
+    fresh = start(layout, positions, starts[:, where.facings], starts[:, where.recipe])
+    wrong = (fresh != starts).any(axis=-1)
+    for agent in (0, 1):
+        wrong |= ~np.isin(positions[:, agent], layout.rooms[agent])
+    if wrong.any():
+        yield f"{wrong.sum()} episodes do not start as the environment starts, first episode {wrong.argmax()}"

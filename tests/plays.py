@@ -1,0 +1,88 @@
+"""Histories for tests, played by the NumPy game itself: real states, rewards and episode ends, no learning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_data.benchmark import track_of
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.rules import step
+from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.release import NewHistory, NewTask, write_release
+from icrl4aht_data.schema import Kind
+from icrl4aht_data.tasks import Task, make_task
+
+
+def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """The arrays of one history: random actions, rich in interactions."""
+    rooms = layout.rooms
+    positions = np.stack([rng.choice(room, episodes) for room in rooms], axis=1)
+    clash = positions[:, 0] == positions[:, 1]
+    positions[clash] = rooms[0][0], rooms[1][-1]
+    facings = rng.integers(0, 4, (episodes, 2)).astype(np.uint8)
+    state = start(layout, positions, facings, rng.choice(layout.recipe_items, episodes))
+    actions = np.where(rng.random((length, episodes, 2)) < 0.4, 5, rng.integers(0, 6, (length, episodes, 2)))
+    states, rewards = [], []
+    for row in actions:
+        outcome = step(layout, state, row, rng.choice(layout.recipe_items, episodes))
+        states.append(state)
+        rewards.append(outcome.reward)
+        state = outcome.state
+    steps = episodes * length
+    done = np.zeros((episodes, length), bool)
+    done[:, -1] = True
+    return {
+        "state": np.stack(states, axis=1).reshape(steps, -1),
+        "actions": actions[..., 0].T.reshape(-1),
+        "teammate_actions": actions[..., 1].T.reshape(-1),
+        "rewards": np.stack(rewards, axis=1).reshape(-1),
+        "dones": done.reshape(-1),
+        "expert_actions": rng.integers(0, 6, steps),
+        "episode_end_state": state,
+    }
+
+
+def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
+    """Training tasks with made-up heuristic entries."""
+    return [
+        make_task(
+            track_of(layout),
+            "train",
+            layout,
+            {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {}},
+            seed,
+        )
+        for seed, (layout, t) in enumerate((layout, t) for layout in layouts for t in range(teammates))
+    ]
+
+
+def random_release(
+    root: Path,
+    kind: Kind = "lite",
+    layouts: tuple[str, ...] = ("coord_simple", "demo_wide"),
+    *,
+    teammates: int = 2,
+    streams: int = 3,
+    episodes: int = 6,
+    length: int = 20,
+    labels: bool = True,
+    seed: int = 0,
+    shard_histories: int = 1024,
+) -> dict[int, dict[str, np.ndarray]]:
+    """Write a release of random play; history id -> the arrays that went in."""
+    rng = np.random.default_rng(seed)
+    written: dict[int, dict[str, np.ndarray]] = {}
+    tasks = []
+    for task in make_tasks(list(layouts), teammates):
+        histories = []
+        for stream in range(streams):
+            arrays = play(get_layout(task.layout_name), episodes, length, rng)
+            if not labels:
+                del arrays["expert_actions"]
+            written[len(written)] = arrays
+            histories.append(NewHistory(stream, arrays))
+        tasks.append(NewTask(task, {"seed": seed}, lambda histories=histories: histories))
+    write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", shard_histories=shard_histories)
+    return written

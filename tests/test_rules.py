@@ -1,0 +1,641 @@
+"""The rules, one hand-drawn scene each, and NumPy equal to JAX on random states of every layout.
+
+Most scenes are in cramped_up, where one room holds everything:
+
+      01234
+    0 WWPWW
+    1 0A A1
+    2 W   R
+    3 WBWXW
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from scenes import random_records, scene
+
+from icrl4aht_data.benchmark import ACTIONS, DOWN, INTERACT, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, Layout
+from icrl4aht_data.overcooked.observe import observe, observe_both
+from icrl4aht_data.overcooked.state import columns, unpack
+
+CRAMPED, ASYMM, RING, DEMO = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring", "demo_simple"))
+
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
+RECIPE_000, RECIPE_001, RECIPE_111 = 3 * ZERO, 2 * ZERO + ONE, 3 * ONE
+SOUP_000, SOUP_001, SOUP_111 = (recipe + COOKED for recipe in (RECIPE_000, RECIPE_001, RECIPE_111))
+DISH_000, DISH_001, DISH_111 = (soup + PLATE for soup in (SOUP_000, SOUP_001, SOUP_111))
+
+Place = tuple[int, int, str]
+ASIDE: Place = (2, 2, "down")
+AT_POT, AT_COUNTER, AT_PILE_0, AT_PILE_1 = (2, 1, "up"), (1, 1, "up"), (1, 1, "left"), (3, 1, "right")
+AT_PLATES, AT_GOAL, AT_INDICATOR = (1, 2, "down"), (3, 2, "down"), (3, 2, "right")
+COUNTER = (1, 0)
+
+DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
+
+
+class Seen(NamedTuple):
+    """One state in plain Python, and the rewards of the step that led to it."""
+
+    record: np.ndarray
+    places: list[Place]
+    hands: list[int]
+    recipe: int
+    delivered: int
+    pots: list[tuple[int, int]]  # (content, timer)
+    buttons: list[int]
+    counters: dict[tuple[int, int], int]  # only those with an item
+    reward: float
+    shaped: list[float]
+
+
+def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, brings: int = RECIPE_111) -> Seen:
+    """One step of the scene; `brings` is the recipe that a correct delivery leads to."""
+    after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([brings], np.uint8))
+    state = unpack(layout, after.state)
+    xy = [(int(cell) % layout.width, int(cell) // layout.width) for cell in state.positions[0]]
+    lying = zip(layout.counters, state.counters[0].tolist(), strict=True)
+    return Seen(
+        record=after.state,
+        places=[(x, y, FACINGS[facing]) for (x, y), facing in zip(xy, state.facings[0], strict=True)],
+        hands=state.hands[0].tolist(),
+        recipe=int(state.recipe[0]),
+        delivered=int(state.delivered[0]),
+        pots=list(zip(state.pot_items[0].tolist(), state.pot_timers[0].tolist(), strict=True)),
+        buttons=state.buttons[0].tolist(),
+        counters={(cell % layout.width, cell // layout.width): item for cell, item in lying if item},
+        reward=float(after.reward[0]),
+        shaped=after.shaped[0].tolist(),
+    )
+
+
+@pytest.fixture(params=[0, 1], ids=["ego", "teammate"])
+def seat(request: pytest.FixtureRequest) -> int:
+    return request.param
+
+
+def solo(seat: int, at: Place, hand: int = 0, layout: Layout = CRAMPED, aside: Place = ASIDE, **fields) -> np.ndarray:
+    """A scene where the agent of that seat stands `at` with `hand`, the other one aside with nothing."""
+    if seat == 0:
+        return scene(layout, at, aside, hands=[hand, 0], **fields)
+    return scene(layout, aside, at, hands=[0, hand], **fields)
+
+
+def interact(seat: int, record: np.ndarray, layout: Layout = CRAMPED, brings: int = RECIPE_111) -> Seen:
+    """The agent of that seat interacts, the other one stays."""
+    ego, teammate = (INTERACT, STAY) if seat == 0 else (STAY, INTERACT)
+    return act(layout, record, ego, teammate, brings)
+
+
+def assert_nothing_happens(seat: int, record: np.ndarray, layout: Layout = CRAMPED) -> None:
+    after = interact(seat, record, layout)
+    np.testing.assert_array_equal(after.record, record)
+    assert (after.reward, after.shaped) == (0, [0, 0])
+
+
+# Moving
+
+
+def test_action_ids_are_in_the_papers_order():
+    assert ACTIONS == ("up", "down", "left", "right", "stay", "interact")
+    assert (UP, DOWN, LEFT, RIGHT, STAY, INTERACT) == (0, 1, 2, 3, 4, 5)
+
+
+@pytest.mark.parametrize(("action", "x", "y"), [(UP, 2, 1), (DOWN, 2, 3), (LEFT, 1, 2), (RIGHT, 3, 2)])
+def test_a_direction_turns_and_advances(seat, action, x, y):
+    record = solo(seat, (2, 2, "up"), layout=DEMO, aside=(8, 2, "left"))
+    actions = (action, STAY) if seat == 0 else (STAY, action)
+    after = act(DEMO, record, *actions)
+    assert after.places[seat] == (x, y, ACTIONS[action])
+    assert after.places[1 - seat] == (8, 2, "left")
+    assert (after.reward, after.shaped) == (0, [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("at", "action"),
+    [
+        (AT_COUNTER, UP),
+        (AT_PILE_0, LEFT),
+        (AT_PILE_1, RIGHT),
+        (AT_POT, UP),
+        (AT_PLATES, DOWN),
+        (AT_GOAL, DOWN),
+        (AT_INDICATOR, RIGHT),
+    ],
+)
+def test_an_agent_turns_in_place_before_anything_but_floor(seat, at, action):
+    x, y, facing = at
+    turned_away = "up" if facing != "up" else "down"
+    record = solo(seat, (x, y, turned_away))
+    after = act(CRAMPED, record, *((action, STAY) if seat == 0 else (STAY, action)))
+    assert after.places[seat] == at
+
+
+@pytest.mark.parametrize("action", [STAY, INTERACT])
+def test_stay_and_interact_neither_turn_nor_move(action):
+    for facing in FACINGS:
+        after = act(CRAMPED, scene(CRAMPED, (2, 2, facing), (3, 1, "left")), action)
+        assert after.places == [(2, 2, facing), (3, 1, "left")]
+
+
+def test_two_agents_that_want_one_free_cell_both_stay_but_turn():
+    after = act(CRAMPED, scene(CRAMPED, (1, 1, "up"), (3, 1, "up")), RIGHT, LEFT)
+    assert after.places == [(1, 1, "right"), (3, 1, "left")]
+    after = act(CRAMPED, scene(CRAMPED, (2, 1, "up"), (1, 2, "up")), LEFT, UP)
+    assert after.places == [(2, 1, "left"), (1, 2, "up")]
+
+
+@pytest.mark.parametrize("standing", [STAY, INTERACT, UP])  # UP: the other one walks against the wall
+def test_nobody_walks_into_a_standing_agent(standing):
+    after = act(CRAMPED, scene(CRAMPED, (2, 1, "up"), (3, 1, "up")), RIGHT, standing)
+    assert after.places == [(2, 1, "right"), (3, 1, "up")]
+    after = act(CRAMPED, scene(CRAMPED, (3, 1, "up"), (2, 1, "down")), standing, RIGHT)
+    assert after.places == [(3, 1, "up"), (2, 1, "right")]
+
+
+def test_exchanging_cells_sends_both_back():
+    after = act(CRAMPED, scene(CRAMPED, (1, 1, "up"), (2, 1, "up")), RIGHT, LEFT)
+    assert after.places == [(1, 1, "right"), (2, 1, "left")]
+    after = act(CRAMPED, scene(CRAMPED, (1, 2, "left"), (1, 1, "left")), UP, DOWN)
+    assert after.places == [(1, 2, "up"), (1, 1, "down")]
+
+
+def test_an_agent_follows_into_the_cell_that_the_other_leaves():
+    after = act(CRAMPED, scene(CRAMPED, (1, 1, "up"), (2, 1, "up")), RIGHT, RIGHT)
+    assert after.places == [(2, 1, "right"), (3, 1, "right")]
+    after = act(CRAMPED, scene(CRAMPED, (2, 1, "up"), (1, 1, "up")), DOWN, RIGHT)
+    assert after.places == [(2, 2, "down"), (2, 1, "right")]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
+    """Against steps 1 to 3 of the specification, written out cell by cell."""
+    cells, wanted_cells, actions = [], [], []
+    for old, pair in product(product(*layout.rooms), product(range(6), repeat=2)):
+        if old[0] == old[1]:
+            continue
+        before = [(int(cell) % layout.width, int(cell) // layout.width) for cell in old]
+        wanted = []
+        for (x, y), action in zip(before, pair, strict=True):
+            dx, dy = DELTA.get(action, (0, 0))
+            wanted.append((x + dx, y + dy) if layout.rows[y + dy][x + dx] in " A" else (x, y))
+        if wanted[0] == wanted[1] or wanted == before[::-1]:
+            wanted = before
+        cells.append(before)
+        wanted_cells.append([y * layout.width + x for x, y in wanted])
+        actions.append(pair)
+    records = np.repeat(scene(layout, (1, 1, "up"), (1, 1, "up")), len(cells), axis=0)
+    where = columns(layout)
+    records[:, where.positions] = [[y * layout.width + x for x, y in pair] for pair in cells]
+    records[:, where.facings] = facings = np.random.default_rng(0).integers(0, 4, (len(cells), 2))
+    after = unpack(layout, rules.step(layout, records, np.array(actions), records[:, where.recipe]).state)
+    np.testing.assert_array_equal(after.positions, wanted_cells)
+    turned = np.array([FACINGS.index(name) if name in FACINGS else -1 for name in ACTIONS])[np.array(actions)]
+    np.testing.assert_array_equal(after.facings, np.where(turned >= 0, turned, facings))
+
+
+# Piles and counters
+
+
+@pytest.mark.parametrize(("at", "item"), [(AT_PILE_0, ZERO), (AT_PILE_1, ONE), (AT_PLATES, PLATE)])
+def test_piles_give_without_end_to_empty_hands_only(seat, at, item):
+    for _ in range(3):
+        record = solo(seat, at)
+        after = interact(seat, record)
+        assert after.hands[seat] == item
+        assert after.hands[1 - seat] == 0
+        assert after.pots == [(0, 0)]
+        assert after.counters == {}
+    for hand in (PLATE, ZERO, ONE, DISH_000):
+        assert_nothing_happens(seat, solo(seat, at, hand))
+
+
+@pytest.mark.parametrize("item", [PLATE, ZERO, ONE, DISH_000, DISH_111])
+def test_a_counter_takes_one_item_and_gives_it_back(seat, item):
+    down = interact(seat, solo(seat, AT_COUNTER, item))
+    assert down.hands == [0, 0]
+    assert down.counters == {COUNTER: item}
+    up = interact(seat, down.record)
+    assert up.hands[seat] == item
+    assert up.counters == {}
+    assert (down.reward, up.reward, down.shaped, up.shaped) == (0, 0, [0, 0], [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("hand", "lies"), [(ZERO, ZERO), (ZERO, ONE), (PLATE, DISH_000), (DISH_000, PLATE), (ONE, PLATE)]
+)
+def test_a_full_counter_takes_nothing(seat, hand, lies):
+    assert_nothing_happens(seat, solo(seat, AT_COUNTER, hand, counters={COUNTER: lies}))
+
+
+def test_an_empty_counter_gives_nothing_to_empty_hands(seat):
+    assert_nothing_happens(seat, solo(seat, AT_COUNTER, counters={(3, 0): ZERO}))
+
+
+# Pots
+
+
+def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(seat):
+    record = solo(seat, AT_POT, ZERO)
+    for content in (ZERO, 2 * ZERO):
+        after = interact(seat, record)
+        assert after.pots == [(content, 0)]
+        assert after.hands == [0, 0]
+        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two do not cook
+        record = after.record.copy()
+        record[:, columns(CRAMPED).hands.start + seat] = ZERO
+    after = interact(seat, record)
+    timeline = []
+    for _ in range(21):
+        timeline.append((*after.pots[0], int(observe(CRAMPED, after.record, seat)[0, 1, 2, -1])))
+        after = act(CRAMPED, after.record, STAY)
+    cooking = [(RECIPE_000, timer, timer) for timer in range(19, 0, -1)]
+    assert timeline == [*cooking, (SOUP_000, 0, 0), (SOUP_000, 0, 0)]
+
+
+@pytest.mark.parametrize("content", [RECIPE_001, ZERO + 2 * ONE])
+def test_wrong_mixes_cook_too(seat, content):
+    assert content not in CRAMPED.recipe_items
+    after = interact(seat, solo(seat, AT_POT, ONE, pot_items=[content - ONE]))
+    assert after.pots == [(content, 19)]
+    for _ in range(19):
+        assert after.pots[0][0] == content
+        after = act(CRAMPED, after.record, STAY)
+    assert after.pots == [(content + COOKED, 0)]
+
+
+def test_pots_that_cook_tick_and_others_do_not():
+    record = scene(ASYMM, (1, 1, "up"), (7, 3, "up"), pot_items=[RECIPE_000, 2 * ONE], pot_timers=[2, 0])
+    after = act(ASYMM, record, STAY)
+    assert after.pots == [(RECIPE_000, 1), (2 * ONE, 0)]
+    assert act(ASYMM, after.record, STAY).pots == [(SOUP_000, 0), (2 * ONE, 0)]
+
+
+@pytest.mark.parametrize(("content", "timer"), [(RECIPE_000, 9), (RECIPE_000, 1), (SOUP_000, 0), (SOUP_111, 0)])
+@pytest.mark.parametrize("hand", [ZERO, ONE])
+def test_a_pot_takes_no_fourth_ingredient(seat, hand, content, timer):
+    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[content], pot_timers=[timer]))
+    assert after.hands[seat] == hand
+    waited = act(CRAMPED, solo(seat, AT_POT, hand, pot_items=[content], pot_timers=[timer]), STAY)
+    np.testing.assert_array_equal(after.record, waited.record)
+    assert after.shaped == [0, 0]
+
+
+def test_a_plate_takes_the_soup_and_empties_the_pot(seat):
+    after = interact(seat, solo(seat, AT_POT, PLATE, pot_items=[SOUP_001]))
+    assert after.hands[seat] == DISH_001
+    assert after.pots == [(0, 0)]
+    refilled = interact(seat, solo(seat, AT_POT, ONE, pot_items=[after.pots[0][0]]))
+    assert refilled.pots == [(ONE, 0)]
+
+
+@pytest.mark.parametrize("hand", [0, ZERO, ONE, DISH_000, DISH_111])
+def test_nothing_but_a_plate_takes_soup(seat, hand):
+    assert_nothing_happens(seat, solo(seat, AT_POT, hand, pot_items=[SOUP_000]))
+
+
+@pytest.mark.parametrize("hand", [0, PLATE, DISH_000])
+@pytest.mark.parametrize("content", [0, ZERO, ZERO + ONE])
+def test_only_ingredients_go_into_a_pot_and_nothing_raw_comes_out(seat, hand, content):
+    assert_nothing_happens(seat, solo(seat, AT_POT, hand, pot_items=[content]))
+
+
+@pytest.mark.parametrize("hand", [0, PLATE, DISH_000])
+def test_nothing_leaves_a_cooking_pot(seat, hand):
+    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[RECIPE_000], pot_timers=[1]))
+    assert after.hands[seat] == hand  # it is cooked only at the end of this step
+    assert after.pots == [(SOUP_000, 0)]
+
+
+# Deliveries
+
+
+@pytest.mark.parametrize("brings", [RECIPE_000, RECIPE_111])
+def test_a_correct_delivery_pays_20_and_brings_the_next_recipe(seat, brings):
+    after = interact(seat, solo(seat, AT_GOAL, DISH_000, recipe=RECIPE_000), brings=brings)
+    assert (after.reward, after.shaped) == (20, [0, 0])
+    assert after.hands == [0, 0]
+    assert after.recipe == brings  # may be the same again
+    assert after.delivered == 1
+    later = act(CRAMPED, after.record, STAY, brings=RECIPE_001)
+    assert (later.delivered, later.recipe, later.reward) == (0, brings, 0)
+
+
+@pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
+def test_a_wrong_delivery_costs_20_and_the_recipe_stays(seat, recipe, dish):
+    after = interact(seat, solo(seat, AT_GOAL, dish, recipe=recipe), brings=RECIPE_001)
+    assert (after.reward, after.shaped) == (-20, [0, 0])
+    assert after.hands == [0, 0]
+    assert (after.recipe, after.delivered) == (recipe, 0)
+
+
+@pytest.mark.parametrize("hand", [0, PLATE, ZERO, ONE])
+def test_the_goal_takes_cooked_dishes_only(seat, hand):
+    assert_nothing_happens(seat, solo(seat, AT_GOAL, hand))
+
+
+@pytest.mark.parametrize(
+    ("dishes", "reward"),
+    [
+        ([DISH_000, DISH_000], 40),
+        ([DISH_000, DISH_111], 0),  # judged by the recipe before the step, which changes only after both
+        ([DISH_111, DISH_000], 0),
+        ([DISH_111, DISH_111], -40),
+    ],
+)
+def test_two_deliveries_in_one_step_both_count(dishes, reward):
+    record = scene(ASYMM, (3, 2, "up"), (7, 1, "right"), hands=dishes, recipe=RECIPE_000)
+    after = act(ASYMM, record, INTERACT, INTERACT, brings=RECIPE_111)
+    assert after.reward == reward
+    assert after.hands == [0, 0]
+    some_correct = DISH_000 in dishes
+    assert (after.recipe, after.delivered) == ((RECIPE_111, 1) if some_correct else (RECIPE_000, 0))
+
+
+# Button and indicator. In coord_ring the first button is at (4, 2), the ego's ring around it, the teammate's room below.
+
+AT_BUTTON = ((4, 1, "down"), (4, 3, "up"))
+FAR = ((1, 4, "up"), (3, 5, "up"))
+
+
+def ring(seat: int, hand: int = 0, **fields) -> np.ndarray:
+    return solo(seat, AT_BUTTON[seat], hand, layout=RING, aside=FAR[1 - seat], **fields)
+
+
+def test_a_press_costs_5_and_lights_one_button_for_9_observations(seat):
+    record = ring(seat, recipe=RECIPE_000)
+    row = 3 if seat == 0 else 1
+    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # count of ingredient 0 in the recipe, n = 3
+    after = interact(seat, record, RING)
+    assert (after.reward, after.shaped) == (-5, [0, 0])
+    assert after.hands == [0, 0]
+    timers, visible = [], []
+    for _ in range(11):
+        timers.append(after.buttons)
+        visible.append(int(observe(RING, after.record, seat)[0, row, 2, recipe_channel]))
+        after = act(RING, after.record, STAY)
+    assert timers == [[timer, 0] for timer in (9, 8, 7, 6, 5, 4, 3, 2, 1, 0, 0)]
+    assert visible == [3] * 9 + [0, 0]
+    assert after.reward == 0
+
+
+def test_a_press_while_lit_costs_again_and_lights_anew(seat):
+    after = interact(seat, ring(seat, buttons=[4, 7]), RING)
+    assert after.reward == -5
+    assert after.buttons == [9, 6]
+
+
+@pytest.mark.parametrize("hand", [PLATE, ZERO, DISH_000])
+@pytest.mark.parametrize("lit", [0, 4])
+def test_full_hands_press_no_button(seat, hand, lit):
+    after = interact(seat, ring(seat, hand, buttons=[lit, 0]), RING)
+    assert (after.reward, after.hands[seat], after.buttons) == (0, hand, [max(lit - 1, 0), 0])
+
+
+def test_both_agents_may_press_in_one_step():
+    after = act(RING, scene(RING, *AT_BUTTON), INTERACT, INTERACT)
+    assert (after.reward, after.buttons) == (-10, [9, 0])
+
+
+def test_a_press_and_a_delivery_in_one_step_add_up():
+    record = scene(RING, (1, 4, "right"), AT_BUTTON[1], hands=[DISH_000, 0], recipe=RECIPE_000)
+    after = act(RING, record, INTERACT, INTERACT)
+    assert (after.reward, after.recipe, after.buttons) == (15, RECIPE_111, [9, 0])
+
+
+@pytest.mark.parametrize("hand", [0, PLATE, ZERO, DISH_000])
+def test_the_recipe_indicator_has_no_interaction(seat, hand):
+    assert_nothing_happens(seat, solo(seat, AT_INDICATOR, hand))
+
+
+# Agent 0 first: the counter (3, 2) of coord_ring, and the pot (4, 2) of asymm_both, are faced from both sides
+
+
+@pytest.mark.parametrize(
+    ("hands", "lies", "hands_after", "lies_after"),
+    [
+        ([ZERO, 0], 0, [0, ZERO], 0),  # the ego puts down what the teammate takes
+        ([0, ZERO], 0, [0, 0], ZERO),  # the ego comes too early
+        ([ZERO, ONE], 0, [0, ONE], ZERO),  # the ego's item lies, the teammate keeps its own
+        ([0, 0], ONE, [ONE, 0], 0),  # the ego takes it
+        ([0, ZERO], ONE, [ONE, 0], ZERO),  # the ego makes room for the teammate's
+        ([ZERO, 0], ONE, [ZERO, ONE], 0),  # the ego cannot, the teammate takes it
+    ],
+)
+def test_agent_0_interacts_first_on_a_shared_counter(hands, lies, hands_after, lies_after):
+    record = scene(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): lies})
+    after = act(RING, record, INTERACT, INTERACT)
+    assert after.hands == hands_after
+    assert after.counters == ({(3, 2): lies_after} if lies_after else {})
+
+
+@pytest.mark.parametrize(
+    ("hands", "pot", "hands_after", "pot_after"),
+    [
+        ([ZERO, ONE], ZERO, [0, 0], (RECIPE_001, 19)),  # the teammate's is the third
+        ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the teammate's would be the fourth
+        ([PLATE, PLATE], SOUP_000, [DISH_000, PLATE], (0, 0)),
+        ([PLATE, ONE], SOUP_000, [DISH_000, 0], (ONE, 0)),  # the pot that the ego emptied takes an ingredient
+        ([ONE, PLATE], SOUP_000, [ONE, DISH_000], (0, 0)),
+        ([ZERO, PLATE], 2 * ZERO, [0, PLATE], (RECIPE_000, 19)),
+    ],
+)
+def test_agent_0_interacts_first_on_a_shared_pot(hands, pot, hands_after, pot_after):
+    record = scene(ASYMM, (3, 2, "right"), (5, 2, "left"), hands=hands, pot_items=[pot, 0])
+    after = act(ASYMM, record, INTERACT, INTERACT)
+    assert after.hands == hands_after
+    assert after.pots == [pot_after, (0, 0)]
+
+
+# Shaped rewards: each agent's own, apart from the team's
+
+
+def own(seat: int, value: float) -> list[float]:
+    return [value, 0] if seat == 0 else [0, value]
+
+
+@pytest.mark.parametrize(
+    ("hand", "content", "recipe", "reward"),
+    [
+        (ZERO, 0, RECIPE_000, 3),
+        (ZERO, 2 * ZERO, RECIPE_000, 3),
+        (ZERO, 2 * ONE, RECIPE_000, 3),  # the recipe needs it, whatever else is inside
+        (ONE, 0, RECIPE_000, 0),
+        (ONE, ONE, RECIPE_111, 3),
+        (ZERO, ZERO, RECIPE_001, 3),
+        (ZERO, 2 * ZERO, RECIPE_001, 0),  # enough of it inside
+        (ONE, 2 * ZERO, RECIPE_001, 3),
+        (ONE, ONE, RECIPE_001, 0),
+    ],
+)
+def test_placing_an_ingredient_pays_3_if_the_recipe_still_needs_it(seat, hand, content, recipe, reward):
+    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[content], recipe=recipe))
+    assert after.pots[0][0] == content + hand
+    assert after.shaped == own(seat, reward)
+    assert after.reward == 0
+
+
+@pytest.mark.parametrize(
+    ("soup", "recipe", "reward"),
+    [
+        (SOUP_000, RECIPE_000, 5),
+        (SOUP_111, RECIPE_111, 5),
+        (SOUP_001, RECIPE_001, 5),
+        (SOUP_111, RECIPE_000, 0),
+        (SOUP_001, RECIPE_000, 0),
+    ],
+)
+def test_taking_a_dish_pays_5_if_it_is_the_recipes(seat, soup, recipe, reward):
+    after = interact(seat, solo(seat, AT_POT, PLATE, pot_items=[soup], recipe=recipe))
+    assert after.hands[seat] == soup + PLATE
+    assert after.shaped == own(seat, reward)
+    assert after.reward == 0
+
+
+def test_taking_a_dish_off_a_counter_pays_nothing(seat):
+    after = interact(seat, solo(seat, AT_COUNTER, counters={COUNTER: DISH_000}, recipe=RECIPE_000))
+    assert (after.hands[seat], after.shaped) == (DISH_000, [0, 0])
+
+
+# Plates in asymm_both: two pots, (4, 2) and (4, 3); piles of plates at (3, 4) and (5, 4)
+
+AT_PLATES_ASYMM = ((3, 3, "down"), (5, 3, "down"))
+AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
+
+
+@pytest.mark.parametrize(
+    ("pots", "other_hand", "counters", "reward"),
+    [
+        ([0, 0], 0, {}, 0),  # no pot in use
+        ([ZERO, 0], 0, {}, 3),
+        ([0, SOUP_111], 0, {}, 3),
+        ([ZERO, 0], PLATE, {}, 0),  # as many plates in hands as pots in use
+        ([ZERO, ONE], PLATE, {}, 3),
+        ([ZERO, 0], DISH_000, {}, 3),  # a dish is no plate
+        ([ZERO, 0], 0, {(1, 4): PLATE}, 0),
+        ([ZERO, ONE], 0, {(6, 4): PLATE}, 0),
+        ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # neither is a plate
+    ],
+)
+def test_taking_a_plate_pays_3_if_it_is_needed(seat, pots, other_hand, counters, reward):
+    places, hands = list(AWAY), [other_hand, other_hand]
+    places[seat], hands[seat] = AT_PLATES_ASYMM[seat], 0
+    record = scene(ASYMM, places[0], places[1], hands=hands, pot_items=pots, counters=counters)
+    after = interact(seat, record, ASYMM)
+    assert after.hands[seat] == PLATE
+    assert after.shaped == own(seat, reward)
+    assert after.reward == 0
+
+
+@pytest.mark.parametrize("pots", [[0, 0], [ZERO, 0], [ZERO, ONE]])
+def test_a_plate_taken_off_a_counter_was_lying_there_and_pays_nothing(seat, pots):
+    counter = (AWAY[seat][0], 4)
+    record = scene(ASYMM, *AWAY, pot_items=pots, counters={counter: PLATE})
+    after = interact(seat, record, ASYMM)
+    assert (after.hands[seat], after.counters, after.shaped) == (PLATE, {}, [0, 0])
+
+
+def test_plates_in_hands_count_as_before_the_steps_interactions():
+    both = scene(ASYMM, *AT_PLATES_ASYMM, pot_items=[ZERO, 0])
+    assert act(ASYMM, both, INTERACT, INTERACT).shaped == [3, 3]  # the ego's new plate does not count yet
+
+    served = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[SOUP_001, ONE])
+    after = act(ASYMM, served, INTERACT, INTERACT)
+    assert after.hands == [DISH_001, PLATE]
+    assert after.shaped == [0, 0]  # the plate that the ego used still counts, against the one pot left
+
+
+def test_pots_and_counters_are_as_agent_0_left_them():
+    filled = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[ONE, 0], recipe=RECIPE_000)
+    assert act(ASYMM, filled, INTERACT, INTERACT).shaped == [0, 3]  # the ego's ingredient makes the plate useful
+
+    cleared = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], pot_items=[ZERO, ONE], counters={(2, 4): PLATE})
+    assert act(ASYMM, cleared, INTERACT, INTERACT).shaped == [0, 3]  # the ego took the plate that lay about
+
+    dropped = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[ZERO, ONE])
+    assert act(ASYMM, dropped, STAY, INTERACT).shaped == [0, 3]
+    assert act(ASYMM, dropped, INTERACT, INTERACT).shaped == [0, 0]  # the ego's plate lies on a counter now
+
+
+def test_shaped_rewards_are_each_agents_own():
+    record = scene(
+        ASYMM,
+        (3, 2, "right"),
+        (5, 3, "left"),
+        hands=[ZERO, PLATE],
+        pot_items=[ZERO, SOUP_000],
+        recipe=RECIPE_000,
+    )
+    after = act(ASYMM, record, INTERACT, INTERACT)
+    assert (after.shaped, after.reward) == ([3, 5], 0)
+
+
+# NumPy and JAX, and batch dimensions
+
+
+@lru_cache
+def compiled(layout: Layout):
+    """One jitted step with the observations of the state before it."""
+    return jax.jit(lambda *inputs: (*rules.step(layout, *inputs), observe_both(layout, inputs[0])))
+
+
+def random_inputs(layout: Layout, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(size)
+    actions = np.where(rng.random((size, 2)) < 0.5, INTERACT, rng.integers(0, 6, (size, 2))).astype(np.int32)
+    return random_records(layout, size, rng), actions, rng.choice(layout.recipe_items, size)
+
+
+def assert_same_bytes(found: Sequence, expected: Sequence) -> None:
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.dtype == theirs.dtype
+        assert ours.shape == theirs.shape
+        np.testing.assert_array_equal(np.asarray(ours), np.asarray(theirs))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_numpy_and_jax_give_equal_bytes(layout):
+    inputs = random_inputs(layout, 8192)
+    outcome = rules.step(layout, *inputs)
+    ours = (*outcome, observe_both(layout, inputs[0]))
+    assert [array.dtype.name for array in ours] == ["uint8", "float32", "float32", "uint8", "uint8"]
+    assert_same_bytes(compiled(layout)(*inputs), ours)
+    everything = 255 if layout.buttons else 255 & ~rules.PRESSED
+    assert np.bitwise_or.reduce(outcome.events, axis=None) == everything  # the states cover every event
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_batch_dimensions_of_any_rank_equal_the_flat_batch(layout):
+    inputs = random_inputs(layout, 15)
+    flat = (*rules.step(layout, *inputs), observe_both(layout, inputs[0]))
+    deep_inputs = [array.reshape(3, 5, *array.shape[1:]) for array in inputs]
+    deep = (*rules.step(layout, *deep_inputs), observe_both(layout, deep_inputs[0]))
+    assert_same_bytes(deep, [array.reshape(3, 5, *array.shape[1:]) for array in flat])
+    for agent in (0, 1):
+        np.testing.assert_array_equal(observe(layout, deep_inputs[0], agent), deep[-1][:, :, agent])
+    for number in range(15):
+        single_inputs = [array[number] for array in inputs]
+        single = (*rules.step(layout, *single_inputs), observe_both(layout, single_inputs[0]))
+        assert_same_bytes(single, [array[number] for array in flat])
+
+
+def test_batch_dimensions_of_any_rank_work_in_jax():
+    inputs = random_inputs(CRAMPED, 15)
+    flat = (*rules.step(CRAMPED, *inputs), observe_both(CRAMPED, inputs[0]))
+    deep = compiled(CRAMPED)(*(array.reshape(3, 5, *array.shape[1:]) for array in inputs))
+    assert_same_bytes(deep, [array.reshape(3, 5, *array.shape[1:]) for array in flat])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
+def test_actions_may_have_any_integer_type(dtype):
+    records, actions, recipes = random_inputs(RING, 256)
+    expected = rules.step(RING, records, actions, recipes)
+    assert_same_bytes(rules.step(RING, records, actions.astype(dtype), recipes), expected)
