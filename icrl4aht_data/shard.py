@@ -254,7 +254,7 @@ class Shard:
         """One chunk by its row in the chunk table, read from the file and checked; padding rows included."""
         element = field.element(self.layout, self.kind)
         shape = (self._chunk_rows(history_id, field), *field.row_shape(self.layout), *element.shape)
-        offset, size, expected = (int(value) for value in self._table[row])
+        offset, size, _, expected = (int(value) for value in self._table[row])
         with self.path.open("rb") as stream:
             stream.seek(offset)
             data = stream.read(size)
@@ -325,8 +325,8 @@ def _read_table(root: Path, name: str) -> np.ndarray:
         table = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
         raise IndexFormatError(f"{path}: the chunk table of {name} is missing") from error
-    except (ValueError, EOFError, OSError) as error:
-        raise IndexFormatError(f"{path}: not a chunk table: {error}") from error
+    except Exception as error:  # a damaged header makes NumPy's parser raise anything
+        raise IndexFormatError(f"{path}: not a chunk table: {error!r}") from error
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:
         raise IndexFormatError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
     return table

@@ -32,50 +32,47 @@ _HEAT, _READY, _LAMP, _PLATE_RIM = (255, 140, 40), (67, 190, 95), (255, 205, 40)
 _CHEF = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
 _CHEF_EDGE = {EGO: (17, 58, 133), TEAMMATE: (122, 14, 27)}
 _SKIN, _PLEAT, _LEAF = (250, 214, 180), (196, 204, 216), (62, 132, 60)
-_BROWN, _GOLD, _SHINE = (176, 120, 20), (246, 190, 50), (255, 228, 145)
+_GOLD, _SHINE = (246, 190, 50), (255, 228, 145)
 
-_SIDES = (-1, 1)
-_AROUND = [(math.cos(turn), math.sin(turn)) for turn in (k * math.tau / 7 for k in range(7))]
+_AROUND = [(math.cos(k * math.tau / 7), math.sin(k * math.tau / 7)) for k in range(7)]
 _INGREDIENTS = {
-    0: [  # an onion
-        *((0.34, _BROWN, (0, -0.98), (side * 0.36, -0.3)) for side in _SIDES),
-        *((0.12, _BROWN, (0, 0.8), (side * 0.3, 1)) for side in (-1, 0, 1)),
-        *((thick, colour, (-0.12, 0.14), (0.12, 0.14)) for thick, colour in ((1.64, _BROWN), (1.4, _GOLD))),
-        *((0.14, _GOLD, (0, -0.95), (side * 0.36, -0.3)) for side in _SIDES),
-        *((0.13, _SHINE, (side * 0.14, -0.4), (side * 0.42, 0.1), (side * 0.16, 0.6)) for side in _SIDES),
-    ],
-    1: [  # a tomato
-        *((thick, colour, (0, 0.08)) for thick, colour in ((1.84, (164, 40, 20)), (1.58, (240, 84, 48)))),
-        *((0.24, _LEAF, (0, -0.45), end) for end in ((-0.45, -0.55), (0.45, -0.55), (0, -0.95))),
-    ],
-    2: [  # a lettuce
-        *((0.9, _LEAF, (0.52 * x, 0.52 * y)) for x, y in _AROUND),
-        *((0.68, (140, 205, 85), (0.52 * x, 0.52 * y)) for x, y in _AROUND),
-        (0.8, (196, 235, 140), (0, 0)),
-    ],
-    3: [  # an aubergine
-        *((0.86, (66, 28, 96), (-0.3, 0.32), (0.35, -0.3)), (1.16, (66, 28, 96), (-0.28, 0.3))),
-        *((0.62, (165, 95, 205), (-0.3, 0.32), (0.35, -0.3)), (0.92, (165, 95, 205), (-0.28, 0.3))),
-        (0.4, _LEAF, (0.5, -0.45), (0.72, -0.72)),
-    ],
+    0: (  # an onion
+        (176, 120, 20),
+        *((0.12, _GOLD, (0, -0.95), (x, -0.3)) for x in (-0.36, 0, 0.36)),
+        *((0.06, _GOLD, (0, 0.8), (x, 0.95)) for x in (-0.3, 0, 0.3)),
+        (1.4, _GOLD, (-0.12, 0.14), (0.12, 0.14)),
+        *((0.13, _SHINE, (x, -0.4), (3 * x, 0.1), (x, 0.6)) for x in (-0.14, 0.14)),
+    ),
+    1: (  # a tomato
+        (150, 36, 18),
+        (1.6, (240, 84, 48), (0, 0.08)),
+        *((0.22, _LEAF, (0, -0.45), end) for end in ((-0.45, -0.55), (0.45, -0.55), (0, -0.9))),
+    ),
+    2: (_LEAF, *((0.7, (140, 205, 85), (0.5 * x, 0.5 * y)) for x, y in _AROUND), (0.8, (196, 235, 140), (0, 0))),
+    3: (  # an aubergine
+        (66, 28, 96),
+        (0.62, (165, 95, 205), (-0.3, 0.32), (0.35, -0.3)),
+        (0.92, (165, 95, 205), (-0.28, 0.3)),
+        (0.36, (90, 170, 80), (0.48, -0.44), (0.72, -0.7)),
+    ),
 }
-"""How each ingredient is drawn: strokes, see `_Canvas.strokes`, within a radius of 1."""
+"""The edge colour of each ingredient and the strokes that draw it within a radius of 1, see `_Canvas.strokes`."""
+_OTHER_INGREDIENT = (_INK, (1.6, _STEEL, (0, 0)))
 
 
 def draw_frame(
     layout: Layout, record: np.ndarray, *, cell: int = 48, caption: str = "", view: bool = True
 ) -> np.ndarray:
-    """A picture of one state: the ego blue, the teammate red, below the map the current recipe and the caption.
+    """A picture of one state: ego blue, teammate red, and a footer with the current recipe and a one-line caption.
 
     Args:
-        layout: the kitchen.
-        record: uint8 (S,), the state record.
+        layout, record: the kitchen, and a state record uint8 (S,).
         cell: side of a map cell in pixels, at least 16.
-        caption: one line for the footer; a long one is written smaller.
+        caption: text for the footer; a long one is written smaller.
         view: whether to outline the cells that the ego observes.
 
     Returns:
-        uint8 (height, width, 3), RGB: cell pixels for each of the map's columns and rows, and 0.8 cells of footer.
+        uint8 (height, width, 3), RGB: the map's rows and columns times `cell`, and below them 0.8 cells of footer.
 
     Raises:
         OptionError: no Pillow, a record of another shape or dtype or with impossible values, or too small a cell.
@@ -98,15 +95,12 @@ def save_episode(
     cell: int = 32,
     fps: int = 8,
 ) -> None:
-    """Write an episode as an animated GIF of T frames that loops endlessly. The file appears complete or not at all.
+    """Write an episode as a GIF of T frames that loops endlessly. The file appears complete or not at all.
 
     Args:
-        path: the file to write.
-        layout: the kitchen.
-        records: uint8 (T, S), the states in order.
+        path, layout, records: the file, the kitchen, and the state records uint8 (T, S) in order.
         rewards: real (T,), the reward of the step from each record; the captions then show the return so far.
-        cell: side of a map cell in pixels, at least 16.
-        fps: frames a second, 1 to 50.
+        cell, fps: side of a map cell in pixels, at least 16; frames a second, 1 to 50.
 
     Raises:
         OptionError: as in `draw_frame`, or there is no record, or rewards or fps do not fit.
@@ -191,13 +185,20 @@ class _Canvas:
         bounds = [self.unit * v for v in (x - radius, y - radius, x + radius, y + radius)]
         self.pen.pieslice(bounds, -90, 360 * part - 90, fill)
 
-    def strokes(self, parts: Iterable, x: float, y: float, size: float = 1, turn: tuple[float, float] = (1, 0)) -> None:
-        """Lines with round ends, of one point a disc: (thickness, fill, *points), the first axis pointing to `turn`."""
-        for thick, fill, *points in parts:
-            ends = [(x + size * (a * turn[0] - b * turn[1]), y + size * (a * turn[1] + b * turn[0])) for a, b in points]
-            self.pen.line([self.unit * v for end in ends for v in end], fill, round(self.unit * size * thick))
-            for end in ends:
-                self.disc(*end, size * thick / 2, fill)
+    def strokes(self, parts: Iterable, x: float, y: float, size=1.0, turn=(1.0, 0.0), edge=None, rim=0.0) -> None:
+        """Lines with round ends, or discs, (thickness, fill, *points), within one rim of the colour `edge`.
+
+        The points are relative to (x, y), in units of `size`; their first axis points to `turn`.
+        """
+        for colour, grow in ((edge, 2 * rim), (None, 0)) if edge else ((None, 0),):
+            for thick, fill, *points in parts:
+                ends = [
+                    (x + size * (a * turn[0] - b * turn[1]), y + size * (a * turn[1] + b * turn[0])) for a, b in points
+                ]
+                thick = size * (thick + grow)
+                self.pen.line([self.unit * v for end in ends for v in end], colour or fill, round(self.unit * thick))
+                for end in ends:
+                    self.disc(*end, thick / 2, colour or fill)
 
     def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor="mm", room: float = 99) -> None:
         """Text, smaller than `size` where that is wider than `room`."""
@@ -319,9 +320,8 @@ def _draw_trio(canvas: _Canvas, contents: list[int], x: float, y: float, radius:
 
 
 def _draw_ingredient(canvas: _Canvas, ingredient: int, x: float, y: float, radius: float) -> None:
-    canvas.strokes(_INGREDIENTS.get(ingredient, [(1.8, _STEEL, (0, 0))]), x, y, radius)
-    if ingredient not in _INGREDIENTS:
-        canvas.text(x, y, str(ingredient), 1.2 * radius, _WHITE)
+    edge, *parts = _INGREDIENTS.get(ingredient, _OTHER_INGREDIENT)
+    canvas.strokes(parts, x, y, radius, edge=edge, rim=0.12)
 
 
 def _draw_view(canvas: _Canvas, layout: Layout, cell: int) -> None:
@@ -338,18 +338,18 @@ def _draw_chef(canvas: _Canvas, layout: Layout, agent: int, cell: int, facing: i
     x, y = _centre(layout, cell)
     front_x, front_y = _centre(layout, int(layout.ahead[cell, facing]))
     forward = front_x - x, front_y - y
-    coat, edge = _CHEF[agent], _CHEF_EDGE[agent]
-    back, arms = ((-0.16, -0.2), (-0.16, 0.2)), [((-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in _SIDES]
-    parts = [
-        *((0.42 + grow, colour, *back) for grow, colour in ((0.07, edge), (0, coat))),
-        *((0.15 + grow, colour, *arm) for grow, colour in ((0.07, edge), (0, coat)) for arm in arms),
-        (0.42, coat, *back),
-        *((0.17, _SKIN, (0.34, 0.24 * side)) for side in _SIDES),
-        *((thick, colour, (0.02, 0)) for thick, colour in ((0.46, edge), (0.42, _SKIN))),
-        *((0.075, _INK, (0.15, 0.08 * side)) for side in _SIDES),
-        *((0.24, _PLEAT, (0.13 * a - 0.1, 0.13 * b)) for a, b in _AROUND),
-        *((0.2, _WHITE, (0.13 * a - 0.1, 0.13 * b)) for a, b in [*_AROUND, (0, 0)]),
-        *((0.025, _PLEAT, (0.05 * a - 0.1, 0.05 * b), (0.15 * a - 0.1, 0.15 * b)) for a, b in _AROUND),
+    arms = [((-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in (-1, 1)]
+    body = [
+        (0.42, _CHEF[agent], (-0.16, -0.2), (-0.16, 0.2)),
+        *((0.15, _CHEF[agent], *arm) for arm in arms),
+        *((0.16, _SKIN, (0.34, 0.24 * side)) for side in (-1, 1)),
+        (0.43, _SKIN, (0.03, 0)),
+        *((0.075, _INK, (0.17, 0.08 * side)) for side in (-1, 1)),
     ]
-    canvas.strokes(parts, x, y, turn=forward)
-    _draw_item(canvas, layout, hand, x + 0.38 * forward[0], y + 0.38 * forward[1], 0.22)
+    hat = [
+        *((0.2, _WHITE, (0.13 * a, 0.13 * b)) for a, b in [*_AROUND, (0, 0)]),
+        *((0.025, _PLEAT, (0.06 * a, 0.06 * b), (0.15 * a, 0.15 * b)) for a, b in _AROUND),
+    ]
+    canvas.strokes(body, x, y, turn=forward, edge=_CHEF_EDGE[agent], rim=0.03)
+    canvas.strokes(hat, x - 0.12 * forward[0], y - 0.12 * forward[1], turn=forward, edge=_PLEAT, rim=0.02)
+    _draw_item(canvas, layout, hand, x + 0.38 * forward[0], y + 0.38 * forward[1], 0.24)

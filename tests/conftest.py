@@ -1,0 +1,38 @@
+"""Releases that many tests read, made once."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plays import random_release
+
+
+@pytest.fixture(scope="session")
+def lite(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+    """A lite release of random play, and what went in. Read only."""
+    root = tmp_path_factory.mktemp("releases") / "lite"
+    return root, random_release(root, "lite")
+
+
+@pytest.fixture(scope="session")
+def full(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+    """The full twin of `lite`. Read only."""
+    root = tmp_path_factory.mktemp("releases") / "full"
+    return root, random_release(root, "full")
+
+
+@pytest.fixture(params=["lite", "full"])
+def either(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+    """Both kinds in turn."""
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def damaged(lite, tmp_path) -> Path:
+    """A copy of `lite` to damage."""
+    root = tmp_path / "release"
+    shutil.copytree(lite[0], root)
+    return root

@@ -1,0 +1,195 @@
+"""`verify` finds what is wrong, wherever it is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from plays import play, random_release
+
+from icrl4aht_data import verify_release
+from icrl4aht_data.cli import cli
+from icrl4aht_data.release import NewHistory, NewTask, write_manifest, write_release
+from icrl4aht_data.shard import chunk_table_path
+
+SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
+
+
+def problems(root, deep=False):
+    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, deep=deep).findings]
+
+
+def test_a_whole_release(either):
+    report = verify_release(either[0], deep=True)
+    assert report.ok
+    assert (report.histories, report.transitions) == (12, 1440)
+    assert report.files == 9
+    assert report.chunks >= 84
+
+
+def test_one_flipped_byte_names_the_chunk(damaged):
+    path = damaged / SHARD
+    table = np.load(chunk_table_path(damaged, SHARD))
+    data = bytearray(path.read_bytes())
+    data[int(table["offset"][9]) + 2] ^= 0xFF
+    path.write_bytes(data)
+    found = problems(damaged)
+    assert any("sha256: expected" in line for line in found)
+    assert any("chunk 0 of rewards in history 1 (bytes" in line and "crc32" in line for line in found), found
+
+
+def test_every_file_is_covered(damaged):
+    files = sorted(p for p in damaged.rglob("*") if p.is_file())
+    rng = np.random.default_rng(1)
+    for path in files:
+        whole = path.read_bytes()
+        for position in rng.integers(0, len(whole), 4):
+            spoiled = bytearray(whole)
+            spoiled[position] ^= 1 << rng.integers(8)
+            path.write_bytes(spoiled)
+            assert not verify_release(damaged).ok, (path, position)
+        path.write_bytes(whole)
+    assert verify_release(damaged).ok
+
+
+def test_missing_and_extra_files(damaged):
+    (damaged / "meta" / "provenance.json").unlink()
+    (damaged / "data" / "notes.txt").write_text("hello")
+    assert problems(damaged) == [
+        "meta/provenance.json: listed in the manifest, but missing",
+        "data/notes.txt: not listed in the manifest",
+    ]
+
+
+def test_no_folder(tmp_path):
+    assert "no such folder" in problems(tmp_path / "nowhere")[0]
+
+
+def rewritten(tmp_path, spoil, kind="lite"):
+    """A release whose hashes hold but whose content is spoiled."""
+    from plays import make_tasks
+
+    (task,) = make_tasks(["demo_simple"])
+    arrays = play(task.layout, 6, 20, np.random.default_rng(5))
+    new = NewTask(task, {}, lambda: [NewHistory(0, spoil(arrays))])
+    return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="")
+
+
+def at(name, index, value):
+    def spoil(arrays):
+        changed = arrays[name].copy()
+        changed[index] = value(changed[index]) if callable(value) else value
+        return arrays | {name: changed}
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (at("actions", 7, 6), "actions: expected 0..5, found"),
+        (at("teammate_actions", 7, -1), "teammate_actions: expected 0..5, found -1..5"),
+        (at("expert_actions", 0, 9), "expert_actions: expected 0..5"),
+        (at("dones", [100, 119], [True, False]), "dones: expected 6 episodes, the last ending at step 119"),
+        (at("state", (3, 0), 0), "state has a position that is not reachable floor"),
+        (at("state", (3, 2), 9), "state has an unknown facing"),
+        (at("state", (3, 4), 2), "state has an impossible item in hand"),
+        (at("episode_end_state", (1, 6), 5), "episode_end_state has an impossible recipe"),
+    ],
+)
+def test_values_out_of_range(tmp_path, spoil, message):
+    found = problems(rewritten(tmp_path, spoil))
+    assert any(message in line for line in found), found
+
+
+def test_an_untouched_rewrite_is_whole(tmp_path):
+    assert problems(rewritten(tmp_path, lambda arrays: arrays), deep=True) == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (at("rewards", 33, 20), "replay: 1 rewards differ, first at step 33: rules 0.0, found 20.0"),
+        (at("state", (45, 3), lambda facing: (facing + 1) % 4), "do not lead to the recorded next state"),
+        (at("state", (40, 7), 1), "1 episodes do not start as the environment starts, first episode 2"),
+        (at("episode_end_state", (2, 5), 1), "do not lead to the recorded next state, first step 59"),
+        (lambda a: a | {"actions": np.roll(a["actions"], 1)}, "do not lead to the recorded next state"),
+        (
+            lambda a: a | {"state": np.where(np.arange(a["state"].shape[1]) == 6, 0b01010100, a["state"])},
+            "a recipe is not one of the layout's",
+        ),
+    ],
+)
+def test_physics_that_cannot_have_happened_is_found_by_deep(tmp_path, spoil, message):
+    root = rewritten(tmp_path, spoil)
+    assert problems(root) == [], "only --deep looks at the physics"
+    found = problems(root, deep=True)
+    assert any(message in line for line in found), found
+
+
+def test_observations_that_the_state_does_not_show(tmp_path, monkeypatch):
+    from icrl4aht_data import release
+
+    real = release.observe
+
+    def wrong(layout, record, agent):
+        seen = real(layout, record, agent).copy()
+        seen[17, 2, 2, 0] = 0
+        return seen
+
+    monkeypatch.setattr(release, "observe", wrong)
+    root = rewritten(tmp_path, lambda arrays: arrays, kind="full")
+    assert problems(root) == []
+    assert any("obs: 1 steps differ from what their state shows, first step 17" in p for p in problems(root, deep=True))
+
+
+def test_index_that_disagrees_with_the_rewards_or_the_tasks(damaged):
+    path = damaged / "meta" / "histories.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines[0]["score"] += 1
+    lines[1]["seed"] = 77
+    lines[2]["task_id"] = "unheard_of"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(damaged)
+    found = problems(damaged)
+    assert any("history 0: score: the index says" in line for line in found), found
+    assert any("history 1: index and task" in line for line in found), found
+    assert any("history 2: its task 'unheard_of' is missing" in line for line in found), found
+
+
+def test_shard_that_another_tool_would_read_differently(damaged):
+    """The chunk table points at the right bytes, but HDF5's own structure does not."""
+    other = damaged.with_name("other")
+    random_release(other, streams=2)
+    table = chunk_table_path(damaged, SHARD)
+    shutil.copy(chunk_table_path(other, SHARD), table)
+    write_manifest(damaged)
+    assert problems(damaged)
+
+
+class TestCommand:
+    def test_whole(self, lite):
+        result = CliRunner().invoke(cli, ["verify", "--deep", str(lite[0])])
+        assert result.exit_code == 0
+        assert "whole; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in result.output
+
+    def test_damaged(self, damaged):
+        path = damaged / SHARD
+        data = bytearray(path.read_bytes())
+        data[int(np.load(chunk_table_path(damaged, SHARD))["offset"][0])] ^= 1
+        path.write_bytes(data)
+        result = CliRunner().invoke(cli, ["verify", str(damaged)])
+        assert result.exit_code == 1
+        assert "chunk 0 of state in history 0" in result.output
+        as_json = CliRunner().invoke(cli, ["verify", "--json", str(damaged)])
+        assert as_json.exit_code == 1
+        content = json.loads(as_json.output)
+        assert not content["ok"]
+        assert {finding["file"] for finding in content["findings"]} == {SHARD}
+
+    def test_quiet(self, lite):
+        result = CliRunner().invoke(cli, ["verify", "-q", str(lite[0])])
+        assert (result.exit_code, result.output) == (0, "")
