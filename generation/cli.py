@@ -12,7 +12,7 @@ from rich.console import Console
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.schema import KINDS, Kind
 
-console = Console()
+console = Console(soft_wrap=True)
 
 _profile = click.option("--profile", "profile_name", default="smoke", show_default=True, help="Name or TOML file.")
 

@@ -1,4 +1,4 @@
-"""JaxMARL's OvercookedV2 beside our rules: the same maps, and states translated both ways."""
+"""JaxMARL's OvercookedV2 beside our rules: states translated both ways."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxmarl.environments.overcooked_v2.common import Agent, Position
-from jaxmarl.environments.overcooked_v2.layouts import Layout as PeerLayout
 from jaxmarl.environments.overcooked_v2.overcooked import OvercookedV2
 from jaxmarl.environments.overcooked_v2.overcooked import State as PeerState
 
@@ -15,19 +14,6 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import unpack
 
 TO_PEER_ACTION = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS])
-
-
-def peer_environment(layout: Layout, max_steps: int = 400) -> OvercookedV2:
-    """The peer's environment on our map, with the benchmark's options."""
-    return OvercookedV2(
-        PeerLayout.from_string("\n".join(layout.rows), possible_recipes=[list(r) for r in layout.recipes]),
-        max_steps=max_steps,
-        agent_view_size=2,
-        random_agent_positions=True,
-        negative_rewards=True,
-        sample_recipe_on_delivery=True,
-        indicate_successful_delivery=layout.indicates_delivery,
-    )
 
 
 def to_peer_item(layout: Layout, item: np.ndarray) -> np.ndarray:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from peers import TO_PEER_ACTION, from_peer_state, peer_environment, peer_step, to_peer_state
+from peers import TO_PEER_ACTION, from_peer_state, peer_step, to_peer_state
 from scenes import random_records
 
+from benchmarks.peers import jaxmarl_environment
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.rules import step
@@ -19,7 +20,7 @@ BATCH, STEPS, SCENES = 512, 20, 20  # trajectories: 10,240 steps; single steps f
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_step_rewards_and_observations_equal_jaxmarl(layout):
     rng = np.random.default_rng(0)
-    env = peer_environment(layout)
+    env = jaxmarl_environment(layout)
     advance = peer_step(env)
     events = 0
     records = random_records(layout, BATCH, rng)

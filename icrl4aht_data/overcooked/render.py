@@ -23,7 +23,7 @@ from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, reco
 if TYPE_CHECKING:
     from PIL import Image
 
-_ENLARGE, _FOOTER, _SMALLEST_CELL, _GIF_COLOURS = 4, 0.8, 16, 128
+_ENLARGE, _FOOTER, _SMALLEST_CELL, _GIF_COLOURS = 4, 0.8, 16, 127  # and one transparent, for what stays
 
 _INK, _STEEL, _DARK_STEEL, _WHITE = (43, 48, 58), (124, 133, 146), (58, 64, 75), (255, 255, 255)
 _FLOOR, _FAR_WALL, _PAPER = ((248, 245, 238), (239, 234, 224)), (199, 193, 184), (255, 252, 240)
@@ -31,8 +31,7 @@ _COUNTER, _COUNTER_TOP, _CRATE, _CRATE_INSIDE = (168, 131, 92), (205, 171, 130),
 _HEAT, _READY, _LAMP, _PLATE_RIM = (255, 140, 40), (67, 190, 95), (255, 205, 40), (160, 178, 200)
 _CHEF = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
 _CHEF_EDGE = {EGO: (17, 58, 133), TEAMMATE: (122, 14, 27)}
-_SKIN, _PLEAT, _LEAF = (250, 214, 180), (196, 204, 216), (62, 132, 60)
-_GOLD, _SHINE = (246, 190, 50), (255, 228, 145)
+_SKIN, _PLEAT, _LEAF, _GOLD = (250, 214, 180), (196, 204, 216), (62, 132, 60), (246, 190, 50)
 
 _AROUND = [(math.cos(k * math.tau / 7), math.sin(k * math.tau / 7)) for k in range(7)]
 _INGREDIENTS = {
@@ -41,7 +40,7 @@ _INGREDIENTS = {
         *((0.12, _GOLD, (0, -0.95), (x, -0.3)) for x in (-0.36, 0, 0.36)),
         *((0.06, _GOLD, (0, 0.8), (x, 0.95)) for x in (-0.3, 0, 0.3)),
         (1.4, _GOLD, (-0.12, 0.14), (0.12, 0.14)),
-        *((0.13, _SHINE, (x, -0.4), (3 * x, 0.1), (x, 0.6)) for x in (-0.14, 0.14)),
+        *((0.13, (255, 228, 145), (x, -0.4), (3 * x, 0.1), (x, 0.6)) for x in (-0.14, 0.14)),
     ),
     1: (  # a tomato
         (150, 36, 18),
@@ -114,9 +113,11 @@ def save_episode(
         caption = f"step {step}" if math.isnan(reward) else f"step {step}   return {earned:g}"
         frames.append(_picture(layout, record, cell, caption, True))
         earned += reward
-    palette, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
-    first, *rest = (frame.quantize(palette=palette, dither=dither) for frame in frames)
-    _write(Path(path), first, format="GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
+    colours, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
+    first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
+    timing = {"duration": round(1000 / fps), "loop": 0}
+    palette = bytes(colours.getpalette() or [])  # given here, Pillow writes it once instead of once a frame
+    _write(Path(path), first, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **timing)
 
 
 def _pillow():
@@ -192,19 +193,18 @@ class _Canvas:
         """
         for colour, grow in ((edge, 2 * rim), (None, 0)) if edge else ((None, 0),):
             for thick, fill, *points in parts:
-                ends = [
-                    (x + size * (a * turn[0] - b * turn[1]), y + size * (a * turn[1] + b * turn[0])) for a, b in points
-                ]
-                thick = size * (thick + grow)
-                self.pen.line([self.unit * v for end in ends for v in end], colour or fill, round(self.unit * thick))
+                turned = [(a * turn[0] - b * turn[1], a * turn[1] + b * turn[0]) for a, b in points]
+                ends = [(x + size * a, y + size * b) for a, b in turned]
+                wide = size * (thick + grow)
+                self.pen.line([self.unit * v for end in ends for v in end], colour or fill, round(self.unit * wide))
                 for end in ends:
-                    self.disc(*end, thick / 2, colour or fill)
+                    self.disc(*end, wide / 2, colour or fill)
 
     def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor="mm", room: float = 99) -> None:
         """Text, smaller than `size` where that is wider than `room`."""
         width = self.pen.textlength(words, _font(round(self.unit * size))) / self.unit
         font = _font(max(1, int(self.unit * size * room / max(room, width))))
-        self.pen.text((self.unit * x, self.unit * y), words, fill, font, anchor, stroke_width=font.size / 40)
+        self.pen.text((self.unit * x, self.unit * y), words, fill, font, anchor, stroke_width=round(font.size / 40))
 
 
 def _picture(layout: Layout, record: np.ndarray, cell: int, caption: str, view: bool) -> Image.Image:
@@ -226,7 +226,7 @@ def _picture(layout: Layout, record: np.ndarray, cell: int, caption: str, view: 
     middle = layout.height + _FOOTER / 2
     canvas.text(0.15, middle, "Recipe", 0.34, _INK, "lm")
     for number, ingredient in enumerate(recipe):
-        _draw_ingredient(canvas, ingredient, 1.52 + 0.42 * number, middle, 0.2)
+        _draw_ingredient(canvas, ingredient, 1.56 + 0.42 * number, middle, 0.2)
     canvas.text(layout.width - 0.15, middle, caption, 0.34, _INK, "rm", room=layout.width - 2.9)
     return canvas.image.reduce(_ENLARGE)
 
@@ -281,9 +281,8 @@ def _draw_pot(canvas: _Canvas, x: float, y: float, contents: list[int], timer: i
         canvas.box(x, y + 0.26, 0.5, 0.34, _HEAT, 0.1)
         canvas.text(x, y + 0.26, str(timer), 0.34, _WHITE)
     if cooked:
-        canvas.disc(x, y + 0.25, 0.2, _WHITE)
-        canvas.disc(x, y + 0.25, 0.17, _READY)
-        canvas.strokes([(0.06, _WHITE, (-0.08, 0), (-0.02, 0.07), (0.09, -0.07))], x, y + 0.25)
+        tick = (0.06, _WHITE, (-0.08, 0), (-0.02, 0.07), (0.09, -0.07))
+        canvas.strokes([(0.4, _WHITE, (0, 0)), (0.34, _READY, (0, 0)), tick], x, y + 0.25)
 
 
 def _draw_button(canvas: _Canvas, x: float, y: float, recipe: list[int], timer: int) -> None:
@@ -327,10 +326,10 @@ def _draw_ingredient(canvas: _Canvas, ingredient: int, x: float, y: float, radiu
 def _draw_view(canvas: _Canvas, layout: Layout, cell: int) -> None:
     """The outline of the ego's window, as far as it is on the map."""
     x, y = _centre(layout, cell)
-    corners = np.array([x, y, x, y]) + np.array([-1, -1, 1, 1]) * WINDOW / 2
-    bounds = canvas.unit * np.clip(corners, 0, [layout.width, layout.height] * 2)
+    reach = WINDOW / 2
+    corners = np.clip([x - reach, y - reach, x + reach, y + reach], 0, [layout.width, layout.height] * 2)
     for thick, colour in ((0.1, _WHITE), (0.065, _CHEF[EGO])):
-        canvas.pen.rectangle(bounds.tolist(), outline=colour, width=round(canvas.unit * thick))
+        canvas.pen.rectangle((canvas.unit * corners).tolist(), outline=colour, width=round(canvas.unit * thick))
 
 
 def _draw_chef(canvas: _Canvas, layout: Layout, agent: int, cell: int, facing: int, hand: int) -> None:
@@ -338,10 +337,9 @@ def _draw_chef(canvas: _Canvas, layout: Layout, agent: int, cell: int, facing: i
     x, y = _centre(layout, cell)
     front_x, front_y = _centre(layout, int(layout.ahead[cell, facing]))
     forward = front_x - x, front_y - y
-    arms = [((-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in (-1, 1)]
     body = [
         (0.42, _CHEF[agent], (-0.16, -0.2), (-0.16, 0.2)),
-        *((0.15, _CHEF[agent], *arm) for arm in arms),
+        *((0.15, _CHEF[agent], (-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in (-1, 1)),
         *((0.16, _SKIN, (0.34, 0.24 * side)) for side in (-1, 1)),
         (0.43, _SKIN, (0.03, 0)),
         *((0.075, _INK, (0.17, 0.08 * side)) for side in (-1, 1)),

@@ -1,0 +1,1 @@
+"""Benchmarks as commands: JSON lines, with the peer measured in the same run."""

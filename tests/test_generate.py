@@ -1,0 +1,181 @@
+"""The whole rebuild at its smallest: collect, resume, pack, verify, sample; the demo; the learner's speed."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rich.console import Console
+
+from generation import build, collect
+from generation.cli import cli
+from generation.collect import METADATA
+from generation.learners.checkpoint import load_policy
+from generation.profiles import load_profile
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.errors import OptionError
+
+TINY = """
+[ego]
+total_steps = 16_000
+environments = 8
+rollout = 80
+minibatches = 2
+shaping_horizon = 16_000
+widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
+
+[release]
+keep = 3
+
+[tasks]
+layouts = ["demo_wide"]
+presets = ["default"]
+"""
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """One task collected and packed both ways by the command."""
+    out = tmp_path_factory.mktemp("built")
+    (out / "tiny.toml").write_text(TINY)
+    arguments = ["generate", "--profile", str(out / "tiny.toml"), "--out", str(out / "a")]
+    result = CliRunner().invoke(cli, [*arguments, "--kind", "lite", "--kind", "full"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return out
+
+
+def artefact(out: Path) -> Path:
+    (folder,) = (out / "artefacts").iterdir()
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["lite", "full"])
+def test_releases_are_whole_and_replay(built, kind):
+    report = verify_release(built / "a" / kind, deep=True)
+    assert report.ok, report.findings
+    assert (report.histories, report.transitions) == (3, 3 * 500)
+
+
+def test_history_is_the_first_100_of_each_400_steps(built):
+    history = load_icrl4aht(built / "a" / "lite")[0]
+    assert (history.entry.T, history.entry.episodes) == (500, 5)
+    assert np.flatnonzero(history.dones[:]).tolist() == [99, 199, 299, 399, 499]
+    metrics = [json.loads(line) for line in (artefact(built / "a") / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in metrics] == [640 * (k + 1) for k in range(25)]
+
+
+def test_the_best_streams_are_kept_best_first(built):
+    rewards = np.load(artefact(built / "a") / "rewards.npy")
+    returns = rewards.reshape(8, 5, 100).sum(axis=-1)
+    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # w = 5: start and end are the same five episodes
+    kept = [entry.env_idx for entry in load_icrl4aht(built / "a" / "lite").entries]
+    assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
+
+
+def test_entries_say_where_they_come_from(built):
+    root = built / "a" / "lite"
+    entry = load_icrl4aht(root).entries[0]
+    assert (entry.teammate_family, entry.teammate_kind, entry.split) == ("H4", "utility_greedy", "train")
+    assert entry.has_expert_actions
+    provenance = json.loads((root / "meta" / "provenance.json").read_text())[entry.task_id]
+    assert provenance["ego"]["environments"] == 8
+    assert provenance["streams_kept"] == 3
+    assert "What it is not" in (root / "README.md").read_text()
+
+
+def test_the_final_ego_is_kept(built):
+    network, params, card = load_policy(artefact(built / "a"))
+    assert network.widths.gru == 8
+    assert card["steps"] == 16_000
+    assert params["params"]["actor"]["kernel"].shape == (8, 6)
+
+
+def test_a_finished_task_is_not_done_again(built, monkeypatch):
+    def never(*arguments):
+        raise AssertionError("the task was collected again")
+
+    monkeypatch.setattr(build, "run_task", never)
+    output = StringIO()
+    before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
+    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
+    assert "finished before" in output.getvalue()
+    assert (built / "a" / "lite" / "MANIFEST.sha256").read_bytes() == before
+
+
+def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_path):
+    profile = load_profile(str(built / "tiny.toml"))
+    (task,) = profile.tasks()
+    folder = tmp_path / "copy"
+    shutil.copytree(artefact(built / "a"), folder)
+    assert collect.is_finished(folder, task, profile)
+    (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
+    assert not collect.is_finished(folder, task, load_profile(str(built / "other.toml")))
+    actions = bytearray((folder / "actions.npy").read_bytes())
+    actions[-1] ^= 1
+    (folder / "actions.npy").write_bytes(actions)
+    assert not collect.is_finished(folder, task, profile)
+    (folder / METADATA).unlink()
+    assert not collect.is_finished(folder, task, profile)
+
+
+def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    (task,) = profile.tasks()
+    folder = built / "b" / task.task_id
+
+    def stop(update, metrics):
+        if update == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect.run_task(task, profile, folder, stop)
+    assert not folder.exists()
+    collect.run_task(task, profile, folder)
+    for name in ("state", "actions", "teammate_actions", "rewards", "episode_end_state"):
+        assert (folder / f"{name}.npy").read_bytes() == (artefact(built / "a") / f"{name}.npy").read_bytes(), name
+    weights = "policy.safetensors"
+    assert (folder / weights).read_bytes() == (artefact(built / "a") / weights).read_bytes()
+
+
+def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
+    shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
+    (tmp_path / "lite").mkdir()
+    (tmp_path / "lite" / "notes.txt").write_text("mine")
+    with pytest.raises(OptionError, match="is not a release"):
+        build.build_releases(str(built / "tiny.toml"), tmp_path, ["lite"], Console(file=StringIO()))
+    assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
+
+
+def test_demo_draws_and_measures(built):
+    out = built / "a"  # its task is finished, so the demo goes straight on
+    result = CliRunner().invoke(cli, ["demo", "--profile", str(built / "tiny.toml"), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    for expected in ("6/6", "whole:", "target_actions", "context_next_obs", "done in"):
+        assert expected in result.output
+    assert (out / "learning_curves.png").stat().st_size > 5_000
+    assert (out / "episode.gif").read_bytes()[:6] == b"GIF89a"
+    (line,) = [line for line in result.output.splitlines() if line.startswith("{")]
+    measured = json.loads(line)
+    shares = [measured[f"{name}_share"] for name in ("environment", "forward", "update")]
+    assert sum(shares) == pytest.approx(1, abs=1e-3)
+    assert measured["steps_per_second"] > 0
+
+
+def test_nothing_but_lines_where_output_is_no_terminal(built):
+    output = StringIO()
+    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
+    assert not re.search(r"\x1b|━", output.getvalue())
+
+
+def test_unknown_profile_is_one_line(tmp_path):
+    from generation.cli import main
+
+    result = CliRunner().invoke(cli, ["generate", "--profile", "huge", "--out", str(tmp_path)])
+    assert "unknown profile 'huge'; valid: mini, paper, smoke" in str(result.exception)
+    assert callable(main)
