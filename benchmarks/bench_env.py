@@ -96,7 +96,8 @@ class Loop:
 def compare(layout: Layout, n: int, written: str, rounds: int) -> dict[str, Any]:
     """One JSON line."""
     ours, peer = Loop(our_game(layout, n, written), n), Loop(peer_game(layout, n, written), n)
-    ours.steps_per_second(0), peer.steps_per_second(0)  # compile
+    for loop in (ours, peer):
+        loop.steps_per_second(0)  # compiles
     pairs = [(ours.steps_per_second(r), peer.steps_per_second(r)) for r in range(1, rounds + 1)]
     ratios = [a / b for a, b in pairs]
     return {

@@ -27,15 +27,22 @@ def cli() -> None:
 @_profile
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for artefacts and releases.")
 @click.option("--kind", type=click.Choice(KINDS), multiple=True, default=("lite",), show_default=True)
-def generate(profile_name: str, out: Path, kind: tuple[Kind, ...]) -> None:
+@click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
+def generate(profile_name: str, out: Path, kind: tuple[Kind, ...], bundle: bool) -> None:
     """Train an ego for every task of a profile, record it, and pack the releases OUT/lite or OUT/full.
 
     Finished tasks are kept: after a stop, the same command goes on with the first unfinished one.
     """
     from generation.build import build_releases
+    from generation.package import bundle_release
 
-    for release in build_releases(profile_name, out, kind, console):
+    if bundle and "lite" not in kind:
+        raise click.UsageError("--bundle needs --kind lite")
+    releases = dict(zip(kind, build_releases(profile_name, out, kind, console), strict=True))
+    for release in releases.values():
         console.print(f"release: {release}")
+    if bundle:
+        console.print(f"bundled: {bundle_release(releases['lite'])}")
 
 
 @cli.command()
@@ -55,6 +62,24 @@ def speed(profile_name: str, layout: str) -> None:
     task = make_task(track_of(name), "train", name, heuristic_teammate("utility_greedy", "default", 0), 0)
     measured = learner_speed(make_learner(task, load_profile(profile_name)))
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
+
+
+@cli.command()
+@click.option("--check", is_flag=True, help="Write nothing; fail if the files differ.")
+def manifests(check: bool) -> None:
+    """Write the published test tasks into icrl4aht_data/manifests, from the parameter tables."""
+    from generation.teammates.instances import published_tasks
+    from icrl4aht_data.benchmark import TRACKS
+    from icrl4aht_data.errors import TaskFormatError
+    from icrl4aht_data.tasks import manifest_path, read_tasks, write_tasks
+
+    for track in TRACKS:
+        path, tasks = manifest_path(track, "test"), published_tasks(track)
+        if not check:
+            write_tasks(path, tasks)
+        elif read_tasks(path) != tasks:
+            raise TaskFormatError(f"{path}: differs from the parameter tables; run `python -m generation manifests`")
+        console.print(f"{path}: {len(tasks)} tasks")
 
 
 @cli.command()

@@ -63,7 +63,9 @@ class Environment:
         return self.layout.recipe_items if self.recipes is None else self.recipes
 
     def init(self, keys: Key[Array, " N"]) -> EnvState:
-        """The first episode of each environment."""
+        """The first episode of each environment; keys also as raw uint32 (N, 2)."""
+        if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
+            keys = jax.random.wrap_key_data(keys)
         zero = jnp.zeros(keys.shape, jnp.int32)
         return EnvState(keys, zero, zero, self.first_record(keys, zero))
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from generation.collect import METADATA
 from generation.curate import best_streams, relabel
 from generation.learners.checkpoint import load_policy
 from generation.profiles import Profile
+from icrl4aht_data.dataset import MINI
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import Kind
 from icrl4aht_data.tasks import Task
@@ -33,6 +35,15 @@ def package(
     return write_release(target, kind, new, data_version=DATA_VERSION, card=_card(profile, tasks), done=done)
 
 
+def bundle_release(release: Path) -> Path:
+    """Put a copy of a release in the place of the one that the package bundles."""
+    copy = MINI.with_name(f"{MINI.name}.partial")
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(release, copy)
+    shutil.rmtree(MINI, ignore_errors=True)
+    return copy.rename(MINI)
+
+
 def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
     metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
     provenance = {
@@ -44,10 +55,10 @@ def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
         "streams_kept": profile.keep,
         "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
     }
-    return NewTask(task, provenance, lambda: _histories(folder, task, profile))
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, profile))
 
 
-def _histories(folder: Path, task: Task, profile: Profile) -> list[NewHistory]:
+def _histories(folder: Path, task: Task, profile: Profile) -> Iterator[NewHistory]:
     arrays = record.Histories(
         **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in record.Histories._fields}
     )
@@ -55,14 +66,9 @@ def _histories(folder: Path, task: Task, profile: Profile) -> list[NewHistory]:
     network, params, _ = load_policy(folder)
     labels = relabel(task.layout, network, params, arrays.state[streams])
     dones = record.dones(arrays.actions.shape[1])
-    return [
-        NewHistory(
-            int(stream),
-            {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}
-            | {"dones": dones, "expert_actions": expert},
-        )
-        for stream, expert in zip(streams, labels, strict=True)
-    ]
+    for stream, expert in zip(streams, labels, strict=True):
+        recorded = {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}
+        yield NewHistory(int(stream), recorded | {"dones": dones, "expert_actions": expert})
 
 
 def _card(profile: Profile, tasks: Sequence[Task]) -> str:

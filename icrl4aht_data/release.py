@@ -7,8 +7,9 @@ import json
 import os
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
-    ACTION_DIM,
     FORMAT_VERSION,
     HISTORIES,
     INFO,
@@ -50,11 +50,19 @@ class NewHistory:
 
 @dataclass(frozen=True)
 class NewTask:
-    """One task with its histories. `load` is called once, when its shard is written."""
+    """One task with its histories.
+
+    Args:
+        task: what was learned.
+        provenance: how; any JSON.
+        streams: the number of histories that `load` gives.
+        load: called once, when its shard is written, so that few histories are in memory at a time.
+    """
 
     task: Task
     provenance: dict[str, Any]
-    load: Callable[[], list[NewHistory]]
+    streams: int
+    load: Callable[[], Iterable[NewHistory]]
 
 
 def write_release(
@@ -76,7 +84,7 @@ def write_release(
         data_version: SemVer of the data.
         card: README.md of the release.
         shard_histories: at most this many histories a shard.
-        done: called after each shard's task, for progress.
+        done: called when a task's histories have been taken, for progress.
 
     Raises:
         OptionError: if there is no task, or a history's arrays are of unequal length or lossy.
@@ -121,14 +129,16 @@ def _fill(
     for new in tasks:
         groups[new.task.track, new.task.layout.name, new.task.split].append(new)
     for (track, layout, split), members in groups.items():
-        histories = [(new.task, history) for new in members for history in _loaded(new, done)]
-        shards = -(-len(histories) // shard_histories)
+        histories = (pair for new in members for pair in _loaded(new, done))
+        shards = -(-sum(new.streams for new in members) // shard_histories)
         for number in range(shards):
-            part = histories[number * shard_histories : (number + 1) * shard_histories]
+            part = list(islice(histories, shard_histories))
             name = f"data/{track}/{layout}/{split}-{number:05}-of-{shards:05}.h5"
             new_entries = _placed([_entry(task, history, name) for task, history in part], kind, len(entries))
-            write_shard(root, name, kind, new_entries, [_with_obs(task, h, kind) for task, h in part])
+            write_shard(root, name, kind, new_entries, (_with_obs(task, h, kind) for task, h in part))
             entries += new_entries
+        for _ in histories:  # to the end, where a wrong count is noticed and the last task reported
+            pass
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
     write_tasks(root / TASKS, [new.task for new in tasks])
@@ -138,10 +148,14 @@ def _fill(
     write_manifest(root)
 
 
-def _loaded(new: NewTask, done: Callable[[Task], None]) -> list[NewHistory]:
-    histories = new.load()
+def _loaded(new: NewTask, done: Callable[[Task], None]) -> Iterator[tuple[Task, NewHistory]]:
+    given = 0
+    for history in new.load():
+        yield new.task, history
+        given += 1
+    if given != new.streams:
+        raise OptionError(f"task {new.task.task_id}: {given} histories, but {new.streams} were announced")
     done(new.task)
-    return histories
 
 
 def _entry(task: Task, history: NewHistory, shard: str) -> Entry:
@@ -154,7 +168,7 @@ def _entry(task: Task, history: NewHistory, shard: str) -> Entry:
         env_idx=history.env_idx,
         T=len(arrays["actions"]),
         obs_shape=task.layout.obs_shape,
-        action_dim=ACTION_DIM,
+        action_dim=len(ACTIONS),
         track=task.track,
         split=task.split,
         layout=task.layout.name,

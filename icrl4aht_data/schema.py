@@ -34,11 +34,10 @@ INFO, HISTORIES, TASKS, PROVENANCE = (
 Kind = Literal["full", "lite"]
 KINDS: tuple[Kind, ...] = ("full", "lite")
 
-ACTION_DIM = 6
-
 CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")])
 """One line of a chunk table: where the stored bytes are, how many of the chunk's rows are the history's (the last chunk
-is padded), and the checksum of the stored bytes. Lines stand in the order of histories in the shard, then of `FIELDS`, then of chunks."""
+is padded), and the checksum of the stored bytes. Lines stand in the order of histories, then of `FIELDS`, then of
+chunks."""
 
 
 @dataclass(frozen=True)

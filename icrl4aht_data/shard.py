@@ -10,7 +10,7 @@ import os
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ def chunk_table_path(root: Path, shard: str) -> Path:
     return (root / "meta" / "chunks" / Path(shard).relative_to("data")).with_suffix(".npy")
 
 
-def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Sequence[dict]) -> None:
+def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[dict]) -> None:
     """Write a shard and its chunk table; each appears whole or not at all.
 
     Args:
@@ -280,7 +280,7 @@ class Shard:
         offset, size = int(self._table["offset"][row]), int(self._table["size"][row])
         return f"chunk {row - first} of {name} in history {history_id} (bytes {offset}..{offset + size})"
 
-    def chunk_rows(self):
+    def chunk_rows(self) -> Iterator[tuple[int, int, Field]]:
         """Every chunk as (table row, history id, field)."""
         for history_id, entry in self._entries.items():
             for field in entry.stored_fields(self.kind):

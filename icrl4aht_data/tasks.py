@@ -70,6 +70,19 @@ def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], 
     return f"{track}_{split}_{layout_name}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{seed}_{digest}"
 
 
+def manifest_path(track: str, split: str) -> Path:
+    """The bundled manifest of a track's tasks.
+
+    Raises:
+        UnknownNameError: for an unknown track or split.
+    """
+    if track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    if split not in SPLITS:
+        raise unknown("split", split, SPLITS)
+    return Path(__file__).parent / "manifests" / f"{track}_{split}.jsonl"
+
+
 def read_tasks(path: Path) -> list[Task]:
     """The tasks of a JSONL file.
 

@@ -83,6 +83,6 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
-        tasks.append(NewTask(task, {"seed": seed}, lambda histories=histories: histories))
+        tasks.append(NewTask(task, {"seed": seed}, streams, lambda histories=histories: histories))
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", shard_histories=shard_histories)
     return written

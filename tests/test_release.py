@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -47,7 +48,7 @@ def test_plain_h5py_reads_the_same(either):
     for entry in load_icrl4aht(root).entries:
         with h5py.File(root / entry.shard) as file:
             for name, array in written[entry.history_id].items():
-                dataset = file[f"{entry.h5_group}/{name}"]
+                dataset: Any = file[f"{entry.h5_group}/{name}"]
                 found = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
                 np.testing.assert_array_equal(found, array)
 
@@ -56,7 +57,7 @@ def test_full_has_the_papers_fields_and_dtypes(full):
     root, _ = full
     entry = load_icrl4aht(root).entries[0]
     with h5py.File(root / entry.shard) as file:
-        group = file[entry.h5_group]
+        group: Any = file[entry.h5_group]
         dtypes = {name: str(group[name].dtype) for name in group if FIELDS[name].row != "state"}
         assert group["obs"].shape == (entry.T, *entry.obs_shape)
         assert group["state"][()].shape == (entry.T, record_size(get_layout(entry.layout)))
@@ -146,7 +147,7 @@ def short(arrays):
 def test_arrays_that_do_not_fit_are_refused_and_nothing_remains(tmp_path, spoil, message):
     (task,) = make_tasks(["cramped_up"])
     arrays = spoil(play(task.layout, 5, 10, np.random.default_rng(0)))
-    new = NewTask(task, {}, lambda: [NewHistory(0, arrays)])
+    new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)])
     with pytest.raises(OptionError, match=message):
         write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="")
     assert list(tmp_path.iterdir()) == []
@@ -161,12 +162,24 @@ def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
         raise RuntimeError("no data")
 
     with pytest.raises(RuntimeError, match="no data"):
-        write_release(root, "lite", [NewTask(make_tasks(["cramped_up"])[0], {}, fail)], data_version="1.0.0", card="")
+        write_release(
+            root, "lite", [NewTask(make_tasks(["cramped_up"])[0], {}, 1, fail)], data_version="1.0.0", card=""
+        )
     assert (root / "MANIFEST.sha256").read_bytes() == before
     assert verify_release(root).ok
     random_release(root, seed=2)
     assert (root / "MANIFEST.sha256").read_bytes() != before
     assert [path.name for path in tmp_path.iterdir()] == ["release"]
+
+
+def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
+    (task,) = make_tasks(["cramped_up"])
+    arrays = play(task.layout, 5, 10, np.random.default_rng(0))
+    for announced in (1, 3):
+        new = NewTask(task, {}, announced, lambda: [NewHistory(k, arrays) for k in range(2)])
+        with pytest.raises(OptionError, match=f"2 histories, but {announced} were announced"):
+            write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="", shard_histories=1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_is_no_release_is_not_replaced(tmp_path):

@@ -177,7 +177,7 @@ def test_same_batches_in_two_processes_and_from_both_kinds(lite, full):
 def test_batches_depend_on_seed_and_number_alone(lite):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     one, two = dataset.ad(batch_size=8, length=20, seed=1), dataset.ad(batch_size=8, length=20, seed=2)
-    two[5], two[0]
+    assert two[5].obs.shape == two[0].obs.shape
     for i in (3, 0, 3):
         np.testing.assert_array_equal(one[i].obs, dataset.ad(batch_size=8, length=20, seed=1)[i].obs)
     assert (one.windows(0)[1] != one.windows(1)[1]).any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 from scenes import random_records, scene
 
-from generation.env import Environment
 from generation.teammates import utility_greedy
 from generation.teammates.base import Noise, next_key
 from generation.teammates.paths import UNREACHABLE, Paths
@@ -21,7 +21,7 @@ from icrl4aht_data.benchmark import ACTIONS, DOWN, INTERACT, LEFT, PUBLISHED_ACT
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL, Layout
-from icrl4aht_data.overcooked.state import ingredient_count, unpack
+from icrl4aht_data.overcooked.state import ingredient_count, start, unpack
 
 PUBLISHED_PLAY = "030512503051250305125325124444444444444450530512503051250305"
 """H4-t0..t4 on test_simple in the published ids (spec/teammates.md, section 7)."""
@@ -39,6 +39,7 @@ TEST_THETAS = [
 """H4-t0..t4 (spec/teammates.md, section 4)."""
 
 SEARCH = (RIGHT, DOWN, LEFT, UP)
+FAST = {"xla_backend_optimization_level": 0}  # these programs are compiled to run once
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 FACED_BY = {0: UP, 1: DOWN, 2: RIGHT, 3: LEFT}  # facing -> the action that turns there
 
@@ -70,7 +71,7 @@ def _scan(layout: Layout, slot: int, noise: Noise, steps: int):
         return jax.lax.scan(step, (record, policy.init(params, key)), recipes)[1]
 
     batch = jax.vmap(jax.vmap(one, (None, 0, 1, 0), 1), (0, None, None, None), 1)
-    return jax.jit(batch)
+    return jax.jit(batch, compiler_options=FAST)
 
 
 def play(
@@ -90,7 +91,10 @@ def play(
 
 
 def start_records(layout: Layout, n: int) -> np.ndarray:
-    return np.asarray(Environment(layout).init(jax.random.split(jax.random.key(5), n)).record)
+    """(n, S): random starts in a kitchen with a room for each."""
+    rng = np.random.default_rng(5)
+    positions = np.stack([rng.choice(room, n) for room in layout.rooms], axis=1)
+    return start(layout, positions, rng.integers(0, 4, (n, 2), np.uint8), rng.choice(layout.recipe_items, n))
 
 
 @lru_cache
@@ -124,9 +128,8 @@ def test_two_deliveries_in_100_steps_beside_a_motionless_ego(name):
     assert 74 <= second.min() <= second.max() <= 92
 
 
-@pytest.mark.parametrize("name", ["asymm_both", "asymm_right"])
-def test_seat_0_plays_too(name):
-    layout = LAYOUTS[name]
+def test_seat_0_plays_too():
+    layout = LAYOUTS["asymm_both"]
     records = start_records(layout, 8)
     recipes = np.random.default_rng(4).choice(layout.recipe_items, (100, 8))
     _, rewards = play(layout, records, recipes, jax.random.split(jax.random.key(0), 8), slot=0)
@@ -142,8 +145,11 @@ class Plain(NamedTuple):
     wait: int
 
 
-def plain_rules(layout: Layout, theta: dict[str, float], record: np.ndarray, slot: int, last: int, roll: int) -> Plain:
-    """Spec/teammates.md, 1.3 to 1.5 and 2.4, cell by cell, for an H4 that does not wait."""
+def plain_rules(
+    layout: Layout, theta: dict[str, float], record: np.ndarray, slot: int, last: int, roll: int
+) -> Plain | None:
+    """Spec/teammates.md, 1.3 to 1.5 and 2.4, cell by cell, for an H4 that does not wait; None if two intents score
+    the same on paper, where rounding decides."""
     state = unpack(layout, record)
     width = layout.width
     mine, partner = int(state.positions[slot]), int(state.positions[1 - slot])
@@ -198,10 +204,8 @@ def plain_rules(layout: Layout, theta: dict[str, float], record: np.ndarray, slo
     stage = near_pots if near_pots and theta["counter_preference"] > 0.5 else empty
     n_cooking, n_cooked, n_nonfull = len(cooking), len(cooked), len(nonfull)
     fullest = max(count for *_, count in pots)
-    if n_cooking + n_cooked:
-        plate = 1 + 0.3 * n_cooking + 0.5 * n_cooked
-    else:
-        plate = 0.8 if n_nonfull == 0 else 0.2
+    idle = 0.8 if n_nonfull == 0 else 0.2
+    plate = 1 + 0.3 * n_cooking + 0.5 * n_cooked if n_cooking + n_cooked else idle
     can_fetch = hand == 0 and needed and (reach(nonfull) or reach(empty))
     if reach(needed):
         fetch = 1 + 0.2 * n_nonfull if reach(nonfull) else 0.8
@@ -219,13 +223,14 @@ def plain_rules(layout: Layout, theta: dict[str, float], record: np.ndarray, slo
         (False, "w_start_cooking", 1.5, []),
         (theta["w_press_L"] > 0 and hand == 0 and not lit, "w_press_L", 1.0, of_kind[BUTTON]),
     ]
-    best, best_score = -1, -np.inf
+    scores: dict[int, float] = {}
     for number, (allowed, weight, value, targets) in enumerate(intents):
         if allowed and reach(targets):
-            score = theta[weight] * value - theta["dist_weight"] * min(away(c) for c in targets)
-            score += 2 * theta["inertia"] * (number == last)
-            if score > best_score + 1e-4:  # sums that are equal on paper differ in their last bits
-                best, best_score = number, score
+            bonus = 2 * theta["inertia"] * (number == last)
+            scores[number] = theta[weight] * value - theta["dist_weight"] * min(away(c) for c in targets) + bonus
+    best = max(scores, key=lambda number: scores[number], default=-1)
+    if sum(score > scores[best] - 1e-4 for score in scores.values()) > 1:
+        return None
     if best < 0:
         free = [a for a in SEARCH if brute_move(layout, mine, a) not in (mine, partner)]
         action = free[0] if free else STAY
@@ -282,106 +287,125 @@ def brute_first_step(layout: Layout, origin: int, target: int) -> int:
     return next(a for a in SEARCH if brute_distances(layout)[brute_move(layout, origin, a), target] == left - 1)
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_equals_plain_rules_on_random_states(name):
+@pytest.mark.parametrize(
+    ("name", "slot"), [("coord_ring", 1), ("asymm_both", 0), ("cramped_up", 1), ("demo_wide", 0), ("test_wide", 1)]
+)
+def test_equals_plain_rules_on_random_states(name, slot):
     layout = LAYOUTS[name]
     rng = np.random.default_rng(11)
-    n = 120
+    n = 400
     records = random_records(layout, n, rng)
     last, rolls = rng.integers(-1, 8, n), rng.integers(0, 100, n)
     thetas = [DEFAULTS | PRESETS[preset] for preset in PRESETS] + TEST_THETAS
     of = rng.integers(0, len(thetas), n)
     params = {name: jnp.array([thetas[t][name] for t in of], jnp.float32) for name in DEFAULTS}
     keys = jax.random.wrap_key_data(jnp.stack([jnp.asarray(rolls, jnp.uint32), jnp.zeros(n, jnp.uint32)], axis=1))
-    for slot in (0, 1):
-        policy = build(layout, {"family": "utility_greedy", "theta": DEFAULTS}, slot)
-        memory = Memory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
-        actions, after = jax.jit(jax.vmap(policy.act))(params, memory, records, keys)
-        found = [Plain(*row) for row in np.stack([after.intent, actions, after.wait], axis=1).tolist()]
-        expected = [plain_rules(layout, thetas[of[i]], records[i], slot, int(last[i]), int(rolls[i])) for i in range(n)]
-        assert found == expected
+    policy = build(layout, {"family": "utility_greedy", "theta": DEFAULTS}, slot)
+    memory = Memory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
+    act = jax.jit(jax.vmap(policy.act), compiler_options=FAST)
+    actions, after = act(params, memory, records, keys)
+    found = [Plain(*row) for row in np.stack([after.intent, actions, after.wait], axis=1).tolist()]
+    expected = [plain_rules(layout, thetas[of[i]], records[i], slot, int(last[i]), int(rolls[i])) for i in range(n)]
+    clear = [pair for pair in zip(found, expected, strict=True) if pair[1] is not None]
+    assert len(clear) > 0.95 * n
+    assert [pair[0] for pair in clear] == [pair[1] for pair in clear]
 
 
 # Noise.
 
 
+ROLLS = [0, 1, 19, 20, 39, 40, 41, 99]
+
+
 @lru_cache
 def _act(slot: int):
+    """H4 in cramped_up, eight at once: memory, records (8, S) -> actions (8,), memory."""
     policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot)
-    return policy.params, jax.jit(policy.act)
+    keys = jax.random.split(jax.random.key(0), 8)
+    act = jax.jit(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)), compiler_options=FAST)
+    return lambda memory, records: act(policy.params, memory, records, keys)
 
 
-def _near_partner(slot: int) -> np.ndarray:
-    """An empty-handed H4 at (1, 2) that wants to go up to (1, 1), towards pile 0, with the partner at (2, 1)."""
-    mover, other = (1, 2, "up"), (2, 1, "down")
-    return scene(LAYOUTS["cramped_up"], *((mover, other) if slot == 0 else (other, mover)))[0]
+def _memory(rolls: list[int], intent: int = -1, wait: int = 0) -> Memory:
+    key = jax.random.wrap_key_data(jnp.array([[300 + roll, 7] for roll in rolls], jnp.uint32))
+    return Memory(key, jnp.full(8, intent), jnp.full(8, wait))
 
 
-def _memory(roll: int, intent: int = -1, wait: int = 0) -> Memory:
-    key = jax.random.wrap_key_data(jnp.array([300 + roll, 7], jnp.uint32))
-    return Memory(key, jnp.int32(intent), jnp.int32(wait))
+def _first_memory(noise: Noise, keys: jax.Array, slot: int = TEAMMATE) -> Memory:
+    policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot, noise)
+    return jax.vmap(policy.init, in_axes=(None, 0))(policy.params, keys)
+
+
+def _heading_up(slot: int, partner: tuple[int, int, str]) -> np.ndarray:
+    """(8, S): H4, empty-handed at (1, 2), wants to go up to (1, 1), towards pile 0."""
+    mover = (1, 2, "up")
+    record = scene(LAYOUTS["cramped_up"], *((mover, partner) if slot == 0 else (partner, mover)))
+    return np.repeat(record, 8, axis=0)
 
 
 @pytest.mark.parametrize("slot", [0, 1])
-@pytest.mark.parametrize("roll", [0, 19, 20, 39, 40, 99])
-def test_yields_where_the_next_cell_touches_the_partner(slot, roll):
-    params, act = _act(slot)
-    action, after = act(params, _memory(roll), _near_partner(slot), jax.random.key(0))
-    yields = roll < (20, 40)[slot]
-    assert (int(action), int(after.wait)) == ((STAY, 1 + roll % 2) if yields else (UP, 0))
-    assert int(after.intent) == utility_greedy.FETCH
+def test_yields_where_the_next_cell_touches_the_partner(slot):
+    actions, after = _act(slot)(_memory(ROLLS), _heading_up(slot, (2, 1, "down")))
+    yields = [roll < (20, 40)[slot] for roll in ROLLS]
+    assert actions.tolist() == [STAY if y else UP for y in yields]
+    assert after.wait.tolist() == [1 + roll % 2 if y else 0 for y, roll in zip(yields, ROLLS, strict=True)]
+    assert after.intent.tolist() == [utility_greedy.FETCH] * 8
 
 
 @pytest.mark.parametrize("slot", [0, 1])
 def test_does_not_yield_far_from_the_partner(slot):
-    mover, other = (1, 2, "up"), (3, 2, "down")
-    record = scene(LAYOUTS["cramped_up"], *((mover, other) if slot == 0 else (other, mover)))[0]
-    params, act = _act(slot)
-    action, after = act(params, _memory(0), record, jax.random.key(0))
-    assert (int(action), int(after.wait)) == (UP, 0)
+    actions, after = _act(slot)(_memory(ROLLS), _heading_up(slot, (3, 2, "down")))
+    assert actions.tolist() == [UP] * 8
+    assert after.wait.tolist() == [0] * 8
 
 
 def test_waits_without_a_thought_and_walks_its_key_on():
-    params, act = _act(1)
-    memory = _memory(99, intent=utility_greedy.PRESS, wait=2)
+    memory = _memory(ROLLS, intent=utility_greedy.PRESS, wait=2)
     keys = [memory.key]
     for wait in (1, 0):
-        action, memory = act(params, memory, _near_partner(1), jax.random.key(0))
+        actions, memory = _act(1)(memory, _heading_up(1, (2, 1, "down")))
         keys.append(memory.key)
-        assert (int(action), int(memory.wait), int(memory.intent)) == (STAY, wait, utility_greedy.PRESS)
-    for before, after in zip(keys, keys[1:], strict=False):
-        assert jax.random.key_data(after).tolist() == jax.random.key_data(jax.random.split(before, 3)[0]).tolist()
+        assert actions.tolist() == [STAY] * 8
+        assert memory.wait.tolist() == [wait] * 8
+        assert memory.intent.tolist() == [utility_greedy.PRESS] * 8
+    for before, after in pairwise(keys):
+        links = jax.vmap(lambda key: jax.random.split(key, 3)[0])(before)
+        np.testing.assert_array_equal(jax.random.key_data(after), jax.random.key_data(links))
 
 
 def test_fixed_key_chain_is_the_published_one():
     chain = [(0, 1), (507451445, 1853169794), (3704974950, 1863054868)]
-    policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), noise="fixed")
-    memory = policy.init(policy.params, jax.random.key(123))
-    assert tuple(jax.random.key_data(memory.key).tolist()) == chain[0]
-    assert tuple(jax.random.key_data(next_key(next_key(memory.key))).tolist()) == chain[2]
-    params, act = _act(1)
-    for expected in chain[1:]:
-        _, memory = act(params, memory, _near_partner(1), jax.random.key(0))
-        assert tuple(jax.random.key_data(memory.key).tolist()) == expected
+    memory = _first_memory("fixed", jax.random.split(jax.random.key(123), 8))
+    assert memory.intent.tolist() == [-1] * 8
+    assert memory.wait.tolist() == [0] * 8
+    assert tuple(jax.random.key_data(next_key(next_key(memory.key[0]))).tolist()) == chain[2]
+    for expected in chain:
+        assert {tuple(key) for key in jax.random.key_data(memory.key).tolist()} == {expected}
+        _, memory = _act(1)(memory, _heading_up(1, (2, 1, "down")))
 
 
 def test_fixed_noise_of_seat_0_starts_at_its_own_key():
-    policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), 0, "fixed")
-    assert jax.random.key_data(policy.init(policy.params, jax.random.key(1)).key).tolist() == [0, 0]
+    memory = _first_memory("fixed", jax.random.split(jax.random.key(1), 8), slot=0)
+    assert {tuple(key) for key in jax.random.key_data(memory.key).tolist()} == {(0, 0)}
 
 
 def test_seeded_noise_depends_on_the_episode_key_and_fixed_does_not():
-    layout, n = LAYOUTS["cramped_up"], 8
-    records = np.repeat(_near_partner(1)[None], n, axis=0)
-    recipes = np.full((30, n), layout.recipe_items[0])
-    keys = jax.random.split(jax.random.key(2), n)
-    thetas = [dict(DEFAULTS)]
-    fixed, _ = play(layout, records, recipes, keys, thetas=thetas, noise="fixed")
-    seeded, _ = play(layout, records, recipes, keys, thetas=thetas, noise="seeded")
-    again, _ = play(layout, records, recipes, keys[::-1], thetas=thetas, noise="seeded")
-    assert len(np.unique(fixed[:, 0], axis=1).T) == 1
-    assert len(np.unique(seeded[:, 0], axis=1).T) > 2
-    np.testing.assert_array_equal(again, seeded[..., ::-1])
+    layout = LAYOUTS["cramped_up"]
+
+    def actions(noise: Noise, keys: jax.Array) -> np.ndarray:
+        memory, records, rows = _first_memory(noise, keys), _heading_up(1, (2, 1, "down")), []
+        for _ in range(20):
+            acted, memory = _act(1)(memory, records)
+            rows.append(np.asarray(acted))
+            both = np.stack([np.full(8, STAY), rows[-1]], axis=1)
+            records = rules.step(layout, records, both, records[:, 6]).state
+        return np.stack(rows, axis=1)
+
+    keys = jax.random.split(jax.random.key(2), 8)
+    assert len(np.unique(actions("fixed", keys), axis=0)) == 1
+    seeded = actions("seeded", keys)
+    assert len(np.unique(seeded, axis=0)) > 2
+    np.testing.assert_array_equal(actions("seeded", keys[::-1]), seeded[::-1])
 
 
 # Path tables.

@@ -13,6 +13,7 @@ from plays import play, random_release
 from icrl4aht_data import verify_release
 from icrl4aht_data.cli import cli
 from icrl4aht_data.release import NewHistory, NewTask, write_manifest, write_release
+from icrl4aht_data.schema import Kind
 from icrl4aht_data.shard import chunk_table_path
 
 SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
@@ -68,13 +69,13 @@ def test_no_folder(tmp_path):
     assert "no such folder" in problems(tmp_path / "nowhere")[0]
 
 
-def rewritten(tmp_path, spoil, kind="lite"):
+def rewritten(tmp_path, spoil, kind: Kind = "lite"):
     """A release whose hashes hold but whose content is spoiled."""
     from plays import make_tasks
 
     (task,) = make_tasks(["demo_simple"])
     arrays = play(task.layout, 6, 20, np.random.default_rng(5))
-    new = NewTask(task, {}, lambda: [NewHistory(0, spoil(arrays))])
+    new = NewTask(task, {}, 1, lambda: [NewHistory(0, spoil(arrays))])
     return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="")
 
 

@@ -1,0 +1,69 @@
+"""Every command and snippet of the README runs."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from generation.cli import cli as generation_cli
+from icrl4aht_data.cli import cli
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def commands(start: str) -> list[list[str]]:
+    """The arguments of every shell line that starts so."""
+    lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(start)]
+    return [shlex.split(line, comments=True)[len(start.split()) :] for line in lines]
+
+
+@pytest.mark.parametrize("snippet", blocks("python"))
+def test_python_snippets(snippet):
+    exec(compile(snippet, "README.md", "exec"), {})
+
+
+@pytest.mark.parametrize("arguments", commands("icrl4aht-data"), ids=" ".join)
+def test_reader_commands(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize("arguments", commands("python -m generation"), ids=" ".join)
+def test_generation_commands_are_understood(arguments):
+    """Too long to run here; test_generate runs them on a tiny profile."""
+    name, command, rest = generation_cli.resolve_command(
+        generation_cli.make_context("g", ["x"], resilient_parsing=True), arguments
+    )
+    assert command is not None
+    command.make_context(name, rest)
+
+
+def test_make_targets_exist():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    named = set(re.findall(r"(?:`|^    )make ([a-z-]+)", README, flags=re.MULTILINE))
+    assert {"demo", "test", "help"} <= named
+    for target in named:
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+def test_snippets_were_found():
+    assert blocks("python")
+    assert commands("icrl4aht-data")
+    assert commands("python -m generation")
+
+
+def test_files_that_the_map_names_exist():
+    for cell in re.findall(r"^\| `(.*?)` \|", README, flags=re.MULTILINE):
+        stem, names, end = re.fullmatch(r"([^{]*)(?:\{(.*)\}(.*))?", cell).groups()  # type: ignore[union-attr]
+        for name in names.split(",") if names else [""]:
+            assert (ROOT / f"{stem}{name}{end or ''}").exists(), cell
