@@ -7,7 +7,7 @@ ROOT ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
-CODE := icrl4aht_data generation benchmarks tests
+CODE := icrl4aht_data generation baselines benchmarks tests
 
 .PHONY: help install demo generate verify test check format bench-env clean
 .DEFAULT_GOAL := help

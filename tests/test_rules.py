@@ -477,10 +477,8 @@ def test_plates_in_hands_count_as_before_the_steps_interactions():
 
     served = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[SOUP_001, ONE])
     after = act(ASYMM, served, INTERACT, INTERACT)
-    assert (after.hands, after.shaped) == (
-        [DISH_001, PLATE],
-        [0, 0],
-    )  # the plate that the ego used still counts, against the one pot left
+    # The plate that the ego used still counts, against the one pot left.
+    assert (after.hands, after.shaped) == ([DISH_001, PLATE], [0, 0])
 
 
 def test_pots_and_counters_are_as_agent_0_left_them():

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
-from jaxtyping import Array, Int, Key
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
 
 Noise = Literal["fixed", "seeded"]
 """Where a heuristic's randomness comes from: `fixed` is the published PRNGKey(slot) in every episode, so that numbers
@@ -26,6 +27,18 @@ class Policy(NamedTuple):
     sees: Literal["state", "observation"]
 
 
+class Sampling(NamedTuple):
+    """From what a split's parameters are drawn, where they are not published."""
+
+    presets: tuple[str, ...]
+    ranges: dict[str, tuple[float, float] | list[int]]  # (low, high), or the values to choose from
+
+
+def as_params(theta: dict[str, float], defaults: dict[str, float]) -> dict[str, Array]:
+    """A policy's `params`: int32 where the default is a whole number, else float32."""
+    return {name: (jnp.int32 if isinstance(defaults[name], int) else jnp.float32)(theta[name]) for name in defaults}
+
+
 def first_key(noise: Noise, slot: int, key: Key[Array, ""]) -> Key[Array, ""]:
     """The key a heuristic starts an episode with."""
     return jax.random.key(slot) if noise == "fixed" else key
@@ -34,3 +47,15 @@ def first_key(noise: Noise, slot: int, key: Key[Array, ""]) -> Key[Array, ""]:
 def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
     """One link of a heuristic's key chain."""
     return jax.random.split(key)[0]
+
+
+def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
+    """The next link of the key chain, and the step's uniform draws u1..u4, float32 in [0, 1)."""
+    keys = jax.random.split(key, 5)
+    return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
+
+
+def extra_split(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
+    """One more link of the chain where some branch draws more: the chain's key after it, and the key to draw from."""
+    link, own = jax.random.split(key)
+    return jnp.where(where, link, key), own

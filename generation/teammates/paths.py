@@ -7,15 +7,17 @@ Teammates see the whole state. The partner never blocks a path; ties resolve in 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from icrl4aht_data.benchmark import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.layouts import BUTTON, COOKED, GOAL, PLATE, PLATES, WALL, Layout
+from icrl4aht_data.overcooked.layouts import BUTTON, COOKED, GOAL, INDICATOR, PLATE, PLATES, POT, WALL, Layout
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
 
 UNREACHABLE = 10_000
@@ -91,6 +93,11 @@ class Paths:
         return self.access_distance.min(axis=-1)
 
     @cached_property
+    def only_access(self) -> np.ndarray:
+        """int32 (cells,): the access cell of a target that has exactly one, else -1."""
+        return np.where((self.access >= 0).sum(axis=1) == 1, self.access.max(axis=1), -1)
+
+    @cached_property
     def manhattan(self) -> np.ndarray:
         """int32 (cells, cells)."""
         cell = np.arange(self.layout.cells)
@@ -105,6 +112,33 @@ class Paths:
     def static(self, kind: int) -> np.ndarray:
         """bool (cells,): where something of that kind stands."""
         return self.layout.kinds == kind
+
+
+def is_dish(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
+    """Whether the item is a plate with a cooked soup."""
+    return (item & (PLATE | COOKED)) == (PLATE | COOKED)
+
+
+def is_ingredient(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
+    """Whether the item has ingredients and no plate."""
+    return (item >> 2 > 0) & ((item & PLATE) == 0)
+
+
+class Rule(NamedTuple):
+    """Where a condition holds and one of the targets can be reached: go to the nearest of them."""
+
+    when: Bool[Array, ""]
+    targets: Bool[Array, " cells"]
+    waits: bool = False  # beside the target, face it and wait, instead of interacting
+
+
+class Chosen(NamedTuple):
+    """The first rule that applies. Undefined but for `found` if none does."""
+
+    found: Bool[Array, ""]
+    number: Int[Array, ""]
+    target: Int[Array, ""]  # the nearest of its targets
+    waits: Bool[Array, ""]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +182,15 @@ class Scene:
 
     @cached_property
     def holds_dish(self) -> Bool[Array, ""]:
-        return (self.hand & (PLATE | COOKED)) == (PLATE | COOKED)
+        return is_dish(self.hand)
 
     @cached_property
     def holds_ingredient(self) -> Bool[Array, ""]:
-        return (self.hand >> 2 > 0) & ((self.hand & PLATE) == 0)
+        return is_ingredient(self.hand)
+
+    @cached_property
+    def partner_hand(self) -> UInt8[Array, ""]:
+        return self.state.hands[1 - self.slot]
 
     # Masks over cells.
 
@@ -178,6 +216,20 @@ class Scene:
         return self._at(self.paths.layout.pots, (self.state.pot_items & COOKED) > 0)
 
     @cached_property
+    def pots(self) -> Bool[Array, " cells"]:
+        return jnp.asarray(self.paths.static(POT))
+
+    @cached_property
+    def pots_in_use(self) -> Bool[Array, " cells"]:
+        """Pots with something in them, raw, cooking or cooked."""
+        return self._at(self.paths.layout.pots, self.state.pot_items > 0)
+
+    @cached_property
+    def staged(self) -> Bool[Array, " cells"]:
+        """Counters on which an ingredient lies."""
+        return self._at(self.paths.layout.counters, is_ingredient(self.state.counters))
+
+    @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
         """Walls without an item, also those that nobody can reach."""
         taken = self._at(self.paths.layout.counters, self.state.counters > 0)
@@ -190,9 +242,10 @@ class Scene:
     @cached_property
     def needed(self) -> Int[Array, " types"]:
         """How many pieces of each piled ingredient the recipe lacks, over all pots together."""
-        return jnp.maximum(self._counts(self.state.recipe) - self._counts(self.state.pot_items).sum(axis=0), 0)
+        return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
-    def _counts(self, item: Array) -> Int[Array, "... types"]:
+    def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B types"]:
+        """How many pieces of each piled ingredient are in an item, ascending id."""
         shift = 2 + 2 * jnp.arange(len(self.paths.layout.ingredients), dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
 
@@ -210,7 +263,7 @@ class Scene:
 
     @cached_property
     def recipe_piles(self) -> Bool[Array, " cells"]:
-        return self.piles_of(self._counts(self.state.recipe) > 0)
+        return self.piles_of(self.counts(self.state.recipe) > 0)
 
     @cached_property
     def goals(self) -> Bool[Array, " cells"]:
@@ -223,6 +276,10 @@ class Scene:
     @cached_property
     def buttons(self) -> Bool[Array, " cells"]:
         return jnp.asarray(self.paths.static(BUTTON))
+
+    @cached_property
+    def indicators(self) -> Bool[Array, " cells"]:
+        return jnp.asarray(self.paths.static(INDICATOR))
 
     # Where things are, and how to get there.
 
@@ -242,28 +299,71 @@ class Scene:
         """The nearest cell of the mask, the first in reading order among equals. Undefined if none is reachable."""
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
-    def _turn_or(self, target: Int[Array, ""], when_facing: int) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
         """Whether I stand beside the target, and what to do then: turn to it, or `when_facing`."""
         beside = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
         direction = jnp.argmax(jnp.asarray(self.paths.neighbours)[self.me] == target)  # up, down, left, right
         return beside, jnp.where(self.facing_action == direction, when_facing, direction)
 
-    def _approach(self, target: Int[Array, ""]) -> Int[Array, ""]:
+    def first(self, rules: Sequence[Rule]) -> Chosen:
+        """The first rule that applies, with the nearest of its targets."""
+        targets = jnp.stack([rule.targets for rule in rules])
+        possible = jnp.stack([rule.when for rule in rules]) & jnp.any(self.reach(targets), axis=-1)
+        number = jnp.argmax(possible)
+        waits = jnp.asarray(np.array([rule.waits for rule in rules]))[number]
+        return Chosen(jnp.any(possible), number, self.closest(targets[number]), waits)
+
+    def approach(
+        self, target: Int[Array, ""], extra: np.ndarray | None = None
+    ) -> tuple[Int[Array, ""], Int[Array, ""] | Float[Array, ""]]:
+        """The step towards the target's nearest access cell, and that cell's distance plus 100 if the partner
+        stands on it. `extra` (cells,) adds to the distance of each access cell."""
         access = jnp.asarray(self.paths.access)[target]
         cost = jnp.asarray(self.paths.access_distance)[self.me, target] + 100 * (access == self.partner)
+        if extra is not None:
+            cost = cost + jnp.asarray(extra)[access]
         best = jnp.argmin(cost)
         step = jnp.asarray(self.paths.first_step)[self.me, access[best]]
-        return jnp.where(cost[best] < UNREACHABLE, step, STAY)
+        return jnp.where(cost[best] < UNREACHABLE, step, STAY), cost[best]
 
-    def go_to(self, target: Int[Array, ""]) -> Int[Array, ""]:
-        """Walk to the target; beside it, turn and interact."""
-        beside, action = self._turn_or(target, INTERACT)
-        return jnp.where(beside, action, self._approach(target))
+    def go_to(
+        self,
+        target: Int[Array, ""],
+        waits: Bool[Array, ""] | bool = False,
+        step: Int[Array, ""] | None = None,
+    ) -> Int[Array, ""]:
+        """Walk to the target; beside it, turn and interact, or wait. A family with its own way of walking gives the
+        `step` of that way."""
+        beside, action = self._turn_or(target, jnp.where(waits, STAY, INTERACT))
+        return jnp.where(beside, action, self.approach(target)[0] if step is None else step)
 
     def hover(self, target: Int[Array, ""]) -> Int[Array, ""]:
         """Walk to the target; beside it, turn and wait."""
-        beside, action = self._turn_or(target, STAY)
-        return jnp.where(beside, action, self._approach(target))
+        return self.go_to(target, waits=True)
+
+    @cached_property
+    def ways(self) -> Int[Array, " 4"]:
+        """The cells to the right, below, left and above; my own where the way is barred."""
+        return jnp.asarray(self.paths.layout.moves[:, list(_SEARCH_ORDER)].astype(np.int32))[self.me]
+
+    @cached_property
+    def free(self) -> Bool[Array, " 4"]:
+        """Which of the `ways` lead onto a floor cell without the partner."""
+        return (self.ways != self.me) & (self.ways != self.partner)
+
+    def sidestep(self, otherwise: Int[Array, ""] | int) -> Int[Array, ""]:
+        """The first free move in search order."""
+        return self.best_way(self.free, jnp.zeros(4), otherwise)
+
+    def best_way(
+        self,
+        allowed: Bool[Array, " 4"],
+        score: Int[Array, " 4"] | Float[Array, " 4"],
+        otherwise: Int[Array, ""] | int = STAY,
+    ) -> Int[Array, ""]:
+        """The allowed one of the `ways` with the highest score, the first in search order among equals."""
+        best = jnp.argmax(jnp.where(allowed, score, -jnp.inf))
+        return jnp.where(jnp.any(allowed), jnp.asarray(_SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
         """A step onto a free neighbour, in search order; else stay, or (150) walk into the partner."""

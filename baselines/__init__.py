@@ -1,0 +1,1 @@
+"""Reference agents and the one evaluator of the benchmark."""

@@ -1,0 +1,79 @@
+"""`python -m baselines`: thin commands; the only place where exceptions become exit codes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import Progress
+
+from baselines.evaluate import PROTOCOLS
+from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.errors import Icrl4ahtError
+
+console = Console(soft_wrap=True)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="icrl4aht-data")
+def cli() -> None:
+    """Evaluate agents on the ICRL4AHT benchmark."""
+
+
+@cli.command()
+@click.option("--agent", required=True, help="stay or random.")
+@click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
+@click.option("--track", multiple=True, default=tuple(TRACKS), show_default=True)
+@click.option(
+    "--manifest", type=click.Path(path_type=Path, exists=True), help="Tasks of a file instead of the tracks'."
+)
+@click.option("--seed", default=0, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for one JSON per task.")
+def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path | None, seed: int, out: Path) -> None:
+    """Evaluate an agent; goes on where a stopped run of the same settings ended."""
+    from baselines.agents import get_agent
+    from baselines.evaluate import evaluate as run
+    from baselines.evaluate import get_protocol
+    from icrl4aht_data.tasks import manifest_path, read_tasks
+
+    paths = [manifest] if manifest else [manifest_path(name, "test") for name in track]
+    tasks = [task for path in paths for task in read_tasks(path)]
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task(f"{agent}, {protocol}", total=len(tasks))
+        run(
+            agent,
+            get_agent(agent),
+            tasks,
+            get_protocol(protocol),
+            seed=seed,
+            out=out,
+            done=lambda n: bars.advance(bar, n),
+        )
+    console.print(f"{len(tasks)} results in {out}; `python -m baselines report {out}` shows them")
+
+
+@cli.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Folder of the report; RUN/report of the first by default."
+)
+def report(runs: tuple[Path, ...], out: Path | None) -> None:
+    """The paper's tables with the published numbers beside ours, as Markdown, CSV and curves."""
+    from baselines.report import markdown, read_run, write_report
+
+    loaded = [read_run(run) for run in runs]
+    paths = write_report(loaded, out or runs[0] / "report")
+    click.echo(markdown(loaded))
+    for path in paths:
+        click.echo(f"wrote {path}")
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        cli()
+    except Icrl4ahtError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(1)
