@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate verify test check format bench-env clean
+.PHONY: help install demo generate verify test check format bench-env bench-eval clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -46,6 +46,9 @@ format: install ## format the code and mend what the linter can
 
 bench-env: install ## environment steps/s beside JaxMARL's, JSON lines
 	$(BIN)/python -m benchmarks.bench_env
+
+bench-eval: install ## evaluation steps/s per teammate family beside the environment alone, JSON lines
+	$(BIN)/python -m benchmarks.bench_eval
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

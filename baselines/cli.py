@@ -70,6 +70,48 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
         click.echo(f"wrote {path}")
 
 
+@cli.command()
+@click.option("--layout", required=True, help="Short or environment name.")
+@click.option("--teammate", default="H4/t0", show_default=True, help="Family and published instance, such as H3/t1.")
+@click.option("--ego", default="random", show_default=True, help="An agent's name.")
+@click.option("--protocol", default="seeded", show_default=True)
+@click.option("--seed", default=0, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The GIF to write.")
+def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
+    """An episode to look at."""
+    import dataclasses
+
+    import numpy as np
+
+    from baselines.agents import get_agent
+    from baselines.evaluate import get_protocol, play_tasks
+    from generation.teammates.instances import named_task
+    from icrl4aht_data.overcooked.render import save_episode
+
+    task = named_task(layout, teammate)
+    one = dataclasses.replace(get_protocol(protocol), episodes=1)
+    (played,) = play_tasks(get_agent(ego), [task], one, seed)
+    record, reward = np.asarray(played.record[0]), np.asarray(played.reward[0])
+    save_episode(out, task.layout, record, reward)
+    console.print(
+        f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {reward.sum():g}; wrote {out}"
+    )
+
+
+@cli.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/headroom"), show_default=True)
+@click.option("--protocol", multiple=True, default=tuple(PROTOCOLS), show_default=True)
+@click.option("--seed", default=0, show_default=True)
+def headroom(out: Path, protocol: tuple[str, ...], seed: int) -> None:
+    """Measure the reference egos on every test task and write cards/headroom.json and cards/headroom.md."""
+    from baselines.headroom import measure, write_cards
+
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        runs = measure(out, protocol, seed, bars)
+    for path in write_cards(runs):
+        console.print(f"wrote {path}")
+
+
 def main() -> None:
     """Entry point."""
     try:

@@ -20,7 +20,7 @@ from generation.env import Environment
 from generation.learners.network import Widths
 from generation.learners.ppo import Batch, Learner, LearnerState, PPOConfig, Rollout, generalised_advantage
 from generation.teammates.base import Policy
-from icrl4aht_data.benchmark import EGO, INTERACT, TEAMMATE
+from icrl4aht_data.benchmark import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
@@ -270,6 +270,17 @@ def test_learning_is_a_pure_function_too(update, trained):
 def test_each_update_draws_anew(update, frozen):
     actions = [update(frozen._replace(update=jnp.int32(n)))[1].actions[..., EGO] for n in (0, 1)]
     assert not np.array_equal(actions[0], actions[1])
+
+
+def test_minibatches_are_shuffled_by_the_key(update, trained):
+    """An ego that always stays plays the same under every key, and still learns in another order."""
+    state = trained.before[60]
+    actor = state.params["params"]["actor"]
+    bias = jnp.zeros_like(actor["bias"]).at[STAY].set(1e3)
+    params = {"params": state.params["params"] | {"actor": {"kernel": actor["kernel"], "bias": bias}}}
+    one, other = (update(state._replace(params=params, key=jax.random.key(k))) for k in (5, 6))
+    assert same_bytes(one[1], other[1])
+    assert not same_bytes(one[0].params, other[0].params)
 
 
 # Episodes.

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.benchmark import HEURISTIC_KINDS, TRACKS, track_of, unknown
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.tasks import Task, make_task
 
 Table = dict[str, tuple[float, ...]]
@@ -107,6 +108,22 @@ def _published(value: float, family: str) -> float:
     if isinstance(value, int) or family == "utility_greedy":
         return value
     return float(np.float32(value))
+
+
+def named_task(layout: str, teammate: str) -> Task:
+    """The test task of a layout and of a teammate such as "H3/t1", on the layouts of the test and training splits.
+
+    Raises:
+        UnknownNameError: for an unknown layout, family or instance.
+    """
+    name = get_layout(layout).name
+    names = {f"{HEURISTIC_KINDS[family]}/t{t}": (family, t) for family in _TABLES for t in range(INSTANCES)}
+    if teammate not in names:
+        raise unknown("teammate", teammate, names)
+    family, number = names[teammate]
+    entry = {"kind": "heuristic", "family": family, "theta_id": number, "base_seed": 0}
+    entry["theta"] = published_thetas(name, family)[number]
+    return make_task(track_of(name), "test", name, entry, seed=0)
 
 
 def published_tasks(track: str) -> list[Task]:
