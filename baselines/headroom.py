@@ -54,9 +54,9 @@ def _markdown(table: dict[str, dict[str, dict[str, dict[str, float]]]]) -> str:
     lines = [
         "# Headroom: what an ego can change",
         "",
-        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the published",
-        "test instances. **bold**: the oracle gets more than staying does; elsewhere no reference ego can raise the",
-        "return, so a method's score there says nothing about adaptation.",
+        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the",
+        "published test instances. **bold**: the oracle gets more than staying does; elsewhere no reference ego can",
+        "raise the return, so a method's score there says nothing about adaptation.",
     ]
     for protocol, layouts in table.items():
         names = [layout for layout in LAYOUTS if layout in layouts]
