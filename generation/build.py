@@ -11,6 +11,7 @@ from generation.collect import is_finished, run_task
 from generation.package import package
 from generation.profiles import Profile, load_profile
 from generation.progress import progress
+from icrl4aht_data.release import check_replaceable
 from icrl4aht_data.schema import Kind
 from icrl4aht_data.tasks import Task
 
@@ -20,6 +21,8 @@ def build_releases(profile_name: str, out: Path, kinds: Sequence[Kind], console:
     profile = load_profile(profile_name)
     tasks = profile.tasks()
     artefacts = out / "artefacts"
+    for kind in kinds:
+        check_replaceable(out / kind)  # before the long work, not after it
     for number, task in enumerate(tasks, start=1):
         folder = artefacts / task.task_id
         label = f"task {number}/{len(tasks)} {task.layout.name} with {task.teammate_kind}"

@@ -96,6 +96,6 @@ def main() -> None:
     """Entry point."""
     try:
         cli()
-    except Icrl4ahtError as error:
+    except (Icrl4ahtError, OSError) as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)

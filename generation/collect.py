@@ -16,17 +16,27 @@ from typing import Any
 
 import jax
 import numpy as np
+from filelock import FileLock, Timeout
 
 from generation import record
 from generation.env import Environment
 from generation.learners.checkpoint import save_policy
 from generation.learners.ppo import Learner
 from generation.profiles import Profile
+from generation.teammates.base import Noise
 from generation.teammates.registry import build
+from icrl4aht_data.benchmark import TEAMMATE
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.release import file_hash
 from icrl4aht_data.tasks import Task
 
 METADATA = "metadata.json"
+
+TEAMMATE_NOISE: Noise = "seeded"
+"""Heuristic teammates of training histories draw from each episode's own key."""
+
+_FILES = {f"{name}.npy" for name in record.Histories._fields} | {"metrics.jsonl", "policy.safetensors", "policy.json"}
 
 Report = Callable[[int, dict[str, float]], None]
 """Called after each update with its number and metrics."""
@@ -34,21 +44,42 @@ Report = Callable[[int, dict[str, float]], None]
 
 def make_learner(task: Task, profile: Profile) -> Learner:
     """The ego of a task, untrained."""
-    return Learner(Environment(task.layout), build(task.layout, task.teammate), profile.ego)
+    mate = build(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE)
+    return Learner(Environment(task.layout), mate, profile.ego)
 
 
 def is_finished(folder: Path, task: Task, profile: Profile) -> bool:
     """Whether the folder holds this task's artefact under these settings, every file as it was written."""
     try:
-        metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
-        same = metadata["task"] == asdict(task) and metadata["ego_hash"] == profile.ego_hash
+        metadata = parse_json(read_text(folder / METADATA))
+        same = (
+            metadata["task"] == asdict(task)
+            and metadata["ego_hash"] == profile.ego_hash
+            and metadata["code_version"] == version("icrl4aht-data")
+            and set(metadata["files"]) == _FILES
+        )
         return same and all(file_hash(folder / name) == digest for name, digest in metadata["files"].items())
-    except (FileNotFoundError, json.JSONDecodeError, KeyError):
+    except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
 
 def run_task(task: Task, profile: Profile, folder: Path, report: Report = lambda update, metrics: None) -> None:
-    """Train the ego of a task from scratch and record its histories into `folder`."""
+    """Train the ego of a task from scratch and record its histories into `folder`.
+
+    Raises:
+        OptionError: if another process is at this task.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=0):
+            _run(task, profile, folder, report)
+    except Timeout as error:
+        raise OptionError(
+            f"{folder}: another process is collecting this task; wait for it, or give another --out"
+        ) from error
+
+
+def _run(task: Task, profile: Profile, folder: Path, report: Report) -> None:
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

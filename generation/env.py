@@ -100,7 +100,11 @@ class Environment:
         return self._recipe(_fold(self.episode_key(state), state.clock + 1))
 
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
-        """The key of each running episode: a function of the environment's key and the episode's number."""
+        """The key of each running episode: a function of the environment's key and the episode's number.
+
+        Players may fold in 1..20: those are the recipe draws of an episode's first steps, which nothing uses, since no
+        soup is done before step 20.
+        """
         return _fold(state.key, state.episode)
 
     def first_record(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> UInt8[Array, "N S"]:

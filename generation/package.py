@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from generation import record
-from generation.collect import METADATA
+from generation.collect import METADATA, TEAMMATE_NOISE
 from generation.curate import best_streams, relabel
 from generation.learners.checkpoint import load_policy
 from generation.profiles import Profile
+from icrl4aht_data.benchmark import KEPT_STEPS, TEAMMATE
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import Kind
+from icrl4aht_data.release import NewHistory, NewTask, folder_in_place_of, write_release
+from icrl4aht_data.schema import Kind, episode_ends
 from icrl4aht_data.tasks import Task
-
-DATA_VERSION = "0.1.0"
 
 
 def package(
@@ -32,16 +31,14 @@ def package(
 ) -> Path:
     """Write a release of these tasks' artefacts; see `write_release`."""
     new = [_new_task(artefacts / task.task_id, task, profile) for task in tasks]
-    return write_release(target, kind, new, data_version=DATA_VERSION, card=_card(profile, tasks), done=done)
+    return write_release(target, kind, new, data_version=profile.data_version, card=_card(profile, tasks), done=done)
 
 
 def bundle_release(release: Path) -> Path:
     """Put a copy of a release in the place of the one that the package bundles."""
-    copy = MINI.with_name(f"{MINI.name}.partial")
-    shutil.rmtree(copy, ignore_errors=True)
-    shutil.copytree(release, copy)
-    shutil.rmtree(MINI, ignore_errors=True)
-    return copy.rename(MINI)
+    with folder_in_place_of(MINI) as copy:
+        shutil.copytree(release, copy, dirs_exist_ok=True)
+    return MINI
 
 
 def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
@@ -51,6 +48,7 @@ def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
         "ego": metadata["ego"],
         "ego_hash": metadata["ego_hash"],
         "code_version": metadata["code_version"],
+        "teammate": {"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
         "streams_recorded": metadata["ego"]["environments"],
         "streams_kept": profile.keep,
         "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
@@ -65,7 +63,7 @@ def _histories(folder: Path, task: Task, profile: Profile) -> Iterator[NewHistor
     streams = best_streams(np.asarray(arrays.rewards), profile.keep)
     network, params, _ = load_policy(folder)
     labels = relabel(task.layout, network, params, arrays.state[streams])
-    dones = record.dones(arrays.actions.shape[1])
+    dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)
     for stream, expert in zip(streams, labels, strict=True):
         recorded = {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}
         yield NewHistory(int(stream), recorded | {"dones": dones, "expert_actions": expert})
@@ -87,7 +85,7 @@ Learning histories of ego agents (recurrent PPO, from scratch) in OvercookedV2, 
 * The teammates are presets of the heuristic H4 (`utility_greedy`), not the learned ones of the paper's training split,
   and the presets act alike. H4 is also a family of the benchmark's test side: do not report teammate generalisation
   from a model trained on this release.
-* On coord_simple and test_simple the ego's room shares nothing with the teammate's: the ego cannot raise the return, it
-  can only avoid the button's cost. A flat, high curve there is the teammate's work.
+* On coord_simple and test_simple the ego's room shares nothing with the teammate's: the ego cannot raise the return (on
+  coord_simple it can lower it, by pressing the button). A flat, high curve there is the teammate's work.
 * Streams of one task come from one learner: they are not independent runs.
 """

@@ -55,8 +55,3 @@ def keep(histories: Histories, update: int, rollout: Rollout) -> None:
     histories.teammate_actions[:, to] = actions[:, kept, TEAMMATE]
     histories.rewards[:, to] = np.asarray(rollout.reward).swapaxes(0, 1)[:, kept]
     histories.episode_end_state[:, episode[after]] = record[:, after]
-
-
-def dones(steps: int) -> np.ndarray:
-    """bool (T,): the last kept step of every episode."""
-    return np.arange(steps) % KEPT_STEPS == KEPT_STEPS - 1

@@ -55,7 +55,21 @@ def track_of(layout: str) -> str:
     raise unknown("layout", layout, [name for splits in TRACKS.values() for s in splits.values() for name in s])
 
 
-def unknown(what: str, found: str, valid: Iterable[str]) -> UnknownNameError:
+def check_place(track: object, split: object, layout: object) -> None:
+    """Whether a layout (short name) belongs to that split of that track.
+
+    Raises:
+        UnknownNameError: lists the valid names and the nearest.
+    """
+    if not isinstance(track, str) or track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    if not isinstance(split, str) or split not in SPLITS:
+        raise unknown("split", split, SPLITS)
+    if layout not in TRACKS[track][split]:
+        raise unknown(f"layout of the {split} split of track {track}", layout, TRACKS[track][split])
+
+
+def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
     """The error for a name that does not exist: lists the valid names and the nearest one."""
     names = list(dict.fromkeys(valid))
     nearest = get_close_matches(str(found), names, n=1, cutoff=0.4)

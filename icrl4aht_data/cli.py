@@ -90,10 +90,17 @@ def list_(root: Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
 def show(
     root: Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
 ) -> None:
-    """Show what a release or one of its histories is."""
+    """Show what a release, a part of it, or one of its histories is."""
+    from icrl4aht_data.release import describe
+
     dataset = _load(root, filters)
     if history_id is None:
-        facts = {"root": str(dataset.root), **dataset.info}
+        info = dataset.info
+        kept_steps = info["environment"]["kept_steps"]
+        facts = {
+            "root": str(dataset.root),
+            **describe(info["kind"], info["data_version"], kept_steps, dataset.entries),
+        }
     else:
         dataset = dataset.select([history_id])
         facts = {
@@ -153,4 +160,7 @@ def main() -> None:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
     except BrokenPipeError:
+        sys.exit(1)
+    except OSError as error:
+        click.echo(f"error: {error}", err=True)
         sys.exit(1)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
 from icrl4aht_data.benchmark import EGO, unknown
-from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError
+from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, UnknownNameError
+from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.release import episode_returns
-from icrl4aht_data.schema import FIELDS, TASKS, Entry, Field
-from icrl4aht_data.shard import Shard
+from icrl4aht_data.schema import FIELDS, PROVENANCE, TASKS, Entry, Field, episode_returns
+from icrl4aht_data.shard import ChunkCache, Shard
 from icrl4aht_data.tasks import Task, read_tasks
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def load_icrl4aht(
     """
     if obs_dtype not in OBS_DTYPES:
         raise unknown("obs_dtype", obs_dtype, OBS_DTYPES)
-    index = read_index(MINI if root is None else Path(root))
+    index = read_index(MINI if root is None else Path(root).expanduser())
     everything = np.array([entry.history_id for entry in index.entries])
     dataset = Dataset(index, everything, obs_dtype, _Shards(index))
     return dataset.filter(
@@ -84,6 +85,7 @@ class _Shards:
     def __init__(self, index: Index) -> None:
         self._index = index
         self._open: dict[str, Shard] = {}
+        self._cache = ChunkCache()
 
     @cached_property
     def _members(self) -> dict[str, list[Entry]]:
@@ -92,19 +94,16 @@ class _Shards:
             members.setdefault(entry.shard, []).append(entry)
         return members
 
-    def names(self) -> list[str]:
-        return list(self._members)
-
     def open(self, name: str) -> Shard:
         if name not in self._open:
-            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], self._members[name])
+            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], self._members[name], self._cache)
         return self._open[name]
 
 
 class Dataset:
     """A selection of learning histories. Opening one reads the index alone; arrays are read when asked for.
 
-    `len(dataset)` counts histories, `dataset[i]` is the i-th, iteration yields them in order.
+    `len(dataset)` counts histories, `dataset[i]` is the i-th, `dataset[a:b]` a part, iteration yields them in order.
     """
 
     def __init__(self, index: Index, ids: np.ndarray, obs_dtype: ObsDtype, shards: _Shards) -> None:
@@ -125,7 +124,15 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __getitem__(self, position: int) -> History:
+    @overload
+    def __getitem__(self, position: int) -> History: ...
+
+    @overload
+    def __getitem__(self, position: slice) -> Dataset: ...
+
+    def __getitem__(self, position: int | slice) -> History | Dataset:
+        if isinstance(position, slice):
+            return self.select(self.ids[position])
         return self.history(int(self.ids[position]))
 
     def __iter__(self) -> Iterator[History]:
@@ -155,14 +162,17 @@ class Dataset:
         return Dataset(self.index, ids, self.obs_dtype, self._shards)
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Dataset:
-        """The histories with these ids, in this order.
+        """The histories of this selection with these ids, in this order.
 
         Raises:
-            UnknownNameError: for an id that the release does not have.
+            UnknownNameError: for an id that this selection does not have.
         """
         if not len(ids):
             raise EmptySelectionError(f"{self.root}: select was given no history id")
-        chosen = np.array([self.index.entry(int(i)).history_id for i in ids])
+        chosen = np.array([operator.index(i) for i in ids])
+        absent = chosen[~np.isin(chosen, self.ids)]
+        if len(absent):
+            raise UnknownNameError(f"{self.root}: this selection has no history {absent.tolist()}; it is {self!r}")
         return Dataset(self.index, chosen, self.obs_dtype, self._shards)
 
     def history(self, history_id: int) -> History:
@@ -173,6 +183,14 @@ class Dataset:
     @cached_property
     def _tasks(self) -> dict[str, Task]:
         return {task.task_id: task for task in read_tasks(self.root / TASKS)}
+
+    @cached_property
+    def _provenance(self) -> dict[str, Any]:
+        path = self.root / PROVENANCE
+        try:
+            return parse_json(read_text(path))
+        except IndexFormatError as error:
+            raise IndexFormatError(f"{path}: {error}") from error
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
         """What rebuilds the environment a history was made in: layout names, map, recipes, episode lengths."""
@@ -187,11 +205,15 @@ class Dataset:
         }
 
     def recover_teammate(self, history_id: int) -> dict[str, Any]:
-        """What rebuilds the teammate of a history: the task's teammate entry, `kind`, `family`, `theta`, ..."""
+        """What rebuilds the teammate of a history.
+
+        Returns:
+            The task's teammate entry (`kind`, `family`, `theta`, ...), and how it played: `slot` and `noise`.
+        """
         entry = self.index.entry(history_id)
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        return dict(self._tasks[entry.task_id].teammate)
+        return self._tasks[entry.task_id].teammate | self._provenance.get(entry.task_id, {}).get("teammate", {})
 
     def ad(self, *, batch_size: int, length: int, seed: int = 0, teammate_actions: bool = False) -> ADSampler:
         """Algorithm Distillation windows; see `sampling.ADSampler`."""
@@ -340,6 +362,8 @@ class LazyArray:
         elif isinstance(first, (int, np.integer)):
             position = range(len(self))[first]
             rows = self._read(position, position + 1)[0]
+        elif first is None or first is Ellipsis:
+            return self._read(0, len(self))[key]
         else:
             rows = self._read(0, len(self))[np.asarray(first)]
         if not rest:

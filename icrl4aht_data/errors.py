@@ -19,7 +19,7 @@ class EmptySelectionError(Icrl4ahtError, ValueError):
 
 
 class OptionError(Icrl4ahtError, ValueError):
-    """An option has an impossible value (a window longer than memory allows, mixed observation shapes)."""
+    """An option has an impossible value (a window of no steps, a selection that spans layouts)."""
 
 
 class LabelsMissingError(Icrl4ahtError):
@@ -35,7 +35,11 @@ class RootNotFoundError(ReleaseError, FileNotFoundError):
 
 
 class IndexFormatError(ReleaseError):
-    """meta/info.json, a line of meta/histories.jsonl, or a chunk table is malformed."""
+    """meta/info.json, a line of meta/histories.jsonl, or another text file of meta/ is missing or malformed."""
+
+
+class ChunkTableError(ReleaseError):
+    """A shard's chunk table is missing or malformed."""
 
 
 class ShardMissingError(ReleaseError, FileNotFoundError):
@@ -43,7 +47,11 @@ class ShardMissingError(ReleaseError, FileNotFoundError):
 
 
 class ShardCorruptError(ReleaseError):
-    """A shard is truncated, is not HDF5, or a chunk's checksum is wrong."""
+    """A shard is not HDF5, or a chunk's checksum is wrong."""
+
+
+class ShardTruncatedError(ShardCorruptError):
+    """A shard is shorter than its chunk table says."""
 
 
 class ShardMismatchError(ReleaseError):

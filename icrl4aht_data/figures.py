@@ -14,8 +14,10 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
     """Return per episode of every task in the selection: mean over streams, band between the 10th and 90th percentile.
 
     Raises:
-        OptionError: if matplotlib is not installed.
+        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise OptionError(f"{path}: expected a name that ends in .png, .svg or .pdf")
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -43,5 +45,5 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
     partial = path.with_name(f".{path.name}.partial")
-    figure.savefig(partial, dpi=120, format=path.suffix.lstrip(".") or "png")
+    figure.savefig(partial, dpi=120, format=path.suffix.removeprefix("."))
     partial.replace(path)

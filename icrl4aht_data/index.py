@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark import FAMILIES, SPLITS, TRACKS, unknown
+from icrl4aht_data.benchmark import ACTIONS, FAMILIES, SPLITS, TRACKS, check_place, unknown
 from icrl4aht_data.errors import (
     EmptySelectionError,
     FormatTooNewError,
     FormatTooOldError,
+    Icrl4ahtError,
     IndexFormatError,
     RootNotFoundError,
     UnknownNameError,
 )
+from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.schema import FORMAT_VERSION, HISTORIES, INFO, KINDS, Entry
 
@@ -29,19 +31,15 @@ QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", 
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """A release's index. Entries stand in the order of their ids."""
+    """A release's index. A history's id is its place in `entries`."""
 
     root: Path
     info: dict[str, Any]
     entries: tuple[Entry, ...]
 
     @cached_property
-    def _rows(self) -> dict[int, int]:
-        return {entry.history_id: row for row, entry in enumerate(self.entries)}
-
-    @cached_property
     def _by_value(self) -> dict[str, dict[str, np.ndarray]]:
-        """field -> value -> rows, ascending: every query is a look-up, none is a scan."""
+        """field -> value -> rows, ascending."""
         tables: dict[str, dict[str, list[int]]] = {name: {} for name in QUERY_FIELDS}
         for row, entry in enumerate(self.entries):
             for name, table in tables.items():
@@ -54,11 +52,9 @@ class Index:
         Raises:
             UnknownNameError: if there is none.
         """
-        row = self._rows.get(history_id)
-        if row is None:
-            ids = f"{self.entries[0].history_id}..{self.entries[-1].history_id}" if self.entries else "none"
-            raise UnknownNameError(f"{self.root}: no history with id {history_id}; ids: {ids}")
-        return self.entries[row]
+        if not 0 <= history_id < len(self.entries):
+            raise UnknownNameError(f"{self.root}: no history with id {history_id}; ids: 0..{len(self.entries) - 1}")
+        return self.entries[history_id]
 
     def values(self, name: str) -> list[str]:
         """What a query field takes in this release."""
@@ -82,9 +78,9 @@ class Index:
             matching = [table[v] for v in values if v in table]
             rows = np.intersect1d(rows, np.concatenate(matching)) if matching else rows[:0]
         if not len(rows):
-            asked = ", ".join(f"{name}={value!r}" for name, value in wanted.items() if value is not None)
+            asked = ", ".join(f"{name}={value!r}" for name, value in wanted.items() if value is not None) or "any"
             raise EmptySelectionError(f"{self.root}: no history has {asked}. This release has {self.summary()}")
-        return np.array([self.entries[row].history_id for row in rows])
+        return rows
 
     def _canonical(self, name: str, value: str) -> str:
         if name == "layout":
@@ -114,33 +110,44 @@ def read_index(root: Path) -> Index:
     info = read_info(root)
     path = root / HISTORIES
     entries: list[Entry] = []
-    seen: set[int] = set()
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines()):
         try:
-            entry = Entry.from_json(json.loads(line))
-            _check_entry(entry, seen)
-        except (json.JSONDecodeError, IndexFormatError, UnknownNameError) as error:
-            raise IndexFormatError(f"{path}, line {number}: {error}") from error
+            entry = Entry.from_json(parse_json(line))
+            _check_entry(entry, number)
+        except Icrl4ahtError as error:
+            raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
         entries.append(entry)
     if len(entries) != info["histories"]:
         raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info['histories']} histories")
     return Index(root, info, tuple(entries))
 
 
-def _check_entry(entry: Entry, seen: set[int]) -> None:
-    if entry.history_id in seen:
-        raise IndexFormatError(f"history_id {entry.history_id} stands twice")
-    seen.add(entry.history_id)
-    if entry.layout not in LAYOUTS:
-        raise unknown("layout", entry.layout, LAYOUTS)
+def _check_entry(entry: Entry, number: int) -> None:
+    """Everything in an entry that other parts rely on."""
+    if entry.history_id != number:
+        raise IndexFormatError(f"history_id {entry.history_id}: ids count up from 0, expected {number}")
+    check_place(entry.track, entry.split, entry.layout)
+    if entry.teammate_family not in FAMILIES:
+        raise unknown("teammate_family", entry.teammate_family, FAMILIES)
     expected = LAYOUTS[entry.layout].obs_shape
     if entry.obs_shape != expected:
         raise IndexFormatError(f"obs_shape {list(entry.obs_shape)}, expected {list(expected)} for {entry.layout}")
-    shard = PurePosixPath(entry.shard)
-    if shard.is_absolute() or ".." in shard.parts or shard.parts[:1] != ("data",) or shard.suffix != ".h5":
-        raise IndexFormatError(f"shard {entry.shard!r}: expected a path like data/<track>/<layout>/<split>-....h5")
+    if entry.action_dim != len(ACTIONS) or not entry.has_teammate_actions:
+        raise IndexFormatError(f"expected action_dim {len(ACTIONS)} and has_teammate_actions true")
+    folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
+    if not re.fullmatch(rf"{folder}-\d{{5}}-of-\d{{5}}\.h5", entry.shard):
+        raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
     if entry.episodes > entry.T:
         raise IndexFormatError(f"{entry.episodes} episodes in {entry.T} steps")
+
+
+_INFO_TYPES: dict[str, type | tuple[type, ...]] = {
+    "kind": str,
+    "data_version": str,
+    "histories": int,
+    "environment": dict,
+    "layouts": dict,
+}
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -151,28 +158,26 @@ def read_info(root: Path) -> dict[str, Any]:
             f"{root}: no release here, expected {INFO} in it; give a release folder, or make one with `make generate`"
         )
     try:
-        info = json.loads(_text(path))
-        version = info["format_version"]
-        known = isinstance(version, int) and info["kind"] in KINDS and isinstance(info["histories"], int)
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise IndexFormatError(f"{path}: malformed: {error!r}") from error
-    if isinstance(version, int) and version > FORMAT_VERSION:
+        info = parse_json(read_text(path))
+    except IndexFormatError as error:
+        raise IndexFormatError(f"{path}: malformed: {error}") from error
+    version = info.get("format_version") if isinstance(info, dict) else None
+    if not isinstance(version, int):
+        raise IndexFormatError(f"{path}: malformed: expected an object with an integer format_version")
+    if version > FORMAT_VERSION:
         raise FormatTooNewError(
             f"{path}: format version {version}, this package reads {FORMAT_VERSION}: `pip install -U icrl4aht-data`"
         )
-    if isinstance(version, int) and version < FORMAT_VERSION:
+    if version < FORMAT_VERSION:
         raise FormatTooOldError(
             f"{path}: format version {version}, this package reads {FORMAT_VERSION}: rebuild or fetch the release again"
         )
-    if not known:
-        raise IndexFormatError(f"{path}: malformed: kind {info['kind']!r}, format_version {version!r}")
+    wrong = [name for name, kind in _INFO_TYPES.items() if not isinstance(info.get(name), kind)]
+    if wrong or info["kind"] not in KINDS or not _is_environment(info["environment"]):
+        raise IndexFormatError(f"{path}: malformed: {', '.join(wrong) or 'kind or environment'} not as expected")
     return info
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise IndexFormatError(f"{path}: missing; fetch the release again") from error
-    except UnicodeDecodeError as error:
-        raise IndexFormatError(f"{path}: not UTF-8 text: {error}") from error
+def _is_environment(value: dict[str, Any]) -> bool:
+    steps = [value.get(name) for name in ("max_steps", "kept_steps")]
+    return len(value) == 2 and all(isinstance(n, int) and n > 0 for n in steps)

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from icrl4aht_data.benchmark import ACTIONS, EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
+    FIELDS,
     FORMAT_VERSION,
     HISTORIES,
     INFO,
@@ -29,6 +32,8 @@ from icrl4aht_data.schema import (
     Entry,
     Kind,
     curve_ends,
+    episode_ends,
+    episode_returns,
     stream_score,
 )
 from icrl4aht_data.shard import write_shard
@@ -72,6 +77,7 @@ def write_release(
     *,
     data_version: str,
     card: str,
+    kept_steps: int = KEPT_STEPS,
     shard_histories: int = 1024,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
@@ -83,34 +89,61 @@ def write_release(
         tasks: what to write; histories are numbered in this order.
         data_version: SemVer of the data.
         card: README.md of the release.
+        kept_steps: steps of every episode.
         shard_histories: at most this many histories a shard.
         done: called when a task's histories have been taken, for progress.
 
     Raises:
-        OptionError: if there is no task, or a history's arrays are of unequal length or lossy.
+        OptionError: if `target` holds something else, if there is no task or one twice, or if a history's arrays are
+            missing, of unequal length or lossy.
     """
-    partial = target.with_name(f"{target.name}.partial-{os.getpid()}")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        _fill(partial, kind, list(tasks), data_version, card, shard_histories, done)
-        _swap(partial, target)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    new = list(tasks)
+    ids = [task.task.task_id for task in new]
+    if not new or len(set(ids)) < len(ids):
+        raise OptionError(f"expected at least one task and none twice, found {ids}")
+    with folder_in_place_of(target) as partial:
+        _fill(partial, kind, new, data_version, card, kept_steps, shard_histories, done)
     return target
 
 
-def _swap(new: Path, target: Path) -> None:
-    """Put `new` in the place of `target`, which never holds half a release."""
-    if target.exists():
-        if not (target / INFO).exists() and any(target.iterdir()):
-            raise OptionError(f"{target}: exists and is not a release; give another folder or remove it")
-        old = target.with_name(f"{target.name}.old-{os.getpid()}")
-        target.rename(old)
-        new.rename(target)
-        shutil.rmtree(old)
-    else:
-        new.rename(target)
+@contextmanager
+def folder_in_place_of(target: Path) -> Iterator[Path]:
+    """A new folder to fill, which takes the place of the release at `target` when the block ends without an error.
+
+    Raises:
+        OptionError: if `target` is not a release, or if another process is writing it.
+    """
+    target = target.resolve()
+    check_replaceable(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
+    try:
+        with FileLock(target.with_name(f".{target.name}.lock"), timeout=0):
+            if old.exists() and not target.exists():  # a writer was killed between the two renames below
+                old.rename(target)
+            for leftover in (new, old):
+                shutil.rmtree(leftover, ignore_errors=True)
+            new.mkdir()
+            try:
+                yield new
+                if target.exists():
+                    target.rename(old)
+                new.rename(target)
+            finally:
+                for leftover in (new, old):
+                    shutil.rmtree(leftover, ignore_errors=True)
+    except Timeout as error:
+        raise OptionError(f"{target}: another process is writing it; wait for it, or give another folder") from error
+
+
+def check_replaceable(target: Path) -> None:
+    """Whether a release may be written there.
+
+    Raises:
+        OptionError: if there is a file, or a folder that is neither empty nor a release.
+    """
+    if target.exists() and not (target.is_dir() and ((target / INFO).exists() or not any(target.iterdir()))):
+        raise OptionError(f"{target}: exists and is not a release; give another folder or remove it")
 
 
 def _fill(
@@ -119,11 +152,10 @@ def _fill(
     tasks: list[NewTask],
     data_version: str,
     card: str,
+    kept_steps: int,
     shard_histories: int,
     done: Callable[[Task], None],
 ) -> None:
-    if not tasks:
-        raise OptionError("a release needs at least one task")
     entries: list[Entry] = []
     groups: dict[tuple[str, str, str], list[NewTask]] = defaultdict(list)
     for new in tasks:
@@ -134,7 +166,8 @@ def _fill(
         for number in range(shards):
             part = list(islice(histories, shard_histories))
             name = f"data/{track}/{layout}/{split}-{number:05}-of-{shards:05}.h5"
-            new_entries = _placed([_entry(task, history, name) for task, history in part], kind, len(entries))
+            new = [_entry(task, history, name, kept_steps) for task, history in part]
+            new_entries = _placed(new, kind, len(entries))
             write_shard(root, name, kind, new_entries, (_with_obs(task, h, kind) for task, h in part))
             entries += new_entries
         for _ in histories:  # to the end, where a wrong count is noticed and the last task reported
@@ -142,8 +175,8 @@ def _fill(
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
     write_tasks(root / TASKS, [new.task for new in tasks])
-    _write_json(root / PROVENANCE, {new.task.task_id: new.provenance for new in tasks})
-    _write_json(root / INFO, describe(kind, data_version, entries))
+    write_json(root / PROVENANCE, {new.task.task_id: new.provenance for new in tasks})
+    write_json(root / INFO, describe(kind, data_version, kept_steps, entries))
     (root / "README.md").write_text(card, encoding="utf-8")
     write_manifest(root)
 
@@ -158,8 +191,13 @@ def _loaded(new: NewTask, done: Callable[[Task], None]) -> Iterator[tuple[Task, 
     done(new.task)
 
 
-def _entry(task: Task, history: NewHistory, shard: str) -> Entry:
+def _entry(task: Task, history: NewHistory, shard: str, kept_steps: int) -> Entry:
     arrays = history.arrays
+    needed = {field.name for field in FIELDS.values() if not field.optional} - {"obs"}
+    if not needed <= arrays.keys():
+        raise OptionError(f"task {task.task_id}: a history lacks the arrays {sorted(needed - arrays.keys())}")
+    if not np.array_equal(arrays["dones"], episode_ends(len(arrays["dones"]), kept_steps)):
+        raise OptionError(f"task {task.task_id}: a history's episodes do not all have {kept_steps} steps")
     returns = episode_returns(arrays["rewards"], arrays["dones"])[None]
     start, end = curve_ends(returns)
     return Entry(
@@ -209,13 +247,7 @@ def _with_obs(task: Task, history: NewHistory, kind: Kind) -> dict[str, np.ndarr
     return history.arrays | {"obs": observe(task.layout, history.arrays["state"], 0)}
 
 
-def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
-    """float64 (E,): the sum of rewards (T,) of each episode; `dones` (T,) marks last steps."""
-    ends = np.flatnonzero(dones) + 1
-    return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
-
-
-def describe(kind: Kind, data_version: str, entries: list[Entry]) -> dict[str, Any]:
+def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry]) -> dict[str, Any]:
     """The content of meta/info.json."""
     layouts = {}
     for name in dict.fromkeys(entry.layout for entry in entries):
@@ -236,7 +268,7 @@ def describe(kind: Kind, data_version: str, entries: list[Entry]) -> dict[str, A
         "data_version": data_version,
         "kind": kind,
         "actions": list(ACTIONS),
-        "environment": {"max_steps": EPISODE_STEPS, "kept_steps": KEPT_STEPS},
+        "environment": {"max_steps": EPISODE_STEPS, "kept_steps": kept_steps},
         "histories": len(entries),
         "transitions": sum(entry.T for entry in entries),
         "layouts": layouts,
@@ -256,7 +288,3 @@ def file_hash(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _write_json(path: Path, content: Any) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

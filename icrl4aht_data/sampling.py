@@ -7,6 +7,7 @@ the next i. `len(sampler)` batches hold as many steps as the selection; `i` may 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -63,11 +64,8 @@ class _Sampler:
     """What both samplers share: options, histories of one shape, draws, rendering."""
 
     def __init__(self, dataset: Dataset, *, batch_size: int, length: int, seed: int, teammate_actions: bool) -> None:
-        for name, value in (("batch_size", batch_size), ("length", length)):
-            if value < 1:
-                raise OptionError(f"{name} = {value}: expected at least 1")
-        if seed < 0:
-            raise OptionError(f"seed = {seed}: expected at least 0")
+        batch_size, length = _whole("batch_size", batch_size, 1), _whole("length", length, 1)
+        seed = _whole("seed", seed, 0)
         layouts = list(dict.fromkeys(entry.layout for entry in dataset.entries))
         if len(layouts) > 1:
             raise OptionError(
@@ -79,18 +77,17 @@ class _Sampler:
         self.batch_size, self.length, self.seed = batch_size, length, seed
         self.teammate_actions = teammate_actions
         self._entry = dataset.entries[0]
+        self._lengths = np.array([entry.T for entry in dataset.entries])
 
     def __len__(self) -> int:
-        steps = sum(entry.T for entry in self.dataset.entries)
-        return max(1, steps // (self.batch_size * self.length))
+        return max(1, int(self._lengths.sum()) // (self.batch_size * self.length))
 
     def _draws(self, i: int, count: int) -> np.ndarray:
         """uint64 (count, B): random words below 2**32, from (seed, i) alone.
 
         Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
         """
-        if i < 0:
-            raise IndexError(f"batch {i}: expected 0 or more")
+        i = _whole("batch", i, 0)
         raw = np.random.Philox(key=np.array([self.seed, i], np.uint64)).random_raw(count * self.batch_size)
         return (raw >> np.uint64(32)).reshape(count, self.batch_size)
 
@@ -119,9 +116,8 @@ class ADSampler(_Sampler):
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Which windows batch i holds: history ids and starts, int64 (B,) each."""
         which, where = self._draws(i, 2)
-        lengths = np.array([entry.T for entry in self.dataset.entries], np.uint64)
         position = _below(which, len(self.dataset))
-        starts = np.maximum(lengths[position].astype(np.int64) - self.length, 0) + 1
+        starts = np.maximum(self._lengths[position] - self.length, 0) + 1
         return self.dataset.ids[position].astype(np.int64), _below(where, starts)
 
     def __getitem__(self, i: int) -> ADBatch:
@@ -200,8 +196,8 @@ class DPTSampler(_Sampler):
                 f"DPT needs expert actions, but {len(unlabelled)} of {len(dataset)} histories have none "
                 f"(first: {unlabelled[0]}); select labelled ones: entry.has_expert_actions"
             )
-        shortest = min(entry.T for entry in dataset.entries)
-        if context > shortest:
+        shortest = int(self._lengths.min())
+        if order == "contiguous" and self.length > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
         self.order: ContextOrder = order
 
@@ -265,6 +261,17 @@ def transitions(history: History, start: int, stop: int) -> tuple[np.ndarray, np
     episode = np.cumsum(dones)[start:][last] - 1
     following[last] = history.read("episode_end_state")[episode]
     return states[: stop - start], following
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    """The value as an int, if it is one from `least` to 2**63."""
+    try:
+        number = operator.index(value)
+    except TypeError as error:
+        raise OptionError(f"{name} = {value!r}: expected a whole number") from error
+    if not least <= number < 2**63:
+        raise OptionError(f"{name} = {number}: expected at least {least} and below 2**63")
+    return number
 
 
 def _below(words: np.ndarray, n: Any) -> np.ndarray:

@@ -171,6 +171,17 @@ _JSON_TYPES: dict[str, tuple[type, ...]] = {
 _TYPES = {field.name: _JSON_TYPES[str(field.type)] for field in fields(Entry)}
 
 
+def episode_ends(steps: int, kept_steps: int) -> np.ndarray:
+    """bool (steps,): the last step of every episode of `kept_steps` steps."""
+    return np.arange(steps) % kept_steps == kept_steps - 1
+
+
+def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
+    """float64 (E,): the sum of rewards (T,) of each episode; `dones` (T,) marks last steps."""
+    ends = np.flatnonzero(dones) + 1
+    return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
+
+
 def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean return over the first and over the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
 

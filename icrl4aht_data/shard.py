@@ -6,20 +6,28 @@ they take a chunk's bytes at the offset in the chunk table, check its crc32 and 
 
 from __future__ import annotations
 
-import os
 import threading
 import zlib
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
-from icrl4aht_data.errors import IndexFormatError, OptionError, ShardCorruptError, ShardMismatchError, ShardMissingError
+from icrl4aht_data.errors import (
+    ChunkTableError,
+    OptionError,
+    ShardCorruptError,
+    ShardMismatchError,
+    ShardMissingError,
+    ShardTruncatedError,
+)
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
+
+if TYPE_CHECKING:  # libhdf5 is needed to write and to check, not to read
+    import h5py
 
 _DEFLATE_LEVEL = 6
 _CACHE_BYTES = 256 * 2**20
@@ -31,7 +39,7 @@ def chunk_table_path(root: Path, shard: str) -> Path:
 
 
 def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[dict]) -> None:
-    """Write a shard and its chunk table; each appears whole or not at all.
+    """Write a shard and its chunk table into a folder that no reader has seen yet.
 
     Args:
         root: the release folder.
@@ -43,29 +51,26 @@ def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], hi
     Raises:
         OptionError: if a value does not survive the stored dtype, or an array has not the entry's length.
     """
+    import h5py
+
     path, table_path = root / shard, chunk_table_path(root, shard)
     path.parent.mkdir(parents=True, exist_ok=True)
     table_path.parent.mkdir(parents=True, exist_ok=True)
     layout = get_layout(entries[0].layout)
-    partial, table_partial = path.with_suffix(".partial"), table_path.with_suffix(".partial")
     checksums: list[int] = []
-    with h5py.File(partial, "w", libver=("v110", "v110")) as file:
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["layout"] = layout.name
         for group in dict.fromkeys(entry.h5_group for entry in entries):
             _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
         for entry, arrays in zip(entries, histories, strict=True):
             checksums += _write_history(file[entry.h5_group], layout, kind, entry, arrays)
-    with h5py.File(partial, "r") as file:
+    with h5py.File(path, "r") as file:
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = checksums
         places = [place for entry in entries for place in _chunk_places(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
-    with table_partial.open("wb") as stream:
-        np.save(stream, table, allow_pickle=False)
-    for source, target in ((partial, path), (table_partial, table_path)):
-        _flush(source)
-        source.replace(target)
+    np.save(table_path, table, allow_pickle=False)
 
 
 def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
@@ -153,34 +158,74 @@ def _chunk_places(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, 
     return places
 
 
-def _flush(path: Path) -> None:
-    with path.open("rb") as stream:
-        os.fsync(stream.fileno())
+class ChunkCache:
+    """Decoded chunks of all shards of a dataset, the least recently used ones dropped beyond a size. Thread-safe."""
+
+    def __init__(self, size: int = _CACHE_BYTES) -> None:
+        self._size = size
+        self._clear()
+
+    def _clear(self) -> None:
+        self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> int:
+        return self._size
+
+    def __setstate__(self, size: int) -> None:
+        self._size = size
+        self._clear()
+
+    def get(self, key: tuple[str, int], decode: Callable[[], np.ndarray]) -> np.ndarray:
+        """The chunk of that key, decoded if it is not here."""
+        with self._lock:
+            if key in self._chunks:
+                self._chunks.move_to_end(key)
+                return self._chunks[key]
+        rows = decode()
+        with self._lock:
+            if key not in self._chunks:
+                self._chunks[key] = rows
+                self._bytes += rows.nbytes
+            while self._bytes > self._size and len(self._chunks) > 1:
+                self._bytes -= self._chunks.popitem(last=False)[1].nbytes
+        return rows
 
 
 class Shard:
-    """Reads one shard's histories by offset. Safe to share between threads, to fork and to pickle.
+    """Reads one shard's histories by offset. May be shared between threads and pickled.
 
     Args:
         root: the release folder.
         name: path of the shard below it.
         kind: "full" or "lite".
         entries: all histories of this shard, in index order.
+        cache: of decoded chunks.
 
     Raises:
-        ShardMissingError, IndexFormatError, ShardMismatchError: at once, if shard and chunk table do not fit the index.
+        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError: at once, if shard and chunk table
+            do not fit the index.
     """
 
-    def __init__(self, root: Path, name: str, kind: Kind, entries: Sequence[Entry]) -> None:
+    def __init__(
+        self, root: Path, name: str, kind: Kind, entries: Sequence[Entry], cache: ChunkCache | None = None
+    ) -> None:
         self.path, self.name = root / name, name
         self.kind: Kind = kind
         self.layout = get_layout(entries[0].layout)
         self._entries = {entry.history_id: entry for entry in entries}
+        self._cache = cache or ChunkCache()
         self._table = _read_table(root, name)
         self._first: dict[tuple[int, str], int] = {}
+        self._check_rows(entries)
+        self._check_size()
+
+    def _check_rows(self, entries: Sequence[Entry]) -> None:
+        """Whether the chunk table has the rows that the index says."""
         total = 0
         for entry in entries:
-            for field in entry.stored_fields(kind):
+            for field in entry.stored_fields(self.kind):
                 self._first[entry.history_id, field.name] = total
                 expected, chunks = entry.rows(field), entry.chunks(field)
                 found = int(self._table["rows"][total : total + chunks].sum())
@@ -192,31 +237,26 @@ class Shard:
                 total += chunks
         if total != len(self._table):
             raise ShardMismatchError(
-                f"{self.path}: the index implies {total} chunks, the chunk table has {len(self._table)}"
+                f"{self.path}: the index implies {total} chunks, the chunk table has {len(self._table)}; "
+                f"fetch meta/ and the shard again"
             )
-        size = self._size()
-        beyond = np.flatnonzero(self._table["offset"].astype(np.int64) + self._table["size"] > size)
+
+    def _check_size(self) -> None:
+        """Whether the file is long enough for every chunk."""
+        try:
+            size = self.path.stat().st_size
+        except FileNotFoundError as error:
+            raise self._missing() from error
+        offset, length = self._table["offset"], self._table["size"]
+        beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
-            raise ShardCorruptError(
+            raise ShardTruncatedError(
                 f"{self.path}: truncated: has {size} bytes, but {self.describe(int(beyond[0]))} ends beyond them; "
                 f"fetch the shard again, then run `icrl4aht-data verify`"
             )
-        self._cache: OrderedDict[int, np.ndarray] = OrderedDict()
-        self._cached = 0
-        self._lock = threading.Lock()
 
-    def _size(self) -> int:
-        try:
-            return self.path.stat().st_size
-        except FileNotFoundError as error:
-            raise ShardMissingError(f"{self.path}: the index names this shard, but there is no such file") from error
-
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"_cache": OrderedDict(), "_cached": 0, "_lock": None}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
-        self._lock = threading.Lock()
+    def _missing(self) -> ShardMissingError:
+        return ShardMissingError(f"{self.path}: the index names this shard, but there is no such file")
 
     def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
         """Rows start..stop of a field, in the field's dtype. The range must lie within the history.
@@ -228,7 +268,8 @@ class Shard:
         chunk = self._chunk_rows(history_id, field)
         parts = []
         for number in range(start // chunk, -(-stop // chunk)):
-            rows = self._chunk(first + number, history_id, field)
+            row = first + number
+            rows = self._cache.get((self.name, row), lambda row=row: self.decode(row, history_id, field))
             parts.append(rows[max(start - number * chunk, 0) : stop - number * chunk])
         rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return rows.astype(field.dtype, copy=False)
@@ -236,28 +277,17 @@ class Shard:
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self._entries[history_id].rows(field))
 
-    def _chunk(self, row: int, history_id: int, field: Field) -> np.ndarray:
-        with self._lock:
-            if row in self._cache:
-                self._cache.move_to_end(row)
-                return self._cache[row]
-        rows = self.decode(row, history_id, field)
-        with self._lock:
-            if row not in self._cache:
-                self._cache[row] = rows
-                self._cached += rows.nbytes
-            while self._cached > _CACHE_BYTES and len(self._cache) > 1:
-                self._cached -= self._cache.popitem(last=False)[1].nbytes
-        return rows
-
     def decode(self, row: int, history_id: int, field: Field) -> np.ndarray:
         """One chunk by its row in the chunk table, read from the file and checked; padding rows included."""
         element = field.element(self.layout, self.kind)
         shape = (self._chunk_rows(history_id, field), *field.row_shape(self.layout), *element.shape)
         offset, size, _, expected = (int(value) for value in self._table[row])
-        with self.path.open("rb") as stream:
-            stream.seek(offset)
-            data = stream.read(size)
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(offset)
+                data = stream.read(size)
+        except FileNotFoundError as error:
+            raise self._missing() from error
         found = zlib.crc32(data)
         if found != expected or len(data) != size:
             raise ShardCorruptError(
@@ -288,23 +318,38 @@ class Shard:
                 for number in range(entry.chunks(field)):
                     yield first + number, history_id, field
 
-    def check_structure(self) -> list[str]:
-        """What libhdf5 sees that differs from the index and the chunk table; empty if a plain reader gets the same."""
+    def check_structure(self, values: bool = False) -> list[str]:
+        """What another HDF5 reader would see otherwise than we do; empty if it sees the same.
+
+        Args:
+            values: also compare every value.
+        """
+        import h5py
+
         try:
             with h5py.File(self.path, "r") as file:
-                return self._structure_faults(file)
-        except (OSError, KeyError, RuntimeError, ValueError) as error:
-            return [f"not a readable HDF5 file: {error}"]
+                faults = self._structure_faults(file)
+                if values and not faults:
+                    faults = self._value_faults(file)
+                return faults
+        except (OSError, KeyError, RuntimeError, ValueError, AttributeError, TypeError) as error:
+            return [f"not an HDF5 file as the index describes it: {error}"]
 
     def _structure_faults(self, file: h5py.File) -> list[str]:
         faults = []
+        attributes = {"format_version": FORMAT_VERSION, "layout": self.layout.name}
+        if dict(file.attrs) != attributes:
+            faults.append(f"attributes: expected {attributes}, found {dict(file.attrs)}")
+        groups = Counter(entry.h5_group for entry in self._entries.values())
+        if {f"/{name}" for name in file} != set(groups):
+            faults.append(f"groups: expected {sorted(groups)}, found {sorted(f'/{name}' for name in file)}")
+            return faults
         places: list[tuple[int, int, int]] = []
         for entry in self._entries.values():
-            stacked = sum(other.h5_group == entry.h5_group for other in self._entries.values())
             for field in entry.stored_fields(self.kind):
                 dataset: Any = file[f"{entry.h5_group}/{field.name}"]
                 row = (entry.rows(field), *field.row_shape(self.layout))
-                shape = row if entry.h5_row is None else (stacked, *row)
+                shape = row if entry.h5_row is None else (groups[entry.h5_group], *row)
                 element = field.element(self.layout, self.kind)
                 if dataset.shape != shape or dataset.dtype != element:
                     faults.append(
@@ -318,15 +363,29 @@ class Shard:
             faults.append(f"the chunk table places {self.describe(wrong[0])} where HDF5 has {places[wrong[0]]}")
         return faults
 
+    def _value_faults(self, file: h5py.File) -> list[str]:
+        faults = []
+        for entry in self._entries.values():
+            for field in entry.stored_fields(self.kind):
+                dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+                theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
+                try:
+                    ours = self.read(entry.history_id, field, 0, entry.rows(field))
+                except ShardCorruptError:
+                    continue  # reported chunk by chunk
+                if not np.array_equal(theirs, ours):
+                    faults.append(f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do")
+        return faults
+
 
 def _read_table(root: Path, name: str) -> np.ndarray:
     path = chunk_table_path(root, name)
     try:
         table = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
-        raise IndexFormatError(f"{path}: the chunk table of {name} is missing") from error
+        raise ChunkTableError(f"{path}: the chunk table of {name} is missing") from error
     except Exception as error:  # a damaged header makes NumPy's parser raise anything
-        raise IndexFormatError(f"{path}: not a chunk table: {error!r}") from error
+        raise ChunkTableError(f"{path}: not a chunk table: {error!r}") from error
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:
-        raise IndexFormatError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
+        raise ChunkTableError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
     return table

@@ -15,8 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from icrl4aht_data.benchmark import HEURISTIC_KINDS, SPLITS, TRACKS, unknown
+from icrl4aht_data.benchmark import HEURISTIC_KINDS, SPLITS, TRACKS, check_place, unknown
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError
+from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _FIELDS = ("task_id", "track", "split", "layout_name", "seed", "teammate")
@@ -50,13 +51,18 @@ class Task:
     @property
     def teammate_family(self) -> str:
         """The index's `teammate_family`: H1..H4, or rl."""
-        return HEURISTIC_KINDS.get(self.teammate_kind, "rl")
+        return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS[self.teammate_kind]
 
 
 def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:
-    """A task with its id."""
-    alias = get_layout(layout).alias
-    return Task(task_id(track, split, alias, teammate, seed), track, split, alias, seed, teammate)
+    """A task with its id.
+
+    Raises:
+        UnknownNameError: if the layout does not belong to that split of that track.
+    """
+    known = get_layout(layout)
+    check_place(track, split, known.name)
+    return Task(task_id(track, split, known.alias, teammate, seed), track, split, known.alias, seed, teammate)
 
 
 def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], seed: int) -> str:
@@ -90,7 +96,7 @@ def read_tasks(path: Path) -> list[Task]:
         TaskFormatError: names the file and the line.
     """
     tasks: dict[str, Task] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         try:
             task = _parse(line)
             if task.task_id in tasks:
@@ -107,21 +113,19 @@ def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
 
 
 def _parse(line: str) -> Task:
-    try:
-        fields = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise TaskFormatError(f"not JSON: {error}") from error
+    fields = parse_json(line)
     if not isinstance(fields, dict) or set(fields) != set(_FIELDS):
         found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
         raise TaskFormatError(f"expected the fields {sorted(_FIELDS)}, found {found}")
-    if fields["track"] not in TRACKS:
-        raise unknown("track", fields["track"], TRACKS)
-    if fields["split"] not in SPLITS:
-        raise unknown("split", fields["split"], SPLITS)
-    get_layout(fields["layout_name"])
+    for name, kind in (("task_id", str), ("layout_name", str), ("seed", int), ("teammate", dict)):
+        if not isinstance(fields[name], kind):
+            raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
+    check_place(fields["track"], fields["split"], get_layout(fields["layout_name"]).name)
     teammate = fields["teammate"]
-    if not isinstance(teammate, dict) or "family" not in teammate or "kind" not in teammate:
-        raise TaskFormatError(f"teammate: expected an object with 'kind' and 'family', found {teammate!r}")
+    if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
+        raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
+    if teammate["kind"] == "heuristic" and teammate["family"] not in HEURISTIC_KINDS:
+        raise unknown("heuristic family", teammate["family"], HEURISTIC_KINDS)
     task = Task(**fields)
     expected = task_id(task.track, task.split, task.layout_name, teammate, task.seed)
     if task.task_id != expected:

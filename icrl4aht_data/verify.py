@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,10 +18,20 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import columns, faults, start
-from icrl4aht_data.release import describe, episode_returns, file_hash
-from icrl4aht_data.schema import MANIFEST, TASKS, Entry, curve_ends, stream_score
+from icrl4aht_data.release import describe, file_hash
+from icrl4aht_data.schema import (
+    HISTORIES,
+    INFO,
+    MANIFEST,
+    TASKS,
+    Entry,
+    curve_ends,
+    episode_ends,
+    episode_returns,
+    stream_score,
+)
 from icrl4aht_data.shard import Shard
-from icrl4aht_data.tasks import read_tasks
+from icrl4aht_data.tasks import Task, read_tasks
 
 
 @dataclass(frozen=True)
@@ -77,12 +88,21 @@ def verify_release(
     _check_manifest(root, report, advance)
     try:
         index = read_index(root)
-        tasks = {task.task_id: task for task in read_tasks(root / TASKS)}
-    except (Icrl4ahtError, OSError) as error:
+        tasks = read_tasks(root / TASKS)
+    except Icrl4ahtError as error:
         report.add("meta", str(error))
         return report
+    _check_index(index, tasks, report)
+    _check_shards(index, report, advance)
+    return report
+
+
+def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
+    """Index, tasks, totals and shard names against each other."""
+    by_id = {task.task_id: task for task in tasks}
+    streams: set[tuple[str, int]] = set()
     for entry in index.entries:
-        task = tasks.get(entry.task_id)
+        task = by_id.get(entry.task_id)
         said = (entry.layout, entry.track, entry.split, entry.teammate_kind, entry.teammate_family, entry.seed)
         if task is None:
             report.add(TASKS, f"history {entry.history_id}: its task {entry.task_id!r} is missing")
@@ -95,12 +115,25 @@ def verify_release(
             task.seed,
         ):
             report.add(TASKS, f"history {entry.history_id}: index and task {entry.task_id!r} disagree")
-    expected = describe(index.info["kind"], str(index.info.get("data_version")), list(index.entries))
+        if (entry.task_id, entry.env_idx) in streams:
+            report.add(HISTORIES, f"history {entry.history_id}: stream {entry.env_idx} of its task stands twice")
+        streams.add((entry.task_id, entry.env_idx))
+    for task_id in by_id.keys() - {entry.task_id for entry in index.entries}:
+        report.add(TASKS, f"task {task_id!r} has no history")
+    if not index.entries:
+        report.add(HISTORIES, "no histories")
+    info = index.info
+    kept_steps = info["environment"]["kept_steps"]
+    expected = describe(info["kind"], info["data_version"], kept_steps, list(index.entries))
     for name in expected:
-        if index.info.get(name) != expected[name]:
-            report.add("meta/info.json", f"{name}: expected {expected[name]!r}, found {index.info.get(name)!r}")
-    _check_shards(index, report, advance)
-    return report
+        if info.get(name) != expected[name]:
+            report.add(INFO, f"{name}: expected {expected[name]!r}, found {info.get(name)!r}")
+    shards = {entry.shard for entry in index.entries}
+    for shard in shards:
+        stem, count = shard.removesuffix(".h5").split("-")[0], int(shard.removesuffix(".h5").split("-")[-1])
+        missing = {f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count)} - shards
+        for name in sorted(missing):
+            report.add(name, f"the name of {shard} promises this shard, the index has no history in it")
 
 
 def _check_manifest(root: Path, report: Report, advance: Advance) -> None:
@@ -141,13 +174,19 @@ def _check_shards(index: Index, report: Report, advance: Advance) -> None:
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue
-        for fault in shard.check_structure():
+        for fault in shard.check_structure(values=report.deep):
             report.add(name, fault)
         damaged = _check_chunks(shard, report)
+        seen: dict[tuple[str, bytes], int] = {}
         for entry in entries:
             if entry.history_id not in damaged:
-                for problem in _history_problems(History(entry, shard, "uint8"), report.deep):
+                history = History(entry, shard, "uint8")
+                for problem in _history_problems(history, index.info["environment"]["kept_steps"], report.deep):
                     report.add(name, f"history {entry.history_id}: {problem}")
+                content = hashlib.sha256(history.read("state").tobytes() + history.read("actions").tobytes()).digest()
+                twin = seen.setdefault((entry.task_id, content), entry.history_id)
+                if twin != entry.history_id:
+                    report.add(name, f"history {entry.history_id}: the same as history {twin}")
                 report.transitions += entry.T
             report.histories += 1
             advance("histories", report.histories, len(index.entries))
@@ -166,20 +205,22 @@ def _check_chunks(shard: Shard, report: Report) -> set[int]:
     return damaged
 
 
-def _history_problems(history: History, deep: bool) -> Iterator[str]:
+def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator[str]:
     entry = history.entry
     layout = get_layout(entry.layout)
     dones, rewards = history.read("dones"), history.read("rewards")
-    if int(dones.sum()) != entry.episodes or not dones[-1]:
-        yield f"dones: expected {entry.episodes} episodes, the last ending at step {entry.T - 1}, found {dones.sum()}"
+    if entry.episodes * kept_steps != entry.T or not np.array_equal(dones, episode_ends(entry.T, kept_steps)):
+        yield f"dones: expected {entry.episodes} episodes of {kept_steps} steps, found {dones.sum()} in {entry.T} steps"
         return
     names = ["actions", "teammate_actions", *(["expert_actions"] if entry.has_expert_actions else [])]
     for name in names:
         values = history.read(name)
         if values.min() < 0 or values.max() >= len(ACTIONS):
             yield f"{name}: expected 0..{len(ACTIONS) - 1}, found {values.min()}..{values.max()}"
+    impossible = False
     for name in ("state", "episode_end_state"):
         for fault in faults(layout, history.read(name)):
+            impossible = True
             yield f"{name} has {fault}"
     returns = episode_returns(rewards, dones)[None]
     first, last = curve_ends(returns)
@@ -188,7 +229,7 @@ def _history_problems(history: History, deep: bool) -> Iterator[str]:
     for name, value in found.items():
         if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
-    if deep:
+    if deep and not impossible:
         yield from _physics_problems(layout, history, dones, rewards)
 
 
@@ -210,7 +251,7 @@ def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewar
     if len(wrong):
         t = int(wrong[0])
         yield f"replay: {len(wrong)} rewards differ, first at step {t}: rules {played.reward[t]}, found {rewards[t]}"
-    if not np.isin(states[:, recipe], layout.recipe_items).all():
+    if not np.isin([*states[:, recipe], *ends[:, recipe]], layout.recipe_items).all():
         yield "a recipe is not one of the layout's"
     yield from _start_problems(layout, states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icrl4aht_data.benchmark import track_of
+from icrl4aht_data.benchmark import TRACKS, track_of
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import start
@@ -45,11 +45,11 @@ def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -
 
 
 def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
-    """Training tasks with made-up heuristic entries."""
+    """Tasks with made-up heuristic entries, of the training split where the layout has one."""
     return [
         make_task(
             track_of(layout),
-            "train",
+            "train" if layout in TRACKS[track_of(layout)]["train"] else "test",
             layout,
             {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {}},
             seed,
@@ -84,5 +84,7 @@ def random_release(
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
         tasks.append(NewTask(task, {"seed": seed}, streams, lambda histories=histories: histories))
-    write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", shard_histories=shard_histories)
+    write_release(
+        root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
+    )
     return written

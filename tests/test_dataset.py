@@ -59,6 +59,9 @@ def test_positions_ids_and_iteration(lite):
         np.arange(120) % 3 == 0,
         (slice(3, 9), 2),
         (7, 3),
+        ...,
+        None,
+        (..., 2),
     ],
     ids=str,
 )
@@ -113,6 +116,13 @@ def test_returns_are_the_learning_curve(lite):
     np.testing.assert_allclose(
         load_icrl4aht(root)[3].returns(), written[3]["rewards"].reshape(6, 20).sum(axis=1), rtol=0, atol=1e-9
     )
+
+
+def test_parts_and_selections_of_a_selection(lite):
+    dataset = load_icrl4aht(lite[0], layout="demo_wide")
+    assert dataset[1:3].ids.tolist() == [7, 8]
+    with pytest.raises(UnknownNameError, match=r"this selection has no history \[0\]"):
+        dataset.select([7, 0])
 
 
 def test_a_dataset_travels_by_pickle(lite):

@@ -20,6 +20,7 @@ from generation.learners.checkpoint import load_policy
 from generation.profiles import load_profile
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import LAYOUTS
 
 TINY = """
 [ego]
@@ -31,6 +32,7 @@ shaping_horizon = 16_000
 widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
 
 [release]
+data_version = "0.0.1"
 keep = 3
 
 [tasks]
@@ -171,6 +173,37 @@ def test_nothing_but_lines_where_output_is_no_terminal(built):
     output = StringIO()
     build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
     assert not re.search(r"\x1b|━", output.getvalue())
+
+
+def test_two_collectors_never_do_one_task_together(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    (task,) = profile.tasks()
+    folder = built / "c" / task.task_id
+
+    def meanwhile(update, metrics):
+        with pytest.raises(OptionError, match="another process is collecting this task"):
+            collect.run_task(task, profile, folder)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect.run_task(task, profile, folder, meanwhile)
+
+
+def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
+    from generation import package
+
+    monkeypatch.setattr(package, "MINI", tmp_path / "mini")
+    for _ in range(2):
+        package.bundle_release(built / "a" / "lite")
+        assert verify_release(tmp_path / "mini").ok
+
+
+def test_the_teammate_can_be_rebuilt(built):
+    from generation.teammates.registry import build as build_teammate
+
+    spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
+    assert (spec["slot"], spec["noise"]) == (1, "seeded")
+    assert build_teammate(LAYOUTS["demo_wide"], spec, spec["slot"], spec["noise"]).sees == "state"
 
 
 def test_unknown_profile_is_one_line(tmp_path):

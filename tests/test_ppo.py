@@ -407,6 +407,13 @@ def test_derived_numbers():
     assert (config.steps_per_update, config.updates, config.episodes) == (800, 12, 3)
 
 
+@pytest.mark.parametrize("steps", [1, 100, 101, 400, 500, 501, 899, 901, 58_368])
+def test_episodes_are_those_with_a_hundred_steps_and_the_state_after_them(steps):
+    """The records of `steps` steps hold what is kept of an episode if they reach its step 100."""
+    complete = sum(start + 100 < steps for start in range(0, steps, 400))
+    assert PPOConfig(total_steps=steps, environments=1, rollout=1, minibatches=1).episodes == complete
+
+
 def test_minibatches_must_divide_the_environments():
     with pytest.raises(ValueError, match=r"environments = 10: not a multiple of minibatches = 4"):
         PPOConfig(environments=10, minibatches=4)

@@ -23,8 +23,8 @@ from icrl4aht_data.errors import OptionError, RootNotFoundError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.release import NewHistory, NewTask, episode_returns, write_release
-from icrl4aht_data.schema import FIELDS
+from icrl4aht_data.release import NewHistory, NewTask, write_release
+from icrl4aht_data.schema import FIELDS, episode_returns
 from icrl4aht_data.shard import decode_chunk, encode_chunk
 
 
@@ -135,6 +135,11 @@ def test_returns_of_episodes():
     assert episode_returns(rewards, dones).tolist() == [15.0, 40.0, -20.0]
 
 
+def visible(folder):
+    """What is in a folder but for lock files."""
+    return sorted(path.name for path in folder.iterdir() if path.suffix != ".lock")
+
+
 def lossy(arrays):
     return arrays | {"rewards": arrays["rewards"] + 0.5}
 
@@ -143,14 +148,25 @@ def short(arrays):
     return arrays | {"actions": arrays["actions"][:-1]} | {"state": arrays["state"][:-1]}
 
 
-@pytest.mark.parametrize(("spoil", "message"), [(lossy, "values that int8 cannot hold"), (short, "rows, expected")])
+def bare(arrays):
+    return {name: array for name, array in arrays.items() if name != "episode_end_state"}
+
+
+def odd(arrays):
+    return arrays | {"dones": np.roll(arrays["dones"], 1)}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [(lossy, "values that int8 cannot hold"), (short, "rows, expected"), (bare, "lacks the arrays"), (odd, "10 steps")],
+)
 def test_arrays_that_do_not_fit_are_refused_and_nothing_remains(tmp_path, spoil, message):
     (task,) = make_tasks(["cramped_up"])
     arrays = spoil(play(task.layout, 5, 10, np.random.default_rng(0)))
     new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)])
     with pytest.raises(OptionError, match=message):
-        write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="")
-    assert list(tmp_path.iterdir()) == []
+        write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
+    assert visible(tmp_path) == []
 
 
 def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
@@ -169,7 +185,7 @@ def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
     assert verify_release(root).ok
     random_release(root, seed=2)
     assert (root / "MANIFEST.sha256").read_bytes() != before
-    assert [path.name for path in tmp_path.iterdir()] == ["release"]
+    assert visible(tmp_path) == ["release"]
 
 
 def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
@@ -178,8 +194,58 @@ def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
     for announced in (1, 3):
         new = NewTask(task, {}, announced, lambda: [NewHistory(k, arrays) for k in range(2)])
         with pytest.raises(OptionError, match=f"2 histories, but {announced} were announced"):
-            write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="", shard_histories=1)
-    assert list(tmp_path.iterdir()) == []
+            write_release(
+                tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10, shard_histories=1
+            )
+    assert visible(tmp_path) == []
+
+
+def test_no_task_and_a_task_twice_are_refused(tmp_path):
+    (task,) = make_tasks(["cramped_up"])
+    new = NewTask(task, {}, 1, list)
+    for tasks in ([], [new, new]):
+        with pytest.raises(OptionError, match="at least one task and none twice"):
+            write_release(tmp_path / "out", "lite", tasks, data_version="0.0.1", card="")
+
+
+def test_two_writers_of_one_release(tmp_path):
+    def meanwhile():
+        with pytest.raises(OptionError, match="another process is writing it"):
+            random_release(tmp_path / "release")
+        return [NewHistory(0, play(task.layout, 5, 10, np.random.default_rng(0)))]
+
+    (task,) = make_tasks(["cramped_up"])
+    new = NewTask(task, {}, 1, meanwhile)
+    write_release(tmp_path / "release", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
+    assert verify_release(tmp_path / "release").histories == 1
+
+
+def test_a_writer_killed_between_the_two_renames(tmp_path):
+    random_release(tmp_path / "release", seed=1)
+    before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
+    (tmp_path / "release").rename(tmp_path / ".release.old")
+
+    def fail():
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        new = NewTask(make_tasks(["cramped_up"])[0], {}, 1, fail)
+        write_release(tmp_path / "release", "lite", [new], data_version="1.0.0", card="")
+    assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
+
+
+def test_a_link_to_a_release_is_followed(tmp_path):
+    random_release(tmp_path / "real", seed=1)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    random_release(tmp_path / "link", seed=2, streams=1)
+    assert (tmp_path / "link").is_symlink()
+    assert verify_release(tmp_path / "real").histories == 4
+
+
+def test_a_file_in_the_way(tmp_path):
+    (tmp_path / "release").write_text("mine")
+    with pytest.raises(OptionError, match="is not a release"):
+        random_release(tmp_path / "release")
 
 
 def test_a_folder_that_is_no_release_is_not_replaced(tmp_path):
@@ -205,7 +271,7 @@ def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, delay)
     assert writer.stdout is not None
     writer.stdout.readline()
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob("release.partial-*")) and time.monotonic() < deadline:
+    while not (tmp_path / ".release.partial").exists() and time.monotonic() < deadline:
         time.sleep(0.005)
     time.sleep(delay)
     writer.send_signal(signal.SIGKILL)
@@ -214,8 +280,11 @@ def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, delay)
     assert not root.exists()
     with pytest.raises(RootNotFoundError):
         load_icrl4aht(root)
-    for partial in tmp_path.glob("release.partial-*"):
-        assert not verify_release(partial).ok
+    assert (tmp_path / ".release.partial").exists(), "the writer was killed too late for this test"
+    assert not verify_release(tmp_path / ".release.partial").ok
+    random_release(root, streams=1)  # the next writer clears up and succeeds
+    assert verify_release(root).ok
+    assert visible(tmp_path) == ["release"]
 
 
 def test_info_counts(lite):

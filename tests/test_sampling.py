@@ -206,8 +206,9 @@ def test_windows_are_uniform_over_histories_and_starts(lite):
 def test_length_and_iteration(lite):
     sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)
     assert len(sampler) == 720 // 120 == len(list(sampler))
-    with pytest.raises(IndexError, match="batch -1"):
-        sampler[-1]
+    for bad in (-1, 0.7, 2**64):
+        with pytest.raises(OptionError, match="batch = "):
+            sampler[bad]  # type: ignore[index]
 
 
 @pytest.mark.parametrize(
@@ -216,6 +217,10 @@ def test_length_and_iteration(lite):
         ({"batch_size": 0, "length": 5}, "batch_size = 0"),
         ({"batch_size": 2, "length": 0}, "length = 0"),
         ({"batch_size": 2, "length": 5, "seed": -1}, "seed = -1"),
+        ({"batch_size": 2, "length": 5, "seed": 0.5}, "seed = 0.5: expected a whole number"),
+        ({"batch_size": 2, "length": 5, "seed": 2**64}, "below"),
+        ({"batch_size": 2.0, "length": 5}, "batch_size = 2.0"),
+        ({"batch_size": 2, "length": None}, "length = None"),
     ],
 )
 def test_impossible_options(lite, options, message):
@@ -227,6 +232,7 @@ def test_impossible_contexts(lite):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     with pytest.raises(OptionError, match="context = 121: the shortest history has 120 transitions"):
         dataset.dpt(batch_size=2, context=121)
+    assert dataset.dpt(batch_size=2, context=121, order="random")[0].context_actions.shape == (2, 121)
     with pytest.raises(UnknownNameError, match=r"unknown order 'sorted'; valid: contiguous, random"):
         dataset.dpt(batch_size=2, context=5, order="sorted")  # type: ignore[arg-type]
 

@@ -76,7 +76,7 @@ def rewritten(tmp_path, spoil, kind: Kind = "lite"):
     (task,) = make_tasks(["demo_simple"])
     arrays = play(task.layout, 6, 20, np.random.default_rng(5))
     new = NewTask(task, {}, 1, lambda: [NewHistory(0, spoil(arrays))])
-    return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="")
+    return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
 
 def at(name, index, value):
@@ -94,7 +94,6 @@ def at(name, index, value):
         (at("actions", 7, 6), "actions: expected 0..5, found"),
         (at("teammate_actions", 7, -1), "teammate_actions: expected 0..5, found -1..5"),
         (at("expert_actions", 0, 9), "expert_actions: expected 0..5"),
-        (at("dones", [100, 119], [True, False]), "dones: expected 6 episodes, the last ending at step 119"),
         (at("state", (3, 0), 0), "state has a position that is not reachable floor"),
         (at("state", (3, 2), 9), "state has an unknown facing"),
         (at("state", (3, 4), 2), "state has an impossible item in hand"),
@@ -169,6 +168,153 @@ def test_shard_that_another_tool_would_read_differently(damaged):
     shutil.copy(chunk_table_path(other, SHARD), table)
     write_manifest(damaged)
     assert problems(damaged)
+
+
+def lines_of(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def spoil_index(root, change):
+    """Change the parsed index lines in place, and make the hashes hold again."""
+    path = root / "meta" / "histories.jsonl"
+    lines = lines_of(path)
+    change(lines)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(root)
+
+
+def swap(lines):
+    lines[0], lines[1] = lines[1], lines[0]
+
+
+def twice(lines):
+    lines[1]["env_idx"] = lines[0]["env_idx"]
+
+
+def foreign(lines):
+    lines[0]["layout"] = "test_simple"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (swap, "line 1: history_id 1: ids count up from 0, expected 0"),
+        (twice, "history 1: stream 0 of its task stands twice"),
+        (foreign, "line 1: obs_shape"),
+        (lambda lines: lines[0].update(split="test"), "line 1: shard"),
+        (lambda lines: lines[0].update(split="validation"), "unknown split 'validation'"),
+        (lambda lines: lines[0].update(action_dim=99), "expected action_dim 6"),
+        (lambda lines: lines[0].update(teammate_family="H9"), "unknown teammate_family 'H9'"),
+    ],
+)
+def test_index_lines_that_lie(damaged, change, message):
+    spoil_index(damaged, change)
+    assert any(message in problem for problem in problems(damaged)), problems(damaged)
+
+
+def test_lost_shards_with_their_lines(tmp_path):
+    random_release(tmp_path / "r", layouts=("cramped_up",), teammates=1, streams=2, shard_histories=1)
+    assert problems(tmp_path / "r") == []
+    spoil_index(tmp_path / "r", lambda lines: lines.pop())
+    found = problems(tmp_path / "r")
+    assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
+
+
+def test_equal_histories_of_a_task(tmp_path):
+    from plays import make_tasks
+
+    (task,) = make_tasks(["demo_simple"])
+    arrays = play(task.layout, 6, 20, np.random.default_rng(5))
+    new = NewTask(task, {}, 2, lambda: [NewHistory(k, arrays) for k in range(2)])
+    write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+    assert problems(tmp_path / "r")[0].endswith("history 1: the same as history 0")
+
+
+def test_other_episode_lengths_than_stated(damaged):
+    path = damaged / "meta" / "info.json"
+    content = json.loads(path.read_text())
+    content["environment"]["kept_steps"] = 40
+    path.write_text(json.dumps(content))
+    write_manifest(damaged)
+    assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
+
+
+def test_values_that_only_plain_hdf5_readers_see_otherwise(damaged):
+    """The chunks are whole, but a header lacks the shuffle filter: other tools would read other values."""
+    import h5py
+
+    path = damaged / SHARD
+    with h5py.File(path, "r+") as file:
+        file.attrs["layout"] = "demo_wide"
+    write_manifest(damaged)
+    assert any("attributes: expected" in problem for problem in problems(damaged))
+    with h5py.File(path, "r+") as file:
+        file.attrs["layout"] = "coord_simple"
+        file.create_group("extra")
+    write_manifest(damaged)
+    assert any("groups: expected ['/0'], found ['/0', '/extra']" in problem for problem in problems(damaged))
+
+
+def test_no_damage_makes_verify_raise(damaged):
+    """Bits and hostile values anywhere: verify always reports, never raises, and never calls it whole."""
+    rng = np.random.default_rng(7)
+    hostile = [b"", b"[]", b"{}", b"null", b"\xff\xfe", b"[" * 5000, b'{"format_version": ' + b"9" * 5000 + b"}"]
+    for path in sorted(p for p in damaged.rglob("*") if p.is_file()):
+        whole = path.read_bytes()
+        flips = []
+        for _ in range(25):
+            data = bytearray(whole)
+            data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+            flips.append(bytes(data))
+        for data in [*flips, *hostile, whole[: len(whole) // 2]]:
+            path.write_bytes(data)
+            assert not verify_release(damaged, deep=True).ok, path
+            if path.name != "MANIFEST.sha256":  # the hashes of a liar hold
+                write_manifest(damaged)
+                verify_release(damaged, deep=True)
+                (damaged / "MANIFEST.sha256").unlink()
+                write_manifest(damaged)
+        path.write_bytes(whole)
+        write_manifest(damaged)
+    assert verify_release(damaged, deep=True).ok
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value"),
+    [("tasks", "track", ["a"]), ("tasks", "layout_name", ["a"]), ("tasks", "teammate", 3), ("tasks", "seed", "x")],
+)
+def test_hostile_task_lines(damaged, name, field, value):
+    path = damaged / "meta" / f"{name}.jsonl"
+    lines = lines_of(path)
+    lines[1][field] = value
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(damaged)
+    assert any("line 2" in problem for problem in problems(damaged)), problems(damaged)
+
+
+def test_chunk_offsets_beyond_any_file(damaged):
+    path = chunk_table_path(damaged, SHARD)
+    table = np.load(path)
+    table["offset"][3] = 2**63 + 5
+    np.save(path, table)
+    write_manifest(damaged)
+    assert any("truncated" in problem for problem in problems(damaged))
+
+
+def test_a_group_where_a_dataset_should_be(damaged):
+    import h5py
+
+    with h5py.File(damaged / SHARD, "r+") as file:
+        del file["0/actions"]
+        file.create_group("0/actions")
+    write_manifest(damaged)
+    assert any("HDF5" in problem or "hdf5" in problem for problem in problems(damaged)), problems(damaged)
+
+
+@pytest.mark.parametrize("column", [0, 2])
+def test_impossible_states_under_deep(tmp_path, column):
+    root = rewritten(tmp_path, at("state", (7, column), 255))
+    assert problems(root, deep=True)
 
 
 class TestCommand:

@@ -37,9 +37,13 @@ class Widths:
         """From JSON or TOML, where tuples are lists.
 
         Raises:
-            TypeError: for unknown names.
+            TypeError: for unknown names or other values than positive whole numbers.
         """
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+        for name, value in values.items():
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not numbers or not all(type(n) is int and n > 0 for n in numbers):
+                raise TypeError(f"widths.{name} = {value!r}: expected positive whole numbers")
         return cls(**values)
 
 

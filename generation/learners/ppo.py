@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 from generation.env import Environment, EnvState, EnvStep
 from generation.learners.network import ActorCritic, Widths
 from generation.teammates.base import Policy
-from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, TEAMMATE
+from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, KEPT_STEPS, TEAMMATE
 from icrl4aht_data.overcooked.observe import observe
 
 
@@ -56,8 +56,8 @@ class PPOConfig:
 
     @property
     def episodes(self) -> int:
-        """Whole episodes of each environment."""
-        return self.updates * self.rollout // EPISODE_STEPS
+        """Episodes of each environment whose kept steps, and the state after them, are within the updates."""
+        return max(0, (self.updates * self.rollout - KEPT_STEPS - 1) // EPISODE_STEPS + 1)
 
 
 class Seats(NamedTuple):

@@ -26,6 +26,7 @@ class Profile:
 
     name: str
     ego: PPOConfig
+    data_version: str  # of the release, SemVer
     keep: int  # streams of each task that the release keeps, best first
     layouts: tuple[str, ...]
     presets: tuple[str, ...]  # of the teammate H4 utility_greedy
@@ -61,13 +62,14 @@ def load_profile(name: str) -> Profile:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         _only(content, "", {"ego", "release", "tasks"})
-        _only(content["release"], "release.", {"keep"})
+        _only(content["release"], "release.", {"keep", "data_version"})
         _only(content["tasks"], "tasks.", {"layouts", "presets"})
         tasks = content["tasks"]
         profile = Profile(
             name=path.stem,
             ego=_ego(dict(content["ego"])),
-            keep=content["release"]["keep"],
+            data_version=_typed("release.data_version", content["release"]["data_version"], str),
+            keep=_typed("release.keep", content["release"]["keep"], int),
             layouts=tuple(get_layout(layout).name for layout in tasks["layouts"]),
             presets=tuple(tasks["presets"]),
         )
@@ -76,8 +78,10 @@ def load_profile(name: str) -> Profile:
         raise OptionError(f"{path}: not TOML: {error}") from error
     except KeyError as error:
         raise OptionError(f"{path}: missing key {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise OptionError(f"{path}: {error}") from error
+    if not profile.tasks():
+        raise OptionError(f"{path}: tasks.layouts and tasks.presets: expected at least one of each")
     if not 0 < profile.keep <= profile.ego.environments:
         raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
     if profile.ego.episodes < 5:
@@ -92,7 +96,19 @@ def _ego(table: dict[str, Any]) -> PPOConfig:
     if "widths" in table:
         _only(table["widths"], "ego.widths.", {field.name for field in fields(Widths)})
         table["widths"] = Widths.from_table(table["widths"])
+    for field in fields(PPOConfig):
+        if field.name in table and field.name != "widths":
+            value = _typed(f"ego.{field.name}", table[field.name], int if field.type == "int" else float)
+            if not value > 0:
+                raise OptionError(f"ego.{field.name} = {value}: expected a positive number")
     return PPOConfig(**table)
+
+
+def _typed(key: str, value: Any, kind: type) -> Any:
+    """The value, if it is of that type; a whole number will do where a float is expected."""
+    if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
+        raise OptionError(f"{key} = {value!r}: expected {kind.__name__}")
+    return value
 
 
 def _only(table: dict[str, Any], prefix: str, known: set[str]) -> None:

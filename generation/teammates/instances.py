@@ -123,7 +123,8 @@ def named_task(layout: str, teammate: str) -> Task:
     family, number = names[teammate]
     entry = {"kind": "heuristic", "family": family, "theta_id": number, "base_seed": 0}
     entry["theta"] = published_thetas(name, family)[number]
-    return make_task(track_of(name), "test", name, entry, seed=0)
+    track = track_of(name)
+    return make_task(track, "test" if name in TRACKS[track]["test"] else "train", name, entry, seed=0)
 
 
 def published_tasks(track: str) -> list[Task]:

@@ -195,7 +195,10 @@ class Scene:
     # Masks over cells.
 
     def _at(self, cells: tuple[int, ...], values: Array) -> Bool[Array, " cells"]:
-        return jnp.zeros(self.paths.layout.cells, bool).at[jnp.asarray(cells, jnp.int32)].set(values)
+        number = np.zeros(self.paths.layout.cells, np.int32)
+        number[list(cells)] = range(len(cells))
+        there = np.isin(np.arange(self.paths.layout.cells), cells)
+        return values[number] & there if cells else jnp.asarray(there)
 
     @cached_property
     def _raw_and_idle(self) -> Bool[Array, " P"]:

@@ -145,8 +145,8 @@ def build(layout: Layout, teammate: dict[str, Any], slot: int = TEAMMATE, noise:
 def _possible(module, name: str, value: Any) -> bool:
     if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
         return False
-    whole = isinstance(module.DEFAULTS[name], int)
-    return not whole or (float(value).is_integer() and 0 <= value < _CHOICES.get(module.KIND, {}).get(name, math.inf))
+    number, choices = float(value), _CHOICES.get(module.KIND, {}).get(name, math.inf)
+    return isinstance(module.DEFAULTS[name], float) or (number.is_integer() and 0 <= number < choices)
 
 
 def _in_words(module, wrong: dict[str, Any]) -> str:

@@ -186,9 +186,9 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
     does, all that I can reach where the mask has its fallback."""
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
     anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
-    areas = _territory(scene, params)
+    mine = areas(scene, params)
     reach = scene.reach(jnp.stack([mask for mask, _ in masks]))
-    strict, relaxed = reach & areas.strict, reach & areas.relaxed
+    strict, relaxed = reach & mine.strict, reach & mine.relaxed
     fallback = jnp.asarray(np.array([[fallback] for _, fallback in masks]))
     found = jnp.where(
         jnp.any(strict, axis=1, keepdims=True),
@@ -198,7 +198,7 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
     return jnp.where(anywhere, reach, found)
 
 
-def _territory(scene: Scene, params) -> Areas:
+def areas(scene: Scene, params) -> Areas:
     """The areas of my seat, or of the partner's if I invade."""
     beyond, stations = _borders(scene.paths)
     kind = jnp.where((params["split_mode"] == STATIONS) & (not stations), VERTICAL, params["split_mode"])

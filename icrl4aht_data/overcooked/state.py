@@ -1,4 +1,4 @@
-"""The state record: everything the rules and the observations need, in S bytes (uint8), S = 22..40 by layout.
+"""The state record: everything the rules and the observations need, in S bytes (uint8), S = 14..36 by layout.
 
 Columns, in order (a = agent 0, the ego, then agent 1, the teammate):
 
@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.overcooked.layouts import COOKED, EMPTY, FACINGS, PLATE, Layout
+from icrl4aht_data.overcooked.layouts import COOKED, FACINGS, PLATE, Layout
 
 Array = Any
 """A NumPy or JAX array: the code in this package runs on either, through `__array_namespace__`."""
@@ -136,37 +136,3 @@ def possible_items(layout: Layout) -> np.ndarray:
     raw = (item & (PLATE | COOKED) == 0) & (count <= 3)
     soup = (item & COOKED > 0) & (count == 3)
     return known & (raw | soup | (item == PLATE))
-
-
-def describe_item(layout: Layout, item: int) -> str:
-    """An item byte in words: 'nothing', 'plate', '0', '0+0+1', 'cooked 0+0+0', 'dish 1+1+1'."""
-    pieces = [str(i) for k, i in enumerate(layout.ingredients) for _ in range(item >> (2 + 2 * k) & 3)]
-    content = "+".join(pieces)
-    if item & COOKED:
-        return ("dish " if item & PLATE else "cooked ") + content
-    return "plate" if item & PLATE else content or "nothing"
-
-
-def draw_text(layout: Layout, record: np.ndarray) -> str:
-    """One record uint8 (S,) as text: the map with agents as arrows, and what is held where. For people and messages."""
-    state = unpack(layout, record)
-    grid = [" " if kind == EMPTY else c for kind, c in zip(layout.kinds, "".join(layout.rows), strict=True)]
-    for agent in (0, 1):
-        grid[int(state.positions[agent])] = "^v><"[int(state.facings[agent])]
-    rows = ["".join(grid[y * layout.width : (y + 1) * layout.width]) for y in range(layout.height)]
-    held = [describe_item(layout, int(item)) for item in state.hands]
-    things = [
-        f"({cell % layout.width}, {cell // layout.width}) {describe_item(layout, int(item))}"
-        for cell, item in [
-            *zip(layout.pots, state.pot_items, strict=True),
-            *zip(layout.counters, state.counters, strict=True),
-        ]
-        if item
-    ]
-    lines = [
-        f"recipe {describe_item(layout, int(state.recipe))}",
-        f"ego holds {held[0]}, teammate holds {held[1]}",
-        f"pot timers {state.pot_timers.tolist()}, buttons {state.buttons.tolist()}",
-        *things,
-    ]
-    return "\n".join([*rows, *lines])
