@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
 from generation.teammates.base import Policy
+from generation.teammates.paths import Paths
 from icrl4aht_data.benchmark import EGO, INTERACT, STAY, TEAMMATE
-from icrl4aht_data.overcooked.layouts import COOKED, GOAL, NOWHERE, PLATE, PLATES, POT, WALL, Layout
+from icrl4aht_data.overcooked.layouts import COOKED, GOAL, PILE, PLATE, PLATES, POT, WALL, Layout
 from icrl4aht_data.overcooked.state import State, ingredient_count, record_size, unpack
 
 import os
@@ -109,6 +110,17 @@ class Kitchen:
         """Whether the ego can do anything for the return."""
         shared = self.mine & self.theirs
         return self.serves or bool(self.of(POT, shared).any() or self.of(WALL, shared).any())
+
+    @cached_property
+    def apart(self) -> np.ndarray:
+        """bool (P,): pots that the teammate, on its way from its piles, passes over for another one."""
+        piles = [int(c) for c in (self.of(PILE, self.theirs)).nonzero()[0]]
+        distance = Paths(self.layout).access_distance  # (cells, cells, 4)
+        access = Paths(self.layout).access
+        total = np.array(
+            [sum(min(distance[a, pot].min() for a in access[pile] if a >= 0) for pile in piles) for pot in self.pot_cells]
+        )
+        return total > total.min() if len(total) else total > 0
 
     @cached_property
     def obstacles(self) -> np.ndarray:
@@ -326,7 +338,7 @@ class View:
         cooked = self.full[:, None] & (self.contents[:, None] == self.recipes)
         dishes = self.recipes | np.uint8(PLATE | COOKED)
         lying = (self.items[:, None] == dishes) & self.kitchen.mine[:, None]
-        return cooked.sum(axis=0) + lying.sum(axis=0) + (self.hand == dishes)
+        return cooked.sum(axis=0) + lying.sum(axis=0) + (self.hand == dishes) + (self.trusted & (self.mate_hand == dishes))
 
     @cached_property
     def lacking(self) -> Int[Array, "P Q types"]:
@@ -345,7 +357,7 @@ class View:
         ahead = self.stock - current
         short = ahead[0] < 0
         stuck = short & ~jnp.any(fits[:, 0])
-        allowed = current | stuck | ~self.risky | (~short & ~jnp.asarray(bool(KNOB.get("noprefill"))))
+        allowed = (current & (short | self.kitchen.apart[:, None])) | stuck | ~self.risky | (~short & self.kitchen.apart[:, None])
 
         return jnp.where(fits & allowed, 150 * (ahead + 1) + work, 10 * FAR)
 
@@ -378,7 +390,8 @@ def _not_yet(view: View) -> Bool[Array, " P"]:
     mixed = view.contents + view.hand
     adds = (view.hand >> 2 > 0) & (view.hand & PLATE == 0)
     early = view.risky & (ingredient_count(mixed) == 3) & ((mixed != view.state.recipe) | (view.stock[0] > 0))
-    return (view.timers > 0) | (adds & ~view.full & (early | view.about_to_deliver))
+    theirs = view.risky & (ingredient_count(mixed) == 3) & (view.mate_hand == view.hand) & (view.calm < PATIENCE)
+    return (view.timers > 0) | (adds & ~view.full & (early | theirs | view.about_to_deliver))
 
 
 def _with_dish(view: View) -> list[Option]:
@@ -448,10 +461,9 @@ def _with_nothing(view: View) -> list[Option]:
 
     arrival = jnp.min(jnp.where((view.plates & kitchen.mine)[:, None], view.time[:, None] + to_pot, 2 * FAR), axis=0)
     late = view.timers <= arrival + 2
-    mate_plate = (view.mate_hand == PLATE) & (view.calm < PATIENCE + 20) & view.risky
     wrong = view.full & ~view.right
     right = view.right & kitchen.serves
-    enough = jnp.sum(right) > mate_plate
+    enough = ~view.risky | ((view.calm >= PATIENCE) & jnp.any(right & (view.timers == 0)))
     plate_for = lambda which: view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1))
     risky = wrong & view.risky & kitchen.serves
     spoiled = _spoiled(view) < 2 * FAR

@@ -106,7 +106,7 @@ def test_recover_environment_and_teammate(lite):
     environment = dataset.recover_environment(8)
     assert environment["environment_name"] == "demo_cook_wide"
     assert environment["recipes"] == [[0, 0, 0], [1, 1, 1]]
-    assert (environment["max_steps"], environment["kept_steps"]) == (400, 100)
+    assert (environment["max_steps"], environment["kept_steps"]) == (400, 20)
     teammate = dataset.recover_teammate(8)
     assert (teammate["kind"], teammate["family"], teammate["theta_id"]) == ("heuristic", "utility_greedy", 0)
 

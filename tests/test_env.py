@@ -138,6 +138,7 @@ def test_starts_are_uniform_over_the_rooms_and_facings_and_recipes(name):
         assert set(np.unique(state.positions[:, agent])) == set(room)
         assert_uniform(state.positions[:, agent], len(room))
         assert_uniform(np.stack([state.positions[:, agent], state.facings[:, agent]], axis=1), 4 * len(room))
+        assert_uniform(np.stack([state.positions[:, agent], state.recipe], axis=1), 2 * len(room))
     assert_uniform(state.positions, pairs)  # the two never share a cell
     assert_uniform(np.concatenate([state.facings, state.recipe[:, None]], axis=1), 4 * 4 * 2)
     assert set(np.unique(state.recipe)) == {3 * ZERO, 3 * ONE}
@@ -264,6 +265,11 @@ def test_after_a_correct_delivery_the_recipe_is_drawn_anew_and_may_repeat(crampe
     assert_uniform(pairs, 4)  # also the pairs of equal ones
     by_environment = pairs[:, 1].reshape(4, N).T
     assert_uniform(by_environment, 16)  # nor does one draw follow from another
+
+
+def test_each_episode_draws_recipes_of_its_own(life):
+    delivered = [fields(CRAMPED, life.steps[number].final).recipe for number in (1, MAX_STEPS + 1, 2 * MAX_STEPS + 1)]
+    assert_uniform(np.stack(delivered, axis=1), 8)
 
 
 def test_without_a_correct_delivery_the_recipe_stays(life):

@@ -27,7 +27,8 @@ from icrl4aht_data.overcooked.state import faults
 
 H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
 MODULES = {H1: recipe_aware_button, H2: territory, H3: assembly_line, H4: utility_greedy}
-FAST = {"xla_backend_optimization_level": 0}  # these programs are compiled to run a few times
+# These programs are compiled to run a few times: neither optimise them nor use the newer, slower code generator.
+FAST = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 PUBLISHED_PLAY = """
 test_simple (5,2) 000 recipe_aware_button 0 325041120202020202020202020240442402020202020202042402020240
@@ -52,13 +53,11 @@ both face up, and the recipe stays (spec/teammates.md, section 7)."""
 PLAYS = [line.split() for line in PUBLISHED_PLAY.split("\n")[1:-1]]
 
 PUBLISHED_MEANS = {
-    ("coord_simple", H1): (0, 0, 0, 0, 0),
-    ("coord_simple", H2): (0, 0, 0, 0, 0),
+    (name, family): (0, 0, 0, 0, 0) for name in ("coord_simple", "test_simple") for family in (H1, H2)
+} | {
     ("coord_simple", H3): (20.0, 20.0, 0.0, 9.2, 0.0),
-    ("coord_simple", H4): (40.0, 40.0, 40.0, 40.0, 40.0),
-    ("test_simple", H1): (0, 0, 0, 0, 0),
-    ("test_simple", H2): (0, 0, 0, 0, 0),
     ("test_simple", H3): (20.0, 20.0, 0.0, 9.8, 0.0),
+    ("coord_simple", H4): (40.0, 40.0, 40.0, 40.0, 40.0),
     ("test_simple", H4): (40.0, 40.0, 40.0, 40.0, 40.0),
 }
 """Mean returns of t0..t4 beside an ego that always stays, 500 episodes of 100 steps (spec/teammates.md, section 7)."""
@@ -121,11 +120,6 @@ def test_published_actions(line):
     assert "".join(str(PUBLISHED_ACTIONS.index(ACTIONS[action])) for action in actions) == digits
 
 
-def test_utility_greedy_instances_are_one_policy_here():
-    actions = played("test_simple", H4)[0][:60, :, -1]
-    assert np.all(actions == actions[:, :1])
-
-
 @pytest.mark.parametrize(("name", "family"), PUBLISHED_MEANS)
 def test_published_means(name, family):
     returns = played(name, family)[1][:, :-1]
@@ -144,15 +138,6 @@ def test_noise_chain_is_the_published_one():
         assert jax.random.key_data(key).tolist() == [int(first), int(second)]
         key, u = draw(key)
         np.testing.assert_allclose(u, np.array(expected, float), atol=5e-7)
-
-
-def test_noise_crosses_thresholds_as_often_as_published():
-    def step(key, _):
-        return draw(key)
-
-    _, u = jax.lax.scan(step, jax.random.key(1), length=100)
-    thresholds = np.array([0.1, 0.15, 0.2, 0.4, 0.6, 0.7, 0.75, 0.8])
-    assert (np.asarray(u[:, :1]) < thresholds).sum(axis=0).tolist() == [10, 14, 18, 43, 61, 71, 78, 84]
 
 
 @pytest.mark.parametrize("family", [H1, H2, H3])
@@ -258,87 +243,65 @@ def one_step(
 
 SPECIALIST = {"task_specialization": 1.0}
 RUNNER, PLATER = {"role_mode": 0}, {"role_mode": 1}
-FULL = {"pot_items": [3 * ZERO], "pot_timers": [9]}
+FULL = {"pot_items": [3 * ZERO], "pot_timers": [19]}
 DONE = {"pot_items": [SOUP_0]}
+TWO = {"pot_items": [2 * ZERO]}
 
-# cramped_down: plates (1, 0), goal (3, 0), pile 0 (0, 1), pile 1 (4, 1), pot (2, 3); floor (1..3, 1..2).
 CRAMPED_CASES = [
     # H1: round the partner, or push.
-    (H1, 1, {}, (3, 2, "up", 0), (1, 2, "up", 0), {}, "left"),
-    (H1, 1, {}, (3, 2, "up", 0), (2, 2, "up", 0), {}, "up"),
-    (H1, 0, {}, (2, 1, "up", DISH_0), (3, 1, "up", 0), {}, "down"),
-    (H1, 0, {}, (2, 1, "up", PLATE), (2, 2, "up", 0), DONE, "right"),
-    (H1, 0, {}, (2, 1, "up", ZERO), (2, 2, "up", 0), {}, "right"),
-    (H1, 0, {}, (1, 2, "up", ZERO), (2, 2, "up", 0), {}, "right"),
-    (H1, 0, {}, (3, 2, "up", 0), (2, 2, "up", 0), {}, "up"),
+    (H1, {}, {}, "1 32- 12- left, 1 32- 22- up, 0 21d 31- down, 0 210 22- right, 0 120 22- right, 0 32- 22- up"),
+    (H1, {}, DONE, "0 21p 22- right, 1 21p 32d down"),
     # H1 seat 1 leaves the pot to a partner who brings an ingredient and is about as near.
-    (H1, 1, {}, (2, 2, "down", ZERO), (2, 1, "up", ZERO), {}, "right"),
-    (H1, 1, {}, (2, 2, "down", ZERO), (1, 1, "up", ZERO), {}, "interact"),
-    (H1, 1, {}, (2, 2, "down", ZERO), (2, 1, "up", PLATE), {}, "interact"),
-    (H1, 0, {}, (2, 2, "down", ZERO), (2, 1, "up", ZERO), {}, "interact"),
-    # H1 seat 1 fetches no plate while the partner has none; specialists.
-    (H1, 1, SPECIALIST, (2, 1, "up", 0), (3, 2, "up", 0), {}, "down"),
-    (H1, 1, SPECIALIST, (2, 1, "up", 0), (3, 2, "up", PLATE), {}, "left"),
-    (H1, 0, SPECIALIST, (2, 1, "up", DISH_0), (3, 2, "up", 0), {}, "interact"),
-    (H1, 0, {}, (2, 1, "up", DISH_0), (3, 2, "up", 0), {}, "right"),
+    (H1, {}, {}, "1 220v 210 right, 1 220v 110 interact, 1 220v 21p interact, 0 220v 210 interact"),
+    # H1 specialists: seat 1 fetches no plate while the partner has none; seat 0 puts its dish down.
+    (H1, SPECIALIST, {}, "1 21- 32- down, 1 21- 32p left, 0 21d 32- interact"),
+    (H1, {}, {}, "0 21d 32- right"),
     # H1 with a plate makes way for a dish.
-    (H1, 1, {}, (2, 1, "up", PLATE), (1, 1, "up", DISH_0), {}, "down"),
-    (H1, 1, {}, (1, 2, "up", PLATE), (1, 1, "up", DISH_0), {}, "right"),
-    (H1, 1, {}, (3, 2, "up", PLATE), (1, 1, "up", DISH_0), {}, "stay"),
-    (H1, 1, {}, (2, 2, "up", PLATE), (3, 2, "up", DISH_0), {}, "left"),
-    (H1, 0, {}, (3, 1, "up", PLATE), (3, 2, "up", DISH_0), {}, "left"),
-    (H1, 1, {}, (2, 1, "up", PLATE), (1, 2, "up", DISH_0), {}, "stay"),
-    (H1, 1, {}, (2, 1, "up", PLATE), (3, 2, "up", DISH_0), DONE, "down"),
+    (H1, {}, {}, "1 21p 11d down, 1 12p 11d right, 1 32p 11d stay, 1 22p 32d left, 0 31p 32d left, 1 21p 12d stay"),
     # H1: two chefs fetch different ingredients of a mixed recipe.
-    (H1, 1, {}, (2, 2, "up", 0), (1, 2, "up", 0), {"recipe": MIXED}, "right"),
-    (H1, 0, {}, (2, 2, "up", 0), (3, 2, "up", 0), {"recipe": MIXED}, "left"),
-    (H1, 1, {}, (2, 2, "up", 0), (3, 2, "up", 0), {"recipe": MIXED, "pot_items": [ZERO + ONE]}, "left"),
-    # H2: waits at a single access, walks round the partner, wanders when stuck.
-    (H2, 1, {"yield_bias": 0.1}, (2, 1, "up", 0), (1, 2, "up", 0), {}, "stay"),
-    (H2, 1, {"yield_bias": 0.05}, (2, 1, "up", 0), (1, 2, "up", 0), {}, "left"),
-    (H2, 1, {"yield_bias": 0.1}, (2, 1, "up", 0), (3, 2, "up", 0), {}, "left"),
-    (H2, 1, {"yield_bias": 0.05}, (3, 2, "up", 0), (2, 2, "up", 0), {}, "up"),
-    (H2, 0, {"yield_bias": 0.3}, (3, 2, "up", 0), (2, 2, "up", 0), {}, "up"),
-    (H2, 0, {"yield_bias": 0.2}, (3, 2, "up", 0), (2, 2, "up", 0), {}, "left"),
+    (H1, {}, {"recipe": MIXED}, "1 22- 12- right, 0 22- 32- left"),
+    (H1, {}, {"recipe": MIXED, "pot_items": [ZERO + ONE]}, "1 22- 32- left"),
+    # H2 waits at a single access, and walks round the partner.
+    (H2, {"yield_bias": 0.1}, {}, "1 21- 12- stay, 1 21- 32- left"),
+    (H2, {"yield_bias": 0.05}, {}, "1 21- 12- left, 1 32- 22- up"),
+    (H2, {"yield_bias": 0.3}, {}, "0 32- 22- up"),
+    (H2, {"yield_bias": 0.2}, {}, "0 32- 22- left"),
     # H2 picks up what lies on a counter; lays down a plate that nothing needs.
-    (H2, 1, {}, (2, 1, "up", 0), (3, 2, "up", 0), {"counters": {(2, 0): ONE}}, "interact"),
-    (H2, 1, {}, (2, 1, "up", PLATE), (3, 2, "up", 0), {}, "interact"),
-    (H2, 1, {}, (2, 2, "down", PLATE), (3, 2, "up", 0), FULL, "stay"),
-    # H2 strict and vertical in seat 0: pile 0 is its own, the goal is the other's, for want of another.
-    (H2, 0, {"strictness": 1.0}, (2, 1, "up", DISH_0), (3, 2, "up", 0), {}, "right"),
-    (H2, 0, {"strictness": 1.0}, (1, 1, "up", 0), (3, 2, "up", 0), {"recipe": 3 * ONE}, "right"),
+    (H2, {}, {"counters": {(2, 0): ONE}}, "1 21- 32- interact"),
+    (H2, {}, {}, "1 21p 32- interact"),
+    (H2, {}, FULL, "1 22pv 32- stay"),
+    # H2, strict, for want of a goal or pile of its own uses the other's.
+    (H2, {"strictness": 1.0}, {"recipe": 3 * ONE}, "0 21d 32- right, 0 11- 32- right"),
     # H3 seat 1, empty-handed, makes room for a partner who carries something; seat 0 does not.
-    (H3, 1, {}, (2, 1, "up", 0), (1, 1, "up", PLATE), {}, "right"),
-    (H3, 1, {}, (3, 1, "up", 0), (2, 1, "up", PLATE), {}, "down"),
-    (H3, 1, {}, (2, 1, "up", 0), (2, 2, "up", ZERO), {}, "right"),
-    (H3, 1, {}, (3, 2, "up", 0), (3, 1, "up", DISH_0), {}, "left"),
-    (H3, 0, {}, (2, 1, "up", 0), (1, 1, "up", PLATE), {}, "left"),
+    (H3, {}, {}, "1 21- 11p right, 1 31- 21p down, 1 21- 220 right, 1 32- 31d left, 0 21- 11p left"),
     # H3 seat 1 stays where the next cell touches the partner.
-    (H3, 1, {}, (3, 2, "up", 0), (1, 2, "up", 0), {}, "stay"),
-    (H3, 0, {}, (3, 2, "up", 0), (1, 2, "up", 0), {}, "left"),
-    (H3, 1, {}, (2, 2, "up", 0), (3, 1, "up", 0), {}, "left"),
+    (H3, {}, {}, "1 32- 12- stay, 0 32- 12- left, 1 22- 31- left"),
     # H3: an ingredient in the partner's hand counts as in the pot, a dish does not.
-    (H3, 0, {}, (2, 2, "up", 0), (3, 1, "up", ZERO), {"pot_items": [2 * ZERO]}, "down"),
-    (H3, 0, {}, (2, 2, "up", 0), (3, 1, "up", ONE), {"pot_items": [2 * ZERO]}, "left"),
-    (H3, 0, {}, (2, 2, "up", 0), (3, 1, "up", DISH_0), {"pot_items": [2 * ZERO]}, "left"),
+    (H3, {}, TWO, "0 22- 310 down, 0 22- 311 left, 0 22- 31d left"),
     # H3 roles: a soup calls for a plate; so does a cooking one, if urgent.
-    (H3, 0, {}, (2, 1, "up", 0), (3, 2, "up", 0), DONE, "left"),
-    (H3, 0, {"plate_urgency": 0.6}, (2, 1, "up", 0), (3, 2, "up", 0), FULL, "left"),
-    (H3, 0, {"plate_urgency": 0.5}, (2, 1, "up", 0), (3, 2, "up", 0), FULL, "down"),
-    (H3, 0, PLATER, (2, 1, "up", ZERO), (3, 2, "up", 0), {}, "interact"),
-    (H3, 0, RUNNER, (2, 1, "up", PLATE), (3, 2, "up", 0), {}, "interact"),
-    (H3, 0, RUNNER, (2, 1, "up", ZERO), (3, 2, "up", 0), DONE, "interact"),
+    (H3, {}, DONE, "0 21- 32- left"),
+    (H3, {"plate_urgency": 0.6}, FULL, "0 21- 32- left"),
+    (H3, {"plate_urgency": 0.5}, FULL, "0 21- 32- down"),
+    (H3, PLATER, {}, "0 210 32- interact"),
+    (H3, RUNNER, DONE, "0 21p 32- interact, 0 210 32- interact"),
     # H3 hands an ingredient off beside the pot, in the middle, or near the partner.
-    (H3, 0, RUNNER | {"handoff_style": 0}, (2, 1, "up", ZERO), (3, 2, "up", 0), FULL, "down"),
-    (H3, 0, RUNNER | {"handoff_style": 1}, (2, 1, "up", ZERO), (3, 2, "up", 0), FULL, "interact"),
-    (H3, 0, RUNNER | {"handoff_style": 2}, (2, 1, "up", ZERO), (3, 2, "up", 0), FULL, "right"),
+    (H3, RUNNER | {"handoff_style": 0}, FULL, "0 210 32- down"),
+    (H3, RUNNER | {"handoff_style": 1}, FULL, "0 210 32- interact"),
+    (H3, RUNNER | {"handoff_style": 2}, FULL, "0 210 32- right"),
 ]
+"""Family, parameters, state, and moves: seat; x, y and hand (- nothing, p plate, d dish, 0 or 1) of itself, facing up
+or down (v); the same of the partner; the action. cramped_down has floor at (1..3, 1..2), plates at (1, 0), the goal at
+(3, 0), pile 0 at (0, 1), pile 1 at (4, 1) and the pot at (2, 3)."""
 
 
-@pytest.mark.parametrize("case", CRAMPED_CASES, ids=lambda case: "-".join(map(str, case)))
+@pytest.mark.parametrize("case", CRAMPED_CASES, ids=lambda case: f"{case[0]}: {case[3]}")
 def test_cramped_scenes(case):
-    family, slot, theta, mine, partner, fields, expected = case
-    assert one_step(LAYOUTS["cramped_down"], family, slot, theta, mine, partner, **fields)[0] == expected
+    family, theta, fields, moves = case
+    hands = {"-": 0, "p": PLATE, "d": DISH_0, "0": ZERO, "1": ONE}
+    for move in moves.split(", "):
+        slot, mine, partner, expected = move.split()
+        seated = [(int(p[0]), int(p[1]), "down" if p[3:] else "up", hands[p[2]]) for p in (mine, partner)]
+        assert one_step(LAYOUTS["cramped_down"], family, int(slot), theta, *seated, **fields)[0] == expected, move
 
 
 def test_h1_brings_an_ingredient_to_the_pot_that_lacks_it():
@@ -351,7 +314,7 @@ def test_h1_brings_an_ingredient_to_the_pot_that_lacks_it():
 
 
 def test_h2_gives_a_rescue_two_soups_but_not_one():
-    """asymm_right: an invader's own side has the left goal; with enough soups any goal will do."""
+    """An invader may take no plate of its own side, unless the soups pile up."""
     theta = {"behavior_mode": territory.INVADER, "strictness": 1.0, "shared_margin": 0, "rescue_threshold": 0.6}
     asymm, ego = LAYOUTS["asymm_right"], (1, 3, "up", 0)
     one, two = ({"pot_items": [SOUP_0, second]} for second in (0, SOUP_0))
@@ -359,19 +322,14 @@ def test_h2_gives_a_rescue_two_soups_but_not_one():
     assert one_step(asymm, H2, 1, theta, (5, 3, "down", 0), ego, **two)[0] == "interact"
 
 
-@pytest.mark.parametrize("mine", [(2, 1, "up", 0), (2, 2, "down", PLATE)])
-def test_h2_wanders_after_four_looks_at_one_cell(mine):
-    cramped, partner = LAYOUTS["cramped_down"], (3, 2, "up", 0)
-    cell = mine[1] * cramped.width + mine[0]
-    for cell_before, stuck in ((cell, 3), (cell + 1, 3)):
-        action, after = one_step(
-            cramped, H2, 1, {}, mine, partner, {"cell": cell_before, "stuck": stuck}, counters={(2, 0): ONE}, **FULL
-        )
-        assert action == ("right" if mine[1] == 1 else "left")
-        assert (int(after.cell), int(after.stuck)) == (cell, 4 if cell_before == cell else 0)
-    action, after = one_step(cramped, H2, 1, {}, mine, partner, {"cell": cell, "stuck": 2}, **FULL)
-    assert action == ("left" if mine[1] == 1 else "stay")
-    assert int(after.stuck) == 3
+@pytest.mark.parametrize(
+    ("cell", "stuck", "expected", "stuck_after"), [(7, 3, "right", 4), (8, 3, "right", 0), (7, 2, "interact", 3)]
+)
+def test_h2_wanders_after_four_looks_at_one_cell(cell, stuck, expected, stuck_after):
+    memory, counters = {"cell": cell, "stuck": stuck}, {(2, 0): ONE}
+    mine, partner = (2, 1, "up", 0), (3, 2, "up", 0)
+    action, after = one_step(LAYOUTS["cramped_down"], H2, 1, {}, mine, partner, memory, counters=counters)
+    assert (action, int(after.cell), int(after.stuck)) == (expected, 7, stuck_after)
 
 
 @pytest.mark.parametrize("name", ["coord_simple", "demo_wide", "asymm_both"])
@@ -481,9 +439,9 @@ SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
         ({"press_L_when_unknown": 0.0, "strict_recipe": 0.3}, {}, {}, "left", 0),  # guesses pile 0
         ({"press_L_when_unknown": 0.0, "wrong_ingredient_prob": 1.0}, {}, {}, "left", 1),  # -1 + 1 is pile 0
         (SURE | {"idle_prob": 1.0}, {}, {}, "stay", 1),
-        (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 100}, {"pot_items": [3 * ZERO], "pot_timers": [20]}, "stay", 1),
-        (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 101}, {"pot_items": [3 * ZERO], "pot_timers": [20]}, "left", 1),
-        (SURE, {}, {"buttons": [5], "pot_items": [3 * ZERO], "pot_timers": [20]}, "stay", 1),
+        (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 100}, FULL, "stay", 1),
+        (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 101}, FULL, "left", 1),
+        (SURE, {}, FULL | {"buttons": [5]}, "stay", 1),
     ],
 )
 def test_h1_asks_the_button(theta, memory, fields, expected, steps):
@@ -505,51 +463,21 @@ def test_h1_presses_and_then_knows():
 # The registry.
 
 PRESETS = {
-    H1: {
-        "press_L_when_unknown": (0.8, 1.0, 0.3, 0.9),
-        "refresh_interval": (100, 50, 200, 80),
-        "cost_sensitivity": (0.2, 0, 0.8, 0.1),
-        "strict_recipe": (0.9, 1, 0.3, 1),
-        "exploration_bias": (0.1, 0, 0.5, 0),
-        "plate_timing": (0.5, 0.6, 0.4, 0.7),
-        "dist_weight": (0.3, 0.3, 0.4, 0.25),
-        "inertia": (0.4, 0.3, 0.5, 0.5),
-        "task_specialization": (0, 0, 0, 0),
-        "stubbornness": (0, 0, 0, 0),
-        "wrong_ingredient_prob": (0, 0, 0, 0),
-        "idle_prob": (0, 0, 0, 0),
-        "path_blocking": (0, 0, 0, 0),
-    },
-    H2: {
-        "split_mode": (0, 0, 1, 2, 0),
-        "strictness": (0.7, 1, 1, 0.8, 0.3),
-        "shared_margin": (1, 0, 0, 1, 2),
-        "rescue_threshold": (0.6, 0.8, 0.8, 0.5, 0.3),
-        "yield_bias": (0.3, 0.5, 0.5, 0.4, 0.2),
-        "behavior_mode": (0, 0, 0, 0, 0),
-        "action_probability": (1, 1, 1, 1, 1),
-    },
-    H3: {
-        "role_mode": (2, 0, 1),
-        "handoff_style": (0, 0, 0),
-        "plate_urgency": (0.5, 0, 0.8),
-        "prestage_bias": (0.3, 0.5, 0),
-        "start_cook_bias": (0.7, 0.8, 0.3),
-        "hesitation_prob": (0, 0, 0),
-        "wrong_action_prob": (0, 0, 0),
-        "task_abandon_prob": (0, 0, 0),
-        "stubbornness": (0, 0, 0),
-        "timing_mismatch": (0, 0, 0),
-    },
+    H1: "0.8 1 0.3 0.9|100 50 200 80|0.2 0 0.8 0.1|0.9 1 0.3 1|0.1 0 0.5 0|0.5 0.6 0.4 0.7|0.3 0.3 0.4 0.25"
+    "|0.4 0.3 0.5 0.5" + "|0 0 0 0" * 5,
+    H2: "0 0 1 2 0|0.7 1 1 0.8 0.3|1 0 0 1 2|0.6 0.8 0.8 0.5 0.3|0.3 0.5 0.5 0.4 0.2|0 0 0 0 0|1 1 1 1 1",
+    H3: "2 0 1|0 0 0|0.5 0 0.8|0.3 0.5 0|0.7 0.8 0.3" + "|0 0 0" * 5,
 }
-"""Parameter -> its value in each preset, in the order of the module's table (spec/teammates.md, section 2)."""
+"""Of every parameter in declaration order its value in each preset (spec/teammates.md, section 2)."""
 
 
 @pytest.mark.parametrize("family", PRESETS)
 def test_presets_are_the_published_ones(family):
-    for number, preset in enumerate(MODULES[family].PRESETS):
-        expected = [(name, values[number]) for name, values in PRESETS[family].items()]
-        assert list(heuristic_teammate(family, preset, 0)["theta"].items()) == expected, preset
+    columns = zip(*(row.split() for row in PRESETS[family].split("|")), strict=True)
+    for preset, column in zip(MODULES[family].PRESETS, columns, strict=True):
+        theta = heuristic_teammate(family, preset, 0)["theta"]
+        assert list(theta) == list(MODULES[family].DEFAULTS)
+        assert list(theta.values()) == [float(value) for value in column], preset
 
 
 @pytest.mark.parametrize("family", MODULES)
@@ -578,15 +506,13 @@ def test_impossible_parameters(family, name, value, expected):
         build(LAYOUTS["demo_wide"], {"family": family, "theta": MODULES[family].DEFAULTS | {name: value}})
 
 
-def test_unknown_families_presets_and_splits():
-    with pytest.raises(UnknownNameError, match=r"teammate family 'territori'.*Did you mean 'territory'"):
-        build(LAYOUTS["demo_wide"], {"family": "territori", "theta": {}})
+def test_unknown_presets_and_splits():
     with pytest.raises(UnknownNameError, match=r"preset of assembly_line 'plater'.*Did you mean 'plater_deliverer'"):
         heuristic_teammate(H3, "plater", 0)
     with pytest.raises(UnknownNameError, match=r"split 'tests'.*Did you mean 'test'"):
         sample(H1, 0, "tests")
-    with pytest.raises(UnknownNameError, match=r"teammate family 'h1'"):
-        sample("h1", 0, "test")
+    with pytest.raises(UnknownNameError, match=r"teammate family 'territori'.*Did you mean 'territory'"):
+        sample("territori", 0, "test")
 
 
 RANGES = {

@@ -292,4 +292,4 @@ def test_info_counts(lite):
     assert info["histories"] == 12
     assert info["transitions"] == 12 * 120
     assert info["layouts"]["demo_wide"]["obs_shape"] == [5, 5, 45]
-    assert info["environment"] == {"max_steps": 400, "kept_steps": 100}
+    assert info["environment"] == {"max_steps": 400, "kept_steps": 20}

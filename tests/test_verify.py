@@ -215,6 +215,8 @@ def test_index_lines_that_lie(damaged, change, message):
 def test_lost_shards_with_their_lines(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), teammates=1, streams=2, shard_histories=1)
     assert problems(tmp_path / "r") == []
+    info = tmp_path / "r" / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"histories": 1}))
     spoil_index(tmp_path / "r", lambda lines: lines.pop())
     found = problems(tmp_path / "r")
     assert any("00001-of-00002.h5: the name of" in problem for problem in found), found

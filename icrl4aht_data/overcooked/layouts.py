@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
+from string import digits
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Layout:
     def __post_init__(self) -> None:
         if len({len(row) for row in self.rows}) != 1:
             raise ValueError(f"layout {self.name}: rows have widths {[len(row) for row in self.rows]}, expected one")
-        wrong = {c for row in self.rows for c in row if c not in _LETTERS and not c.isdigit()}
+        wrong = {c for row in self.rows for c in row if c not in _LETTERS and c not in digits}
         if wrong:
             raise ValueError(f"layout {self.name}: unknown map letters {sorted(wrong)}")
         if len(self.agent_cells) != 2:
@@ -98,12 +99,12 @@ class Layout:
     @cached_property
     def kinds(self) -> np.ndarray:
         """uint8 (cells,): what stands on each cell."""
-        return np.array([PILE if c.isdigit() else _LETTERS[c] for c in "".join(self.rows)], np.uint8)
+        return np.array([PILE if c in digits else _LETTERS[c] for c in "".join(self.rows)], np.uint8)
 
     @cached_property
     def ingredients(self) -> tuple[int, ...]:
         """Ids of the ingredients that have a pile, ascending. The k-th uses bits 2 + 2k of an item byte."""
-        return tuple(sorted({int(c) for c in "".join(self.rows) if c.isdigit()}))
+        return tuple(sorted({int(c) for c in "".join(self.rows) if c in digits}))
 
     @cached_property
     def ingredient_types(self) -> int:
@@ -113,7 +114,7 @@ class Layout:
     @cached_property
     def piles(self) -> np.ndarray:
         """uint8 (cells,): the item byte that a pile gives, 0 elsewhere."""
-        items = [PLATE if c == "B" else self.ingredient_item(int(c)) if c.isdigit() else 0 for c in "".join(self.rows)]
+        items = [PLATE if c == "B" else self.ingredient_item(int(c)) if c in digits else 0 for c in "".join(self.rows)]
         return np.array(items, np.uint8)
 
     @cached_property

@@ -116,8 +116,8 @@ def faults(layout: Layout, record: np.ndarray) -> list[str]:
         "an impossible recipe": ~recipes[state.recipe],
         "a delivery flag that is not 0 or 1": state.delivered > 1,
         "a pot timer above its limit": state.pot_timers > POT_STEPS,
-        "a pot that cooks without three raw ingredients": cooking
-        & ((ingredient_count(state.pot_items) != 3) | (state.pot_items & COOKED > 0)),
+        "a pot that does not cook exactly while it holds three raw ingredients": cooking
+        != ((ingredient_count(state.pot_items) == 3) & (state.pot_items & COOKED == 0)),
         "a button timer above its limit": state.buttons > BUTTON_STEPS,
     }
     return [what for what, wrong in checks.items() if np.any(wrong)]
