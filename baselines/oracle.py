@@ -329,6 +329,14 @@ class View:
         return self.full & (self.contents == self.state.recipe)
 
     @cached_property
+    def mate_takes(self) -> Bool[Array, " P"]:
+        """The pot that the teammate will serve."""
+        first = jnp.argmin(jnp.where(self.right, self.timers, FAR)) == jnp.arange(len(self.timers))
+        leaves = ((self.mate_hand & COOKED) > 0) | ((self.hand == PLATE) & (self.mate_hand != PLATE))
+        slow = (self.calm >= PATIENCE) & (self.timers == 0)
+        return self.right & first & self.risky & ~leaves & ~slow
+
+    @cached_property
     def recipes(self) -> UInt8[Array, " Q"]:
         return jnp.concatenate([self.state.recipe[None], jnp.asarray(self.kitchen.layout.recipe_items)])
 
@@ -389,7 +397,8 @@ def _not_yet(view: View) -> Bool[Array, " P"]:
     """Pots to wait at: cooking ones, and where a piece too early might spoil the soup."""
     mixed = view.contents + view.hand
     adds = (view.hand >> 2 > 0) & (view.hand & PLATE == 0)
-    early = view.risky & (ingredient_count(mixed) == 3) & ((mixed != view.state.recipe) | (view.stock[0] > 0))
+    busy = jnp.any(view.right & (view.timers >= KNOB.get("busy", 9)))
+    early = view.risky & ~busy & (ingredient_count(mixed) == 3) & ((mixed != view.state.recipe) | (view.stock[0] > 0))
     theirs = view.risky & (ingredient_count(mixed) == 3) & (view.mate_hand == view.hand) & (view.calm < PATIENCE)
     return (view.timers > 0) | (adds & ~view.full & (early | theirs | view.about_to_deliver))
 
@@ -412,7 +421,7 @@ def _with_plate(view: View) -> list[Option]:
     building = jnp.min(view.plans) < 10 * FAR
     soon = jnp.min(jnp.where(view.full, view.timers, FAR)) <= 12
     return [
-        Option(holds & (soon | ~building), view.plating(view.right)),
+        Option(holds & (soon | ~building), view.plating(view.right & ~view.mate_takes)),
         Option(holds & _must_flush(view), view.plating(wrong)),
         Option(holds, view.parking),
     ]
@@ -462,17 +471,16 @@ def _with_nothing(view: View) -> list[Option]:
     arrival = jnp.min(jnp.where((view.plates & kitchen.mine)[:, None], view.time[:, None] + to_pot, 2 * FAR), axis=0)
     late = view.timers <= arrival + 2
     wrong = view.full & ~view.right
-    right = view.right & kitchen.serves
-    enough = ~view.risky | ((view.calm >= PATIENCE) & jnp.any(right & (view.timers == 0)))
+    right = view.right & kitchen.serves & ~view.mate_takes
     plate_for = lambda which: view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1))
     risky = wrong & view.risky & kitchen.serves
     spoiled = _spoiled(view) < 2 * FAR
     anything = view.cost(jnp.any(view.sources, axis=0))
     return [
-        Option(empty & jnp.any(right & late) & enough, plate_for(right)),
+        Option(empty & jnp.any(right & late), plate_for(right)),
         Option(empty & jnp.any(risky & late), plate_for(risky)),
         Option(empty & building, ingredients),
-        Option(empty & jnp.any(right) & enough, plate_for(right)),
+        Option(empty & jnp.any(right), plate_for(right)),
         Option(empty & _must_flush(view) & jnp.any(wrong) & kitchen.serves, plate_for(wrong)),
         Option(empty & (view.stock[0] == 0) & jnp.any(spoiled), anything),
     ]

@@ -439,8 +439,15 @@ def test_possible_states_have_no_faults(layout):
         ("an impossible recipe", {"recipe": 64 * 3}),
         ("a delivery flag that is not 0 or 1", {"delivered": 2}),
         ("a pot timer above its limit", {"pot_items": [RECIPE_000], "pot_timers": [21]}),
-        ("a pot that cooks without three raw ingredients", {"pot_items": [2 * ZERO], "pot_timers": [5]}),
-        ("a pot that cooks without three raw ingredients", {"pot_items": [COOKED + RECIPE_000], "pot_timers": [5]}),
+        ("a pot that does not cook exactly while it holds three raw ingredients", {"pot_items": [RECIPE_000]}),
+        (
+            "a pot that does not cook exactly while it holds three raw ingredients",
+            {"pot_items": [8], "pot_timers": [5]},
+        ),
+        (
+            "a pot that does not cook exactly while it holds three raw ingredients",
+            {"pot_items": [COOKED + RECIPE_000], "pot_timers": [5]},
+        ),
     ],
 )
 def test_each_impossible_value_is_found(kind, change):
