@@ -123,6 +123,27 @@ class Kitchen:
         return total > total.min() if len(total) else total > 0
 
     @cached_property
+    def stations(self) -> np.ndarray:
+        """bool (cells,): floor from which something other than a counter can be faced."""
+        useful = np.isin(self.layout.kinds, [GOAL, POT, PILE, PLATES])
+        return self.layout.walkable & useful[self.layout.ahead].any(axis=1)
+
+    @cached_property
+    def in_the_way(self) -> np.ndarray:
+        """int32 (3, cells, cells): how much the ego on a cell hinders a teammate on another one that carries a dish,
+        a plate or an ingredient, or nothing: 2 for each next cell of its ways to where it may be going, 1 beside it."""
+        paths, layout = Paths(self.layout), self.layout
+        table = np.zeros((3, layout.cells, layout.cells), np.int32)
+        for carries, kinds in enumerate([(GOAL,), (POT,), (PILE, PLATES)]):
+            for target in np.isin(layout.kinds, kinds).nonzero()[0]:
+                for access in paths.access[target]:
+                    for mate in layout.rooms[TEAMMATE]:
+                        if access >= 0 and access != mate:
+                            ahead = layout.moves[mate, paths.first_step[mate, access]]
+                            table[carries, mate] += np.maximum(2 - paths.distance[ahead], 0)
+        return table
+
+    @cached_property
     def obstacles(self) -> np.ndarray:
         """int (O,): where a teammate can stand in the way; the first, -1, is nowhere."""
         return np.concatenate([[-1], self.layout.rooms[EGO] if self.shared_room else np.array([], int)]).astype(int)
@@ -389,8 +410,28 @@ def _decide(view: View) -> tuple[Int[Array, ""], Int[Array, ""]]:
     action = view.way(target)
     waits = jnp.any((view.kitchen.pot_cells == target) & _not_yet(view))
     action = jnp.where(waits & (action == INTERACT), STAY, action)
-    action = jnp.where(jnp.any(possible) & (costs[target] < FAR), action, STAY)
-    return action.astype(jnp.int32), jnp.int32(0)
+    found = jnp.any(possible)
+    reachable = found & (costs[target] < FAR)
+    if not view.kitchen.shared_room:
+        return jnp.where(reachable, action, STAY).astype(jnp.int32), jnp.int32(0)
+    idle = ~reachable | (action == STAY) & (view.hand != PLATE)
+    action = jnp.where(idle, _make_way(view, jnp.where(found, target, -1)), action)
+    bumped = (view.memory.action < STAY) & (view.me == view.before.positions[EGO]) & (view.partner == view.before.positions[TEAMMATE])
+    bumped &= jnp.asarray(view.kitchen.layout.moves)[view.me, view.memory.action] != view.me
+    blocked = jnp.where(bumped, view.memory.blocked + 1, 0)
+    return jnp.where(blocked % 2 == 1, STAY, action).astype(jnp.int32), blocked
+
+
+def _make_way(view: View, target: Int[Array, ""]) -> Int[Array, ""]:
+    """A step to where the ego hinders the teammate least, then off the stations, then near its own target."""
+    kitchen = view.kitchen
+    carries = jnp.where((view.mate_hand & COOKED) > 0, 0, jnp.where(view.mate_hand > 0, 1, 2))
+    ends = jnp.asarray(kitchen.layout.moves[:, :5].astype(int))[view.me]  # up, down, left, right, stay
+    taken = (ends == view.partner) | ((ends == view.me) & (jnp.arange(5) < STAY))
+    hinders = jnp.asarray(kitchen.in_the_way)[carries, view.partner, ends]
+    away = jnp.where(target < 0, 0, jnp.asarray(kitchen.time[0].min(axis=1))[ends, target])
+    score = 8 * hinders + 4 * jnp.asarray(kitchen.stations)[ends] + away
+    return jnp.argmin(jnp.where(taken, FAR, score - (jnp.arange(5) == STAY)))
 
 
 def _not_yet(view: View) -> Bool[Array, " P"]:
@@ -419,10 +460,14 @@ def _with_plate(view: View) -> list[Option]:
     holds = view.hand == PLATE
     wrong = view.full & ~view.right
     building = jnp.min(view.plans) < 10 * FAR
-    soon = jnp.min(jnp.where(view.full, view.timers, FAR)) <= 12
+    right = view.right & ~view.mate_takes
+    soon = jnp.min(jnp.where(right, view.timers, FAR)) <= KNOB.get("ripe", 12)
+    ripe = wrong & (view.timers == 0)
     return [
-        Option(holds & (soon | ~building), view.plating(view.right & ~view.mate_takes)),
-        Option(holds & _must_flush(view), view.plating(wrong)),
+        Option(holds & soon, view.plating(right)),
+        Option(holds & ~building, view.plating(ripe)),
+        Option(holds & ~building, view.plating(right)),
+        Option(holds & (_must_flush(view) | ~building), view.plating(wrong)),
         Option(holds, view.parking),
     ]
 
@@ -472,14 +517,19 @@ def _with_nothing(view: View) -> list[Option]:
     late = view.timers <= arrival + 2
     wrong = view.full & ~view.right
     right = view.right & kitchen.serves & ~view.mate_takes
+    work = jnp.sum(jnp.maximum(lacking, 0) * jnp.asarray(kitchen.trip)[pot])
+    nearly = building & (work <= KNOB.get("nearly", 6)) & ~view.risky
+    ripe = wrong & (view.timers <= arrival) & ~view.risky & kitchen.serves & (jnp.min(jnp.where(right, view.timers, FAR)) > KNOB.get("ripe", 12))
     plate_for = lambda which: view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1))
     risky = wrong & view.risky & kitchen.serves
     spoiled = _spoiled(view) < 2 * FAR
     anything = view.cost(jnp.any(view.sources, axis=0))
     return [
+        Option(empty & nearly, ingredients),
         Option(empty & jnp.any(right & late), plate_for(right)),
         Option(empty & jnp.any(risky & late), plate_for(risky)),
         Option(empty & building, ingredients),
+        Option(empty & jnp.any(ripe), plate_for(ripe)),
         Option(empty & jnp.any(right), plate_for(right)),
         Option(empty & _must_flush(view) & jnp.any(wrong) & kitchen.serves, plate_for(wrong)),
         Option(empty & (view.stock[0] == 0) & jnp.any(spoiled), anything),

@@ -16,7 +16,7 @@ from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from icrl4aht_data.tasks import Task, make_task, read_tasks, write_tasks
+from icrl4aht_data.tasks import make_task, read_tasks, task_id, write_tasks
 
 VALID = """
 [ego]
@@ -216,23 +216,24 @@ def test_published_task_ids(layout):
 
 
 def test_an_id_depends_on_every_part_of_its_task():
-    def make(track="teammate", split="train", layout="coord_ring", preset="default", theta_id=0, seed=0) -> Task:
-        return make_task(track, split, layout, heuristic_teammate("utility_greedy", preset, theta_id), seed)
+    def hashed(track="teammate", split="train", layout="demo_cook_wide", preset="default", theta_id=0, seed=0) -> str:
+        return task_id(track, split, layout, heuristic_teammate("utility_greedy", preset, theta_id), seed)[-8:]
 
-    hashes = [
-        task.task_id[-8:]
-        for task in (
-            make(),
-            make(track="layout"),
-            make(split="test"),
-            make(layout="demo_wide"),
-            make(preset="high_inertia"),
-            make(theta_id=1),
-            make(seed=1),
-        )
+    changes = ["track", "split", "layout", "preset", "theta_id", "seed"]
+    others = [
+        hashed(**{name: value}) for name, value in zip(changes, ["a", "a", "a", "high_inertia", 1, 1], strict=True)
     ]
-    assert len(set(hashes)) == 7
-    assert make().task_id == make(layout="grounded_coord_ring").task_id
+    assert len({hashed(), *others}) == 7
+
+
+def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
+    teammate = heuristic_teammate("utility_greedy", "default", 0)
+    short, long = (make_task("teammate", "train", name, teammate, 0) for name in ("coord_ring", "grounded_coord_ring"))
+    assert short == long
+    assert (short.layout_name, short.layout.name) == ("grounded_coord_ring", "coord_ring")
+    assert (short.teammate_kind, short.teammate_family) == ("utility_greedy", "H4")
+    with pytest.raises(UnknownNameError, match=r"asymm_right.*valid: asymm_both, cramped_up"):
+        make_task("layout", "train", "asymm_right", teammate, 0)
 
 
 @pytest.mark.parametrize("name", names())
