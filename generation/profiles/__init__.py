@@ -19,6 +19,9 @@ from icrl4aht_data.tasks import Task, make_task
 
 FOLDER = Path(__file__).parent
 
+_MAY_BE_ZERO = dict.fromkeys(("entropy", "value"), "0 or more")
+_MAY_BE_ZERO |= dict.fromkeys(("warmup", "discount", "gae_lambda"), "0 to 1")
+
 
 @dataclass(frozen=True)
 class Profile:
@@ -70,8 +73,8 @@ def load_profile(name: str) -> Profile:
             ego=_ego(dict(content["ego"])),
             data_version=_typed("release.data_version", content["release"]["data_version"], str),
             keep=_typed("release.keep", content["release"]["keep"], int),
-            layouts=tuple(get_layout(layout).name for layout in tasks["layouts"]),
-            presets=tuple(tasks["presets"]),
+            layouts=tuple(get_layout(layout).name for layout in _names("tasks.layouts", tasks["layouts"])),
+            presets=_names("tasks.presets", tasks["presets"]),
         )
         profile.tasks()
     except tomllib.TOMLDecodeError as error:
@@ -99,9 +102,18 @@ def _ego(table: dict[str, Any]) -> PPOConfig:
     for field in fields(PPOConfig):
         if field.name in table and field.name != "widths":
             value = _typed(f"ego.{field.name}", table[field.name], int if field.type == "int" else float)
-            if not value > 0:
-                raise OptionError(f"ego.{field.name} = {value}: expected a positive number")
+            expected = _MAY_BE_ZERO.get(field.name, "a positive number")
+            if value < 0 or (value == 0 and field.name not in _MAY_BE_ZERO) or ("1" in expected and value > 1):
+                raise OptionError(f"ego.{field.name} = {value}: expected {expected}")
     return PPOConfig(**table)
+
+
+def _names(key: str, value: Any) -> tuple[str, ...]:
+    """A list of names, none twice."""
+    names = _typed(key, value, list)
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        raise OptionError(f"{key} = {names!r}: expected names, none twice")
+    return tuple(names)
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
