@@ -98,20 +98,6 @@ def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: P
     )
 
 
-@cli.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/headroom"), show_default=True)
-@click.option("--protocol", multiple=True, default=tuple(PROTOCOLS), show_default=True)
-@click.option("--seed", default=0, show_default=True)
-def headroom(out: Path, protocol: tuple[str, ...], seed: int) -> None:
-    """Measure the reference egos on every test task and write cards/headroom.json and cards/headroom.md."""
-    from baselines.headroom import measure, write_cards
-
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        runs = measure(out, protocol, seed, bars)
-    for path in write_cards(runs):
-        console.print(f"wrote {path}")
-
-
 def main() -> None:
     """Entry point."""
     try:

@@ -23,7 +23,6 @@ HEURISTICS = FAMILIES[1:]
 LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 _RESAMPLES = 10_000
-_NO_HEADROOM = 1.0  # a cell whose best reference ego is within this of `stay` leaves the ego nothing to do
 
 Cell = tuple[str, str]
 """(layout, family)."""
@@ -88,8 +87,8 @@ def interval(means: np.ndarray, rng: np.random.Generator) -> tuple[float, float]
 
 
 def rows(run: Run) -> list[dict[str, Any]]:
-    """One row per cell: ours, the published number of the same agent, interval, gain, and the normalised score."""
-    published, headroom = _published(run.agent), read_headroom(run.protocol)
+    """One row per cell: ours, the published number of the same agent, interval, gain."""
+    published = _published(run.agent)
     rng = np.random.default_rng(0)
     table = []
     for layout in LAYOUTS:
@@ -115,7 +114,6 @@ def rows(run: Run) -> list[dict[str, Any]]:
                     "published_mean": theirs[0],
                     "published_std": theirs[1],
                     "gain": run.gain(cell),
-                    "normalised": _normalised(float(means.mean()), headroom.get(cell)),
                 }
             )
     return table
@@ -124,27 +122,6 @@ def rows(run: Run) -> list[dict[str, Any]]:
 def _published(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
     content = json.loads((CARDS / "published.json").read_text(encoding="utf-8"))
     return content["methods"].get(agent, {})
-
-
-def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
-    """cell -> mean returns of `stay`, `random`, `oracle`; empty if none was measured under this protocol."""
-    path = CARDS / "headroom.json"
-    if not path.exists():
-        return {}
-    content = json.loads(path.read_text(encoding="utf-8")).get(protocol, {})
-    return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
-
-
-def has_headroom(references: dict[str, float]) -> bool:
-    """Whether a reference ego of this cell gets more than one that only stays."""
-    return references["oracle"] - references["stay"] > _NO_HEADROOM
-
-
-def _normalised(mean: float, references: dict[str, float] | None) -> float | None:
-    """(return - stay) / (oracle - stay); None where the cell leaves no headroom or was not measured."""
-    if references is None or not has_headroom(references):
-        return None
-    return (mean - references["stay"]) / (references["oracle"] - references["stay"])
 
 
 def markdown(runs: list[Run]) -> str:
@@ -177,8 +154,6 @@ def _cell_text(row: dict[str, Any] | None) -> str:
     if row["published_mean"] is not None:
         text += f"<br>published {row['published_mean']:.1f} ± {row['published_std']:.1f}"
     text += f"<br>gain {row['gain']:+.1f}"
-    if row["normalised"] is not None:
-        text += f"<br>normalised {row['normalised']:.2f}"
     return text
 
 

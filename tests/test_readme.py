@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from baselines.cli import cli as baselines_cli
 from generation.cli import cli as generation_cli
 from icrl4aht_data.cli import cli
 
@@ -43,6 +44,16 @@ def test_generation_commands_are_understood(arguments):
     """Too long to run here; test_generate runs them on a tiny profile."""
     name, command, rest = generation_cli.resolve_command(
         generation_cli.make_context("g", ["x"], resilient_parsing=True), arguments
+    )
+    assert command is not None
+    command.make_context(name, rest)
+
+
+@pytest.mark.parametrize("arguments", commands("python -m baselines"), ids=" ".join)
+def test_evaluation_commands_are_understood(arguments):
+    """Too long to run here; test_evaluate runs them on one task."""
+    name, command, rest = baselines_cli.resolve_command(
+        baselines_cli.make_context("b", ["x"], resilient_parsing=True), arguments
     )
     assert command is not None
     command.make_context(name, rest)

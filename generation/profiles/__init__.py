@@ -19,8 +19,13 @@ from icrl4aht_data.tasks import Task, make_task
 
 FOLDER = Path(__file__).parent
 
-_MAY_BE_ZERO = dict.fromkeys(("entropy", "value"), "0 or more")
-_MAY_BE_ZERO |= dict.fromkeys(("warmup", "discount", "gae_lambda"), "0 to 1")
+_MAY_BE_ZERO: dict[str, str] = {
+    "entropy": "0 or more",
+    "value": "0 or more",
+    "warmup": "0 to 1",
+    "discount": "0 to 1",
+    "gae_lambda": "0 to 1",
+}
 
 
 @dataclass(frozen=True)
