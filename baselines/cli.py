@@ -1,8 +1,7 @@
-"""`python -m baselines`: thin commands; the only place where exceptions become exit codes."""
+"""`python -m baselines`: thin commands."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
@@ -11,7 +10,7 @@ from rich.progress import Progress
 
 from baselines.evaluate import PROTOCOLS
 from icrl4aht_data.benchmark import TRACKS
-from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.cli import run
 
 console = Console(soft_wrap=True)
 
@@ -34,7 +33,7 @@ def cli() -> None:
 def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path | None, seed: int, out: Path) -> None:
     """Evaluate an agent; goes on where a stopped run of the same settings ended."""
     from baselines.agents import get_agent
-    from baselines.evaluate import evaluate as run
+    from baselines.evaluate import evaluate as evaluate_tasks
     from baselines.evaluate import get_protocol
     from icrl4aht_data.tasks import manifest_path, read_tasks
 
@@ -42,7 +41,7 @@ def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path |
     tasks = [task for path in paths for task in read_tasks(path)]
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task(f"{agent}, {protocol}", total=len(tasks))
-        run(
+        evaluate_tasks(
             agent,
             get_agent(agent),
             tasks,
@@ -100,8 +99,4 @@ def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: P
 
 def main() -> None:
     """Entry point."""
-    try:
-        cli()
-    except (Icrl4ahtError, OSError) as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+    run(cli)

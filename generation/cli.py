@@ -1,15 +1,14 @@
-"""`python -m generation`: thin commands; the only place where exceptions become exit codes."""
+"""`python -m generation`: thin commands."""
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import click
 from rich.console import Console
 
-from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.cli import run
 from icrl4aht_data.schema import KINDS, Kind
 
 console = Console(soft_wrap=True)
@@ -94,8 +93,4 @@ def demo(out: Path, profile_name: str) -> None:
 
 def main() -> None:
     """Entry point."""
-    try:
-        cli()
-    except (Icrl4ahtError, OSError) as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+    run(cli)

@@ -152,15 +152,17 @@ def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
     sys.exit(0 if report.ok else 1)
 
 
-def main() -> None:
-    """Entry point."""
+def run(command: click.Command) -> None:
+    """Run a command line; what is wrong with the input becomes one line and exit code 1."""
     try:
-        cli()
-    except Icrl4ahtError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+        command()
     except BrokenPipeError:
         sys.exit(1)
-    except OSError as error:
+    except (Icrl4ahtError, OSError) as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
+
+
+def main() -> None:
+    """Entry point."""
+    run(cli)

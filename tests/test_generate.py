@@ -53,7 +53,7 @@ def built(tmp_path_factory) -> Path:
 
 
 def artefact(out: Path) -> Path:
-    (folder,) = (out / "artefacts").iterdir()
+    (folder,) = (path for path in (out / "artefacts").iterdir() if path.is_dir())
     return folder
 
 
