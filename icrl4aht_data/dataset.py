@@ -67,7 +67,7 @@ def load_icrl4aht(
     if obs_dtype not in OBS_DTYPES:
         raise unknown("obs_dtype", obs_dtype, OBS_DTYPES)
     index = read_index(MINI if root is None else Path(root).expanduser())
-    everything = np.array([entry.history_id for entry in index.entries])
+    everything = np.arange(len(index.entries))
     dataset = Dataset(index, everything, obs_dtype, _Shards(index))
     return dataset.filter(
         split=split,
@@ -87,16 +87,11 @@ class _Shards:
         self._open: dict[str, Shard] = {}
         self._cache = ChunkCache()
 
-    @cached_property
-    def _members(self) -> dict[str, list[Entry]]:
-        members: dict[str, list[Entry]] = {}
-        for entry in self._index.entries:
-            members.setdefault(entry.shard, []).append(entry)
-        return members
-
     def open(self, name: str) -> Shard:
         if name not in self._open:
-            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], self._members[name], self._cache)
+            entries = self._index.entries
+            members = [entries[row] for row in entries.shard_rows(name).tolist()]
+            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], members, self._cache)
         return self._open[name]
 
 

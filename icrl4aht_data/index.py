@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark import ACTIONS, FAMILIES, SPLITS, TRACKS, check_place, unknown
+from icrl4aht_data.benchmark import FAMILIES, SPLITS, TRACKS, unknown
+from icrl4aht_data.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.errors import (
     EmptySelectionError,
     FormatTooNewError,
     FormatTooOldError,
-    Icrl4ahtError,
     IndexFormatError,
     RootNotFoundError,
     UnknownNameError,
 )
 from icrl4aht_data.files import parse_json, read_text
-from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.schema import FORMAT_VERSION, HISTORIES, INFO, KINDS, Entry
-
-QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id")
-"""The entry fields that can be filtered by."""
 
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """A release's index. A history's id is its place in `entries`."""
+    """A release's index. A history's id is its place in `entries`, which makes an entry when it is asked for."""
 
     root: Path
     info: dict[str, Any]
-    entries: tuple[Entry, ...]
-
-    @cached_property
-    def _by_value(self) -> dict[str, dict[str, np.ndarray]]:
-        """field -> value -> rows, ascending."""
-        tables: dict[str, dict[str, list[int]]] = {name: {} for name in QUERY_FIELDS}
-        for row, entry in enumerate(self.entries):
-            for name, table in tables.items():
-                table.setdefault(getattr(entry, name), []).append(row)
-        return {name: {v: np.array(rows) for v, rows in table.items()} for name, table in tables.items()}
+    entries: Columns
 
     def entry(self, history_id: int) -> Entry:
         """The entry of one history.
@@ -57,46 +43,54 @@ class Index:
         return self.entries[history_id]
 
     def values(self, name: str) -> list[str]:
-        """What a query field takes in this release."""
-        return list(self._by_value[name])
+        """What a query field takes in this release, in order of first appearance."""
+        return self.entries.values(name)
 
     def query(self, **wanted: str | Sequence[str] | None) -> np.ndarray:
         """Ids, ascending, of the histories whose fields have one of the wanted values; None means any.
+
+        Looks at each combination of fields that exists once, then copies the ids found: never at each history.
 
         Raises:
             UnknownNameError: for a field or a value that the benchmark does not know; lists the valid ones.
             EmptySelectionError: for valid values that no history of this release has; says what exists.
         """
-        rows = np.arange(len(self.entries))
-        for name, value in wanted.items():
-            if value is None:
-                continue
+        asked = {name: value for name, value in wanted.items() if value is not None}
+        combinations = self.entries.combinations
+        matching = np.ones(len(combinations), bool)
+        for name, value in asked.items():
             if name not in QUERY_FIELDS:
                 raise unknown("filter", name, QUERY_FIELDS)
-            values = [self._canonical(name, v) for v in ([value] if isinstance(value, str) else value)]
-            table = self._by_value[name]
-            matching = [table[v] for v in values if v in table]
-            rows = np.intersect1d(rows, np.concatenate(matching)) if matching else rows[:0]
-        if not len(rows):
-            asked = ", ".join(f"{name}={value!r}" for name, value in wanted.items() if value is not None) or "any"
-            raise EmptySelectionError(f"{self.root}: no history has {asked}. This release has {self.summary()}")
-        return rows
+            names = [value] if isinstance(value, str) else value
+            matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], self._codes(name, names))
+        if not matching.any():
+            what = ", ".join(f"{name}={value!r}" for name, value in asked.items()) or "any"
+            raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {self.summary()}")
+        if matching.all():
+            return np.arange(len(self.entries))
+        ids = np.concatenate([self.entries.rows(c) for c in np.flatnonzero(matching).tolist()])
+        return ids if (np.diff(ids) > 0).all() else np.sort(ids)
 
-    def _canonical(self, name: str, value: str) -> str:
-        if name == "layout":
-            return get_layout(value).name
+    def _codes(self, name: str, values: Sequence[str]) -> list[int]:
+        """The codes of values, aliases of layouts included; -1 for a valid value that no history has."""
         fixed = {"split": SPLITS, "track": tuple(TRACKS), "teammate_family": FAMILIES}.get(name)
-        valid = fixed or self.values(name)
-        if value not in valid:
-            raise unknown(name, value, valid)
-        return value
+        codes = []
+        for value in values:
+            known = get_layout(value).name if name == "layout" else value
+            code = self.entries.code(name, known) if isinstance(known, str) else None
+            if code is None and name != "layout" and known not in (fixed or ()):
+                raise unknown(name, value, fixed or self.values(name))
+            codes.append(-1 if code is None else code)
+        return codes
 
     def summary(self) -> str:
-        """The combinations that exist, in one line."""
+        """The combinations of split, layout and family that exist, in one line."""
+        entries = self.entries
         counts: dict[tuple[str, str, str], int] = {}
-        for entry in self.entries:
-            key = (entry.split, entry.layout, entry.teammate_family)
-            counts[key] = counts.get(key, 0) + 1
+        names = {name: self.values(name) for name in ("split", "layout", "teammate_family")}
+        for codes, histories in zip(entries.combinations.tolist(), np.diff(entries.starts).tolist(), strict=True):
+            split, layout, family = (names[name][codes[QUERY_FIELDS.index(name)]] for name in names)
+            counts[split, layout, family] = counts.get((split, layout, family), 0) + histories
         parts = [f"{split}/{layout} with {family} ({n})" for (split, layout, family), n in counts.items()]
         return ", ".join(parts) or "no histories"
 
@@ -104,41 +98,17 @@ class Index:
 def read_index(root: Path) -> Index:
     """Read and check a release's index.
 
+    A large one is parsed once; what was parsed is kept in the cache folder, by content: see `icrl4aht_data.cache`.
+
     Raises:
         RootNotFoundError, FormatTooNewError, FormatTooOldError, IndexFormatError: each names the file, and the line.
     """
     info = read_info(root)
     path = root / HISTORIES
-    entries: list[Entry] = []
-    for number, line in enumerate(read_text(path).splitlines()):
-        try:
-            entry = Entry.from_json(parse_json(line))
-            _check_entry(entry, number)
-        except Icrl4ahtError as error:
-            raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
-        entries.append(entry)
+    entries = read_columns(path)
     if len(entries) != info["histories"]:
         raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info['histories']} histories")
-    return Index(root, info, tuple(entries))
-
-
-def _check_entry(entry: Entry, number: int) -> None:
-    """Everything in an entry that other parts rely on."""
-    if entry.history_id != number:
-        raise IndexFormatError(f"history_id {entry.history_id}: ids count up from 0, expected {number}")
-    check_place(entry.track, entry.split, entry.layout)
-    if entry.teammate_family not in FAMILIES:
-        raise unknown("teammate_family", entry.teammate_family, FAMILIES)
-    expected = LAYOUTS[entry.layout].obs_shape
-    if entry.obs_shape != expected:
-        raise IndexFormatError(f"obs_shape {list(entry.obs_shape)}, expected {list(expected)} for {entry.layout}")
-    if entry.action_dim != len(ACTIONS) or not entry.has_teammate_actions:
-        raise IndexFormatError(f"expected action_dim {len(ACTIONS)} and has_teammate_actions true")
-    folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
-    if not re.fullmatch(rf"{folder}-\d{{5}}-of-\d{{5}}\.h5", entry.shard):
-        raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
-    if entry.episodes > entry.T:
-        raise IndexFormatError(f"{entry.episodes} episodes in {entry.T} steps")
+    return Index(root, info, entries)
 
 
 _INFO_TYPES: dict[str, type | tuple[type, ...]] = {

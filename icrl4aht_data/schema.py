@@ -143,14 +143,16 @@ class Entry:
         """
         if not isinstance(line, dict):
             raise IndexFormatError(f"expected an object, found {type(line).__name__}")
-        missing, extra = _TYPES.keys() - line.keys(), line.keys() - _TYPES.keys()
+        missing, extra = JSON_TYPES.keys() - line.keys(), line.keys() - JSON_TYPES.keys()
         if missing or extra:
             raise IndexFormatError(f"missing fields {sorted(missing)}, unknown fields {sorted(extra)}")
-        for name, types in _TYPES.items():
+        for name, types in JSON_TYPES.items():
             value = line[name]
-            if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
-                expected = " or ".join(t.__name__ for t in types)
+            if type(value) not in types:
+                expected = " or ".join(sorted(t.__name__ for t in types))
                 raise IndexFormatError(f"field {name!r}: expected {expected}, found {value!r}")
+            if type(value) is int and not -(2**63) <= value < 2**63:
+                raise IndexFormatError(f"field {name!r}: expected at most 64 bits, found {value}")
         shape = line["obs_shape"]
         if len(shape) != 3 or not all(isinstance(n, int) for n in shape):
             raise IndexFormatError(f"field 'obs_shape': expected three integers, found {shape!r}")
@@ -160,15 +162,18 @@ class Entry:
         return cls(**values)
 
 
-_JSON_TYPES: dict[str, tuple[type, ...]] = {
-    "int": (int,),
-    "str": (str,),
-    "bool": (bool,),
-    "float": (float, int),
-    "int | None": (int, type(None)),
-    "tuple[int, int, int]": (list,),
+JSON_TYPES: dict[str, set[type]] = {
+    field.name: {
+        "int": {int},
+        "str": {str},
+        "bool": {bool},
+        "float": {float, int},
+        "int | None": {int, type(None)},
+        "tuple[int, int, int]": {list},
+    }[str(field.type)]
+    for field in fields(Entry)
 }
-_TYPES = {field.name: _JSON_TYPES[str(field.type)] for field in fields(Entry)}
+"""The types that a JSON parser may give for each field of an index line."""
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:

@@ -1,0 +1,223 @@
+"""Arrays made once and kept in a cache folder as plain .npy files, shared by processes, bounded in size.
+
+The folder is $ICRL4AHT_CACHE_DIR, else icrl4aht below $XDG_CACHE_HOME or ~/.cache; its size limit is
+$ICRL4AHT_CACHE_BYTES (100 GB by default). It is never the release folder: a release holds what its manifest lists and
+nothing else, and is often read-only. Deleting the folder loses nothing but time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from filelock import FileLock
+
+from icrl4aht_data.errors import OptionError
+
+_DEFAULT_LIMIT = 100 * 10**9
+_FRESH_NS = 2 * 10**9  # a file changed this recently may change again within one tick of its clock
+_SMALL = 2**20  # hashing this is quicker than remembering
+
+Arrays = dict[str, np.ndarray]
+
+
+def cache_folder() -> Path:
+    """Where arrays are kept; read from the environment at each call."""
+    given = os.environ.get("ICRL4AHT_CACHE_DIR")
+    if given:
+        return Path(given).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "icrl4aht"
+
+
+def cache_limit() -> int:
+    """Bytes that the cache folder may hold.
+
+    Raises:
+        OptionError: if the environment variable is not a whole number.
+    """
+    given = os.environ.get("ICRL4AHT_CACHE_BYTES")
+    if not given:
+        return _DEFAULT_LIMIT
+    try:
+        return int(float(given))
+    except (ValueError, OverflowError) as error:
+        raise OptionError(f"ICRL4AHT_CACHE_BYTES={given!r}: expected a number of bytes, such as 2e11") from error
+
+
+def cache_room() -> int:
+    """Bytes that one more set of arrays may have: what the limit and the disk allow; 0 where nothing can be written."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            return 0
+        reusable = sum(_size(kept) for kept in _kept(folder))
+        return min(cache_limit(), shutil.disk_usage(folder).free + reusable)
+    except OSError:
+        return 0
+
+
+def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
+    """The arrays of that key, memory-mapped read-only, built first if they are not there.
+
+    Two processes that ask at once build once: the other one waits. Sets that were not used for longest are removed
+    while the folder would exceed its limit; whoever has them mapped keeps them.
+
+    Args:
+        key: names the content, so that another content has another key; a file name.
+        size: about how many bytes the arrays have.
+        build: called with a new folder, into which it writes `<name>.npy` files.
+
+    Raises:
+        OptionError: if the arrays alone exceed the limit.
+        OSError: if the folder cannot be written.
+    """
+    folder = cache_folder() / key
+    arrays = _open(folder)
+    if arrays is not None:
+        return arrays
+    if size > cache_limit():
+        raise OptionError(
+            f"{folder.parent}: the arrays have {size:,} bytes, the cache may hold {cache_limit():,}: raise "
+            f'ICRL4AHT_CACHE_BYTES, select fewer histories, or take cache="stream"'
+        )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.with_name(f".{key}.lock")):
+        arrays = _open(folder)
+        if arrays is None:
+            _make_room(folder.parent, size)
+            partial = folder.with_name(f".{key}.partial")
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+            try:
+                build(partial)
+                shutil.rmtree(folder, ignore_errors=True)  # a set that could not be opened
+                partial.rename(folder)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+            arrays = _open(folder)
+    if arrays is None:
+        raise OSError(f"{folder}: arrays just written cannot be opened")
+    return arrays
+
+
+def _open(folder: Path) -> Arrays | None:
+    """The arrays of a finished folder, and a mark that they were used; None where there are none."""
+    try:
+        paths = sorted(folder.glob("*.npy"))
+        arrays: Arrays = {path.stem: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)) for path in paths}
+    except (OSError, ValueError):  # removed or replaced while we looked, or damaged
+        return None
+    if not arrays:
+        return None
+    with suppress(OSError):  # somebody else's folder, or removed since: the mapping holds
+        os.utime(folder)
+    return arrays
+
+
+def _kept(folder: Path) -> list[Path]:
+    """Finished sets, the least recently used first."""
+    used = []
+    for path in folder.iterdir():
+        if path.is_dir() and not path.name.startswith("."):
+            try:
+                used.append((path.stat().st_mtime_ns, path))
+            except FileNotFoundError:
+                continue
+    return [path for _, path in sorted(used)]
+
+
+def _size(folder: Path) -> int:
+    total = 0
+    for path in folder.glob("*.npy"):
+        try:
+            total += path.stat().st_size
+        except FileNotFoundError:
+            continue
+    return total
+
+
+def _make_room(folder: Path, size: int) -> None:
+    with FileLock(folder / ".room.lock"):
+        kept = _kept(folder)
+        sizes = [_size(path) for path in kept]
+        excess = sum(sizes) + size - cache_limit()
+        for path, bytes_ in zip(kept, sizes, strict=True):
+            if excess <= 0:
+                return
+            doomed = path.with_name(f".{path.name}.removed-{os.getpid()}")
+            try:
+                path.rename(doomed)  # at once, so that nobody opens half of it
+            except FileNotFoundError:
+                continue
+            shutil.rmtree(doomed, ignore_errors=True)
+            excess -= bytes_
+
+
+def content_hash(path: Path) -> str:
+    """A hash of a file's content (BLAKE2); that of a large file is remembered until the file changes."""
+    before = path.stat()
+    if before.st_size < _SMALL:
+        return _hash(path)
+    signature = [before.st_size, before.st_mtime_ns, before.st_ctime_ns, before.st_ino]
+    name = hash_text(str(path.resolve()))
+    note = cache_folder() / ".hashes" / f"{name}.json"
+    try:
+        known = json.loads(note.read_text(encoding="utf-8"))
+        if known["signature"] == signature:
+            return str(known["hash"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    content = _hash(path)
+    settled = time.time_ns() - max(before.st_mtime_ns, before.st_ctime_ns) > _FRESH_NS
+    if settled:
+        try:
+            note.parent.mkdir(parents=True, exist_ok=True)
+            partial = note.with_suffix(f".{os.getpid()}")
+            partial.write_text(json.dumps({"signature": signature, "hash": content}), encoding="utf-8")
+            partial.replace(note)
+        except OSError:  # not remembered, then
+            pass
+    return content
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "blake2b").hexdigest()[:32]
+
+
+def hash_text(text: str) -> str:
+    """SHA-256 of a text, its first 32 hexadecimal digits."""
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def free_memory() -> int:
+    """Bytes of memory that this process may still take: of the machine, and of its control group if that has less."""
+    free = []
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                free.append(int(line.split()[1]) * 1024)
+    except (OSError, ValueError):
+        pass
+    for limit, used in (
+        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    ):
+        try:
+            free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
+        except (OSError, ValueError):  # no such group, or "max"
+            continue
+    if free:
+        return max(0, min(free))
+    try:  # no Linux: half of the machine's memory
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    except (AttributeError, ValueError, OSError):
+        return 4 * 2**30
