@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
-from itertools import islice
 from pathlib import Path
 from typing import Any, overload
 
@@ -24,7 +24,7 @@ QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", 
 
 _VERSION = 1  # of the cached columns
 _UNCACHED = 2**20  # bytes: a smaller index is parsed as quickly as its columns are opened
-_BLOCK = 4096  # lines parsed at a time
+_BLOCK = 2**19  # bytes parsed at a time
 
 _NAMES = tuple(field.name for field in fields(Entry))
 _DTYPES = {"int": np.int64, "bool": np.bool_, "float": np.float64, "int | None": np.int64}
@@ -33,8 +33,8 @@ _STRINGS = tuple(field.name for field in fields(Entry) if str(field.type) == "st
 _DERIVED = ("history_id", "obs_shape")  # the row, and the layout's: checked, not stored
 _RULED = ("track", "split", "layout", "teammate_family", "obs_shape", "action_dim", "has_teammate_actions", "shard")
 
-Block = dict[str, tuple[list[Any], np.ndarray]]
-"""column -> its distinct values, and which of them each line has"""
+Block = dict[str, tuple[Sequence[Any] | np.ndarray, np.ndarray]]
+"""column -> values, and which of them each line has"""
 
 
 class Columns(Sequence[Entry]):
@@ -141,28 +141,27 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
     """Every array of `Columns`."""
     merged = {name: _Merged(name) for name in _NAMES if name not in _DERIVED}
     first = 0
-    for lines in _blocks(path):
-        block = _split_lines(lines)
+    for text in _blocks(path):
+        block = _split(text)
         if block is None or not _is_valid(block, first):
-            block = _parse_lines(lines, first, path)
+            block = _parse_lines(text.split(b"\n"), first, path)
         for name, column in merged.items():
             column.add(*block[name])
-        first += len(lines)
+        first += len(block["T"][1])
     arrays: dict[str, np.ndarray] = {}
     for column in merged.values():
         arrays |= column.arrays()
     return arrays | _combined(arrays)
 
 
-def _blocks(path: Path) -> Iterator[list[str]]:
+def _blocks(path: Path) -> Iterator[bytes]:
+    """The file in blocks of whole lines, without the last line's end."""
     try:
-        with path.open(encoding="utf-8", newline="\n") as stream:
-            while lines := list(islice(stream, _BLOCK)):
-                yield [line.rstrip("\r\n") for line in lines]
+        with path.open("rb") as stream:
+            while text := stream.read(_BLOCK):
+                yield (text + stream.readline()).removesuffix(b"\n")
     except FileNotFoundError as error:
         raise IndexFormatError(f"{path}: missing; fetch the release again") from error
-    except UnicodeDecodeError as error:
-        raise IndexFormatError(f"{path}: not UTF-8 text: {error}") from error
     except OSError as error:
         raise IndexFormatError(f"{path}: cannot be read: {error.strerror}") from error
 
@@ -175,13 +174,12 @@ class _Merged:
         self._codes: dict[Any, int] = {}
         self._parts: list[np.ndarray] = []
 
-    def add(self, values: list[Any], which: np.ndarray) -> None:
+    def add(self, values: Sequence[Any] | np.ndarray, which: np.ndarray) -> None:
         if self.name in _STRINGS:
-            codes = [self._codes.setdefault(value, len(self._codes)) for value in values]
-            self._parts.append(np.array(codes, np.int32)[which])
-        else:
-            numbers = [-1 if value is None else value for value in values]
-            self._parts.append(np.array(numbers, _NUMBERS[self.name])[which])
+            values = np.array([self._codes.setdefault(value, len(self._codes)) for value in values], np.int32)
+        elif not isinstance(values, np.ndarray):
+            values = np.array([-1 if value is None else value for value in values], _NUMBERS[self.name])
+        self._parts.append(values[which])
 
     def arrays(self) -> dict[str, np.ndarray]:
         if self.name not in _STRINGS:
@@ -213,42 +211,73 @@ def _combined(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
-def _split_lines(lines: list[str]) -> Block | None:
-    """The columns of lines written as our writer writes them, cut at the field names, which is twice as quick.
+def _split(text: bytes) -> Block | None:
+    """The columns of lines written as our writer writes them, cut at the field names: quicker than a JSON parser.
 
-    None if any line is written otherwise. Values are parsed as JSON, each distinct string once.
+    None if any line is written otherwise. Strings are parsed as JSON, each distinct one once.
     """
-    parts = [line.split(', "') for line in lines]
-    if any(len(part) != len(_NAMES) for part in parts):
+    lines = text.count(b"\n") + 1
+    pieces = text.replace(b"\n", b', "').split(b', "')
+    if len(pieces) != lines * len(_NAMES):
         return None
     block: Block = {}
-    for name, column in zip(_NAMES, zip(*parts, strict=True), strict=True):
-        head = f'{{"{name}": ' if name == _NAMES[0] else f'{name}": '
-        if name == _NAMES[-1]:
-            column = tuple(text.removesuffix("}") for text in column if text.endswith("}"))
-        repeated = name in _STRINGS or name in _RULED
-        distinct = {text: number for number, text in enumerate(dict.fromkeys(column))} if repeated else column
-        text = ",".join(distinct)
-        if text.count(head) != len(distinct):
+    for number, name in enumerate(_NAMES):
+        head, tail = f'{name}": '.encode(), b""
+        if number == 0:
+            head = b'{"' + head
+        elif number == len(_NAMES) - 1:
+            tail = b"}"
+        column = pieces[number :: len(_NAMES)]
+        if column.count(column[0]) == lines:
+            column, which = column[:1], np.zeros(lines, np.intp)
+        elif name in _STRINGS or name in _RULED:
+            places = {piece: place for place, piece in enumerate(dict.fromkeys(column))}
+            column, which = list(places), np.fromiter(map(places.__getitem__, column), np.intp, lines)
+        else:
+            which = np.arange(lines)
+        joined = b",".join(column)
+        if joined.count(head) != len(column) or (tail and joined.count(tail) != len(column)):
             return None
-        try:
-            values = json.loads(f"[{text.replace(head, '')}]")
-        except (ValueError, RecursionError):
+        joined = joined.replace(head, b"").replace(tail, b"") if tail else joined.replace(head, b"")
+        values = _decimals(joined, _NUMBERS.get(name)) if len(column) == lines else None
+        values = _json_values(joined) if values is None else values
+        if values is None or len(values) != len(column):
             return None
-        if len(values) != len(distinct):
-            return None
-        which = map(distinct.__getitem__, column) if isinstance(distinct, dict) else range(len(column))
-        block[name] = values, np.fromiter(which, np.intp, len(column))
+        block[name] = values, which
     return block
 
 
-def _parse_lines(lines: list[str], first: int, path: Path) -> Block:
+def _json_values(joined: bytes) -> list[Any] | None:
+    try:
+        return json.loads(b"[" + joined + b"]")
+    except (ValueError, RecursionError):
+        return None
+
+
+def _decimals(joined: bytes, dtype: type | None) -> np.ndarray | None:
+    """Finite numbers with commas between them, three times as quick as by a JSON parser; None if they are not."""
+    allowed = {np.float64: b"0123456789.-+e,", np.int64: b"0123456789-,"}.get(dtype)
+    if allowed is None or joined.translate(None, allowed):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # what NumPy makes of malformed text
+        try:
+            values = np.fromstring(joined, dtype, sep=",")
+        except (DeprecationWarning, ValueError):
+            return None
+    too_large = dtype is np.int64 and ((values >= 2**62) | (values <= -(2**62))).any()  # NumPy clips them
+    return None if too_large else values
+
+
+def _parse_lines(lines: list[bytes], first: int, path: Path) -> Block:
     """The same of any lines, with every check on each of them."""
     entries = []
     for number, line in enumerate(lines, start=first):
         try:
-            entry = Entry.from_json(parse_json(line))
+            entry = Entry.from_json(parse_json(line.decode()))
             check_entry(entry, number)
+        except UnicodeDecodeError as error:
+            raise IndexFormatError(f"{path}, line {number + 1}: not UTF-8 text: {error}") from error
         except Icrl4ahtError as error:
             raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
         entries.append(entry)
@@ -258,23 +287,26 @@ def _parse_lines(lines: list[str], first: int, path: Path) -> Block:
 
 def _is_valid(block: Block, first: int) -> bool:
     """Whether `check_entry` and `Entry.from_json` would take every line."""
-    if not all(set(map(type, values)) <= JSON_TYPES[name] for name, (values, _) in block.items()):
+    lists = {name: values for name, (values, _) in block.items() if not isinstance(values, np.ndarray)}
+    if not all(set(map(type, values)) <= JSON_TYPES[name] for name, values in lists.items()):
         return False
     try:
-        numbers = {name: np.array(block[name][0], np.int64)[block[name][1]] for name in ("history_id", "T", "episodes")}
-        for name in ("env_idx", "seed"):
-            np.array(block[name][0], np.int64)
-        lines = len(numbers["T"])
-        examples = dict(zip(zip(*(block[name][1].tolist() for name in _RULED), strict=True), range(lines), strict=True))
-        for row in examples.values():
-            entry = Entry.from_json({name: values[which[row]] for name, (values, which) in block.items()})
-            check_entry(entry, first + row)
+        ids, steps, episodes, _, _ = (
+            np.asarray(block[name][0], np.int64)[block[name][1]]
+            for name in ("history_id", "T", "episodes", "env_idx", "seed")
+        )
+        ruled = np.zeros(len(ids), np.int64)
+        for name in _RULED:
+            values, which = block[name]
+            ruled = ruled * len(values) + which
+        for row in np.unique(ruled, return_index=True)[1].tolist():
+            line = {name: values[which[row]] for name, (values, which) in block.items()}
+            line |= {name: value.item() for name, value in line.items() if isinstance(value, np.generic)}
+            check_entry(Entry.from_json(line), first + row)
     except (Icrl4ahtError, OverflowError):
         return False
-    ids, steps, episodes = numbers.values()
-    return bool(
-        np.array_equal(ids, np.arange(first, first + lines)) and (episodes > 0).all() and (episodes <= steps).all()
-    )
+    counted = np.array_equal(ids, np.arange(first, first + len(ids)))
+    return bool(counted and (episodes > 0).all() and (episodes <= steps).all())
 
 
 def check_entry(entry: Entry, number: int) -> None:
