@@ -100,6 +100,7 @@ def show(
         facts = {
             "root": str(dataset.root),
             **describe(info["kind"], info["data_version"], kept_steps, dataset.entries),
+            "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
         }
     else:
         dataset = dataset.select([history_id])

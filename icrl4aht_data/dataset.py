@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 import operator
+import threading
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, overload
 
 import numpy as np
+from numpy.typing import DTypeLike
 
-from icrl4aht_data.benchmark import EGO, unknown
+from icrl4aht_data.benchmark import unknown
+from icrl4aht_data.draws import Curriculum, Episodes, Weights, whole
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, UnknownNameError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
-from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.paint import paint
 from icrl4aht_data.schema import FIELDS, PROVENANCE, TASKS, Entry, Field, episode_returns
 from icrl4aht_data.shard import ChunkCache, Shard
+from icrl4aht_data.store import CACHES, Cache, Choice, Source, choose, decoded_size, open_source
 from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.threads import usable_cores
 
 if TYPE_CHECKING:
+    from typing import Unpack
+
     from icrl4aht_data.sampling import ADSampler, ContextOrder, DPTSampler
 
-ObsDtype = Literal["float32", "uint8", "state"]
-OBS_DTYPES: tuple[ObsDtype, ...] = ("float32", "uint8", "state")
+Obs = Literal["float32", "uint8", "state"]
+OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
 """How observations are presented: float32 (the paper's contract), uint8 (the same integers), or the state records
 from which `icrl4aht_data.overcooked.observe` renders them."""
 
 MINI = Path(__file__).parent / "mini"
 """The bundled mini release."""
-
-_RENDER_ROWS = 4096  # rendering in slabs keeps the working memory small
 
 Names = str | Sequence[str] | None
 
@@ -45,7 +50,9 @@ def load_icrl4aht(
     teammate_family: Names = None,
     teammate_kind: Names = None,
     task_id: Names = None,
-    obs_dtype: ObsDtype = "float32",
+    obs: Obs = "float32",
+    cache: Cache = "auto",
+    threads: int | None = None,
 ) -> Dataset:
     """Open a release and select histories.
 
@@ -57,18 +64,24 @@ def load_icrl4aht(
         teammate_family: "rl" or "H1".."H4".
         teammate_kind: an algorithm or a heuristic, such as "utility_greedy".
         task_id: one task's histories, or several tasks'.
-        obs_dtype: see `OBS_DTYPES`.
+        obs: how observations are presented, see `OBS`.
+        cache: how samplers hold the selection, see `store.CACHES`. `ram` and `mmap` decode it once, `stream` reads what
+            a batch needs; "auto" chooses by size and room. The batches are the same.
+        threads: for decoding and rendering; by default one a core.
 
     Raises:
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
         EmptySelectionError: if nothing matches; says what exists.
         ReleaseError: if the release cannot be read.
     """
-    if obs_dtype not in OBS_DTYPES:
-        raise unknown("obs_dtype", obs_dtype, OBS_DTYPES)
+    if obs not in OBS:
+        raise unknown("obs", obs, OBS)
+    if cache not in CACHES:
+        raise unknown("cache", cache, CACHES)
+    options = Options(obs, cache, usable_cores() if threads is None else whole("threads", threads, 1))
     index = read_index(MINI if root is None else Path(root).expanduser())
     everything = np.arange(len(index.entries))
-    dataset = Dataset(index, everything, obs_dtype, _Shards(index))
+    dataset = Dataset(index, everything, options, Shards(index))
     return dataset.filter(
         split=split,
         layout=layout,
@@ -79,7 +92,35 @@ def load_icrl4aht(
     )
 
 
-class _Shards:
+class SamplerOptions(TypedDict, total=False):
+    """What both samplers take; see `sampling.ADSampler`."""
+
+    seed: int
+    teammate_actions: bool
+    weights: Weights
+    episodes: Episodes | None
+    curriculum: Curriculum | None
+    process_index: int
+    process_count: int
+
+
+class Options(NamedTuple):
+    """How a dataset gives its data; see `load_icrl4aht`."""
+
+    obs: Obs
+    cache: Cache
+    threads: int
+
+
+class Holding(NamedTuple):
+    """Where a selection's rows come from: one source a layout, and each history's place."""
+
+    sources: list[Source]
+    layout: np.ndarray  # intp (H,), which source
+    place: np.ndarray  # intp (H,), position in it
+
+
+class Shards:
     """The release's shards, opened when first read."""
 
     def __init__(self, index: Index) -> None:
@@ -101,11 +142,31 @@ class Dataset:
     `len(dataset)` counts histories, `dataset[i]` is the i-th, `dataset[a:b]` a part, iteration yields them in order.
     """
 
-    def __init__(self, index: Index, ids: np.ndarray, obs_dtype: ObsDtype, shards: _Shards) -> None:
+    def __init__(self, index: Index, ids: np.ndarray, options: Options, shards: Shards) -> None:
         self.index = index
         self.ids = ids
-        self.obs_dtype: ObsDtype = obs_dtype
+        self.options = options
         self._shards = shards
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> tuple:
+        return self.index, self.ids, self.options, self._shards
+
+    def __setstate__(self, state: tuple) -> None:
+        self.__init__(*state)
+
+    def _with(self, ids: np.ndarray) -> Dataset:
+        return Dataset(self.index, ids, self.options, self._shards)
+
+    @property
+    def obs(self) -> Obs:
+        """How observations are presented."""
+        return self.options.obs
+
+    @property
+    def threads(self) -> int:
+        """How many threads decode and render."""
+        return self.options.threads
 
     @property
     def root(self) -> Path:
@@ -134,19 +195,59 @@ class Dataset:
         return (self.history(int(i)) for i in self.ids)
 
     def __repr__(self) -> str:
-        entries = self.entries
-        layouts = list(dict.fromkeys(entry.layout for entry in entries))
-        tasks = len({entry.task_id for entry in entries})
+        layouts = [layout.name for layout in self.layouts]
+        tasks = len(np.unique(self.column("task_id")))
         return (
             f"Dataset({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
-            f"{sum(entry.T for entry in entries):,} transitions, obs {self.obs_dtype}; "
+            f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
             f"{self.info['kind']} release {self.info['data_version']} at {self.root})"
         )
+
+    def column(self, name: str) -> np.ndarray:
+        """A field of every history of the selection: its values, or for names their codes in the index."""
+        return self.index.entries.column(name)[self.ids]
+
+    @cached_property
+    def layouts(self) -> list[Layout]:
+        """The layouts of the selection, in order of appearance."""
+        codes, first = np.unique(self.column("layout"), return_index=True)
+        names = self.index.values("layout")
+        return [get_layout(names[code]) for code in codes[np.argsort(first)].tolist()]
 
     @cached_property
     def entries(self) -> list[Entry]:
         """The index entries of the selection."""
         return [self.index.entry(int(i)) for i in self.ids]
+
+    @cached_property
+    def cache(self) -> Choice:
+        """How samplers hold this selection, and why; see `store.CACHES`."""
+        size = 0
+        for layout, rows in self._by_layout():
+            steps, episodes = (int(self.column(name)[rows].sum()) for name in ("T", "episodes"))
+            size += decoded_size(layout, steps, len(rows), episodes)
+        return choose(self.options.cache, size)
+
+    def _by_layout(self) -> Iterator[tuple[Layout, np.ndarray]]:
+        codes, names = self.column("layout"), self.index.values("layout")
+        for layout in self.layouts:
+            yield layout, np.flatnonzero(codes == names.index(layout.name))
+
+    @property
+    def holding(self) -> Holding:
+        """The selection's rows, as `cache` holds them; `ram` and `mmap` decode them on the first call."""
+        with self._lock:
+            return self._holding
+
+    @cached_property
+    def _holding(self) -> Holding:
+        sources, layout_of, place = [], np.zeros(len(self), np.intp), np.zeros(len(self), np.intp)
+        for number, (_, rows) in enumerate(self._by_layout()):
+            ids, place[rows] = np.unique(self.ids[rows], return_inverse=True)
+            layout_of[rows] = number
+            entries = [self.index.entry(i) for i in ids.tolist()]
+            sources.append(open_source(self.cache.cache, entries, self._shards.open, self.threads))
+        return Holding(sources, layout_of, place)
 
     def filter(self, **wanted: Names) -> Dataset:
         """The histories of this selection whose fields have one of the wanted values; see `index.QUERY_FIELDS`."""
@@ -154,7 +255,7 @@ class Dataset:
         ids = self.ids[np.isin(self.ids, matching)]
         if not len(ids):
             raise EmptySelectionError(f"{self.root}: no history of this selection has {wanted}; it is {self!r}")
-        return Dataset(self.index, ids, self.obs_dtype, self._shards)
+        return self._with(ids)
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Dataset:
         """The histories of this selection with these ids, in this order.
@@ -168,12 +269,12 @@ class Dataset:
         absent = chosen[~np.isin(chosen, self.ids)]
         if len(absent):
             raise UnknownNameError(f"{self.root}: this selection has no history {absent.tolist()}; it is {self!r}")
-        return Dataset(self.index, chosen, self.obs_dtype, self._shards)
+        return self._with(chosen)
 
     def history(self, history_id: int) -> History:
         """One history of the release, by id."""
         entry = self.index.entry(history_id)
-        return History(entry, self._shards.open(entry.shard), self.obs_dtype)
+        return History(entry, self._shards.open(entry.shard), self.obs)
 
     @cached_property
     def _tasks(self) -> dict[str, Task]:
@@ -210,27 +311,19 @@ class Dataset:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
         return self._tasks[entry.task_id].teammate | self._provenance.get(entry.task_id, {}).get("teammate", {})
 
-    def ad(self, *, batch_size: int, length: int, seed: int = 0, teammate_actions: bool = False) -> ADSampler:
-        """Algorithm Distillation windows; see `sampling.ADSampler`."""
+    def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
+        """Algorithm Distillation windows; see `sampling.ADSampler` for the options."""
         from icrl4aht_data.sampling import ADSampler
 
-        return ADSampler(self, batch_size=batch_size, length=length, seed=seed, teammate_actions=teammate_actions)
+        return ADSampler(self, batch_size=batch_size, length=length, **options)
 
     def dpt(
-        self,
-        *,
-        batch_size: int,
-        context: int,
-        seed: int = 0,
-        order: ContextOrder = "contiguous",
-        teammate_actions: bool = False,
+        self, *, batch_size: int, context: int, order: ContextOrder = "contiguous", **options: Unpack[SamplerOptions]
     ) -> DPTSampler:
-        """Decision-Pretrained Transformer queries with contexts; see `sampling.DPTSampler`."""
+        """Decision-Pretrained Transformer queries with contexts; see `sampling.DPTSampler` for the options."""
         from icrl4aht_data.sampling import DPTSampler
 
-        return DPTSampler(
-            self, batch_size=batch_size, context=context, seed=seed, order=order, teammate_actions=teammate_actions
-        )
+        return DPTSampler(self, batch_size=batch_size, context=context, order=order, **options)
 
 
 class History:
@@ -239,10 +332,10 @@ class History:
     `history.actions`, `.rewards`, `.obs`, ... are lazy arrays: slicing reads only the chunks it needs.
     """
 
-    def __init__(self, entry: Entry, shard: Shard, obs_dtype: ObsDtype) -> None:
+    def __init__(self, entry: Entry, shard: Shard, obs: Obs) -> None:
         self.entry = entry
         self._shard = shard
-        self._obs_dtype: ObsDtype = obs_dtype
+        self._obs: Obs = obs
 
     def __len__(self) -> int:
         return self.entry.T
@@ -264,13 +357,14 @@ class History:
         field = self._field(name)
         rows = self.entry.rows(field)
         start, stop, _ = slice(start, stop).indices(rows)
+        stop = max(start, stop)
         if name != "obs" or self._shard.kind == "full":
-            return self._shard.read(self.entry.history_id, field, start, stop) if stop > start else self._no_rows(field)
-        return render(self.entry, self.read("state", start, stop), "uint8")
+            return self._shard.read(self.entry.history_id, field, start, stop)
+        return self._painted(start, stop, np.uint8)
 
-    def _no_rows(self, field: Field) -> np.ndarray:
-        row = self._shard.read(self.entry.history_id, field, 0, 1)
-        return row[:0]
+    def _painted(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
+        out = np.empty((stop - start, *self.entry.obs_shape), dtype)
+        return paint(self._shard.layout, self.read("state", start, stop), out)
 
     def _field(self, name: str) -> Field:
         if name not in FIELDS:
@@ -284,8 +378,8 @@ class History:
 
     @property
     def obs(self) -> LazyArray:
-        """(T, 5, 5, C) float32 or uint8, or the state records (T, S) uint8, as the dataset's `obs_dtype` says."""
-        return LazyArray(self, "state" if self._obs_dtype == "state" else "obs", self._obs_dtype)
+        """(T, 5, 5, C) float32 or uint8, or the state records (T, S) uint8, as the dataset's `obs` says."""
+        return LazyArray(self, "state" if self._obs == "state" else "obs", self._obs)
 
     @property
     def state(self) -> LazyArray:
@@ -330,11 +424,11 @@ class History:
 class LazyArray:
     """One field of one history, read on indexing. Takes what a NumPy array's first axis takes."""
 
-    def __init__(self, history: History, name: str, obs_dtype: ObsDtype | None = None) -> None:
+    def __init__(self, history: History, name: str, obs: Obs | None = None) -> None:
         self._history, self._name = history, name
         entry, field = history.entry, history._field(name)
         self.dtype = np.dtype(field.dtype)
-        if name == "obs" and obs_dtype == "float32":
+        if name == "obs" and obs == "float32":
             self.dtype = np.dtype("float32")
         row = {"scalar": (), "obs": entry.obs_shape}.get(field.row)
         if row is None:
@@ -369,14 +463,6 @@ class LazyArray:
         return self[:].astype(dtype or self.dtype, copy=False)
 
     def _read(self, start: int, stop: int) -> np.ndarray:
+        if self._name == "obs" and self._history._shard.kind == "lite":
+            return self._history._painted(start, max(start, stop), self.dtype)
         return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)
-
-
-def render(entry: Entry, states: np.ndarray, dtype: str) -> np.ndarray:
-    """Ego observations (B, 5, 5, C) of state records uint8 (B, S) on the entry's layout."""
-    layout = get_layout(entry.layout)
-    flat = states.reshape(-1, states.shape[-1])
-    out = np.empty((len(flat), *layout.obs_shape), dtype)
-    for start in range(0, len(flat), _RENDER_ROWS):
-        out[start : start + _RENDER_ROWS] = observe(layout, flat[start : start + _RENDER_ROWS], EGO)
-    return out.reshape(*states.shape[:-1], *layout.obs_shape)

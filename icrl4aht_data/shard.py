@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,20 +177,22 @@ class ChunkCache:
         self._size = size
         self._clear()
 
-    def get(self, key: tuple[str, int], decode: Callable[[], np.ndarray]) -> np.ndarray:
-        """The chunk of that key, decoded if it is not here."""
+    def get(self, key: tuple[str, int]) -> np.ndarray | None:
+        """The chunk of that key, if it is here."""
         with self._lock:
-            if key in self._chunks:
+            rows = self._chunks.get(key)
+            if rows is not None:
                 self._chunks.move_to_end(key)
-                return self._chunks[key]
-        rows = decode()
+            return rows
+
+    def put(self, key: tuple[str, int], rows: np.ndarray) -> None:
+        """Keep a chunk."""
         with self._lock:
             if key not in self._chunks:
                 self._chunks[key] = rows
                 self._bytes += rows.nbytes
             while self._bytes > self._size and len(self._chunks) > 1:
                 self._bytes -= self._chunks.popitem(last=False)[1].nbytes
-        return rows
 
 
 class Shard:
@@ -264,15 +266,47 @@ class Shard:
         Raises:
             ShardCorruptError: names the chunk whose checksum or size is wrong.
         """
-        first = self._first[history_id, field.name]
-        chunk = self._chunk_rows(history_id, field)
-        parts = []
+        element = field.element(self.layout, self.kind)
+        rows = np.empty((stop - start, *field.row_shape(self.layout), *element.shape), field.dtype)
+        self.read_into(history_id, field, start, rows)
+        return rows
+
+    def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray) -> None:
+        """The same for the rows from `start` that fill `out`, cast to its dtype."""
+        first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        stop = start + len(out)
         for number in range(start // chunk, -(-stop // chunk)):
-            row = first + number
-            rows = self._cache.get((self.name, row), lambda row=row: self.decode(row, history_id, field))
-            parts.append(rows[max(start - number * chunk, 0) : stop - number * chunk])
-        rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        return rows.astype(field.dtype, copy=False)
+            rows = self._cache.get((self.name, first + number))
+            if rows is None:
+                rows = self.decode(first + number, history_id, field)
+                self._cache.put((self.name, first + number), rows)
+            begin = number * chunk
+            low, high = max(start, begin), min(stop, begin + chunk)
+            out[low - start : high - start] = rows[low - begin : high - begin]
+
+    def decode_into(self, history_id: int, field: Field, out: np.ndarray) -> None:
+        """All rows of a history's field into `out`, past the cache.
+
+        Raises:
+            ShardMismatchError: if a value does not survive the dtype of `out`.
+        """
+        first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        for number in range(-(-len(out) // chunk)):
+            part = out[number * chunk : (number + 1) * chunk]
+            rows = self.decode(first + number, history_id, field)[: len(part)]
+            part[...] = rows
+            if part.dtype != rows.dtype and not np.array_equal(part, rows):
+                raise ShardMismatchError(
+                    f"{self.path}: {self.describe(first + number)} has values that {part.dtype} cannot hold; "
+                    f"run `icrl4aht-data verify`"
+                )
+
+    def fingerprint(self, history_id: int) -> bytes:
+        """What distinguishes a history's stored content: sizes and checksums of its chunks."""
+        entry = self._entries[history_id]
+        first = self._first[history_id, "state"]
+        chunks = sum(entry.chunks(field) for field in entry.stored_fields(self.kind))
+        return self._table[first : first + chunks][["size", "rows", "crc32"]].tobytes()
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self._entries[history_id].rows(field))
@@ -282,12 +316,7 @@ class Shard:
         element = field.element(self.layout, self.kind)
         shape = (self._chunk_rows(history_id, field), *field.row_shape(self.layout), *element.shape)
         offset, size, _, expected = (int(value) for value in self._table[row])
-        try:
-            with self.path.open("rb") as stream:
-                stream.seek(offset)
-                data = stream.read(size)
-        except FileNotFoundError as error:
-            raise self._missing() from error
+        data = self._bytes(offset, size)
         found = zlib.crc32(data)
         if found != expected or len(data) != size:
             raise ShardCorruptError(
@@ -301,6 +330,14 @@ class Shard:
         rows = np.frombuffer(raw, element.base).reshape(shape)
         rows.flags.writeable = False
         return rows
+
+    def _bytes(self, offset: int, size: int) -> bytes:
+        try:
+            with self.path.open("rb", buffering=0) as stream:
+                stream.seek(offset)
+                return stream.read(size)
+        except FileNotFoundError as error:
+            raise self._missing() from error
 
     def describe(self, row: int) -> str:
         """A chunk in words: history, field, number, bytes."""

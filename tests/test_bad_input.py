@@ -43,7 +43,7 @@ def read_all(root):
         ({"track": "teammates"}, r"unknown track 'teammates'; valid: teammate, layout\. Did you mean 'teammate'\?"),
         ({"teammate_kind": "greedy"}, r"unknown teammate_kind 'greedy'; valid: utility_greedy\. Did you mean"),
         ({"task_id": "nothing"}, r"unknown task_id 'nothing'; valid: teammate_train_"),
-        ({"obs_dtype": "float16"}, r"unknown obs_dtype 'float16'; valid: float32, uint8, state"),
+        ({"obs": "float16"}, r"unknown obs 'float16'; valid: float32, uint8, state"),
     ],
 )
 def test_unknown_names_list_the_valid_and_the_nearest(lite, options, message):

@@ -83,7 +83,7 @@ def test_lazy_array_out_of_range(lite):
 @pytest.mark.parametrize("dtype", ["float32", "uint8", "state"])
 def test_observations_as_asked(either, dtype):
     root, written = either
-    dataset = load_icrl4aht(root, layout="demo_wide", obs_dtype=dtype)
+    dataset = load_icrl4aht(root, layout="demo_wide", obs=dtype)
     history = dataset[0]
     state = written[history.entry.history_id]["state"]
     expected = state if dtype == "state" else observe(_layout(history), state, 0)

