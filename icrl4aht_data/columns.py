@@ -33,7 +33,7 @@ _STRINGS = tuple(field.name for field in fields(Entry) if str(field.type) == "st
 _DERIVED = ("history_id", "obs_shape")  # the row, and the layout's: checked, not stored
 _RULED = ("track", "split", "layout", "teammate_family", "obs_shape", "action_dim", "has_teammate_actions", "shard")
 
-Block = dict[str, tuple[Sequence[Any] | np.ndarray, np.ndarray]]
+Block = dict[str, tuple[list[Any] | np.ndarray, np.ndarray]]
 """column -> values, and which of them each line has"""
 
 
@@ -101,7 +101,7 @@ class Columns(Sequence[Entry]):
         row = range(len(self))[row]
         values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS if name not in _DERIVED}
         for name in _STRINGS:
-            values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].decode()
+            values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].item().decode()
         if values["h5_row"] < 0:
             values["h5_row"] = None
         return Entry(history_id=row, obs_shape=LAYOUTS[values["layout"]].obs_shape, **values)
@@ -174,7 +174,7 @@ class _Merged:
         self._codes: dict[Any, int] = {}
         self._parts: list[np.ndarray] = []
 
-    def add(self, values: Sequence[Any] | np.ndarray, which: np.ndarray) -> None:
+    def add(self, values: list[Any] | np.ndarray, which: np.ndarray) -> None:
         if self.name in _STRINGS:
             values = np.array([self._codes.setdefault(value, len(self._codes)) for value in values], np.int32)
         elif not isinstance(values, np.ndarray):

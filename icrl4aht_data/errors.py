@@ -58,6 +58,10 @@ class ShardMismatchError(ReleaseError):
     """Index, chunk table and shard disagree."""
 
 
+class PublishedFormatError(ReleaseError):
+    """Files of the published code are missing, malformed, or lack what a release needs."""
+
+
 class FormatTooNewError(ReleaseError):
     """The release was written in a newer format than this package reads."""
 

@@ -186,7 +186,7 @@ class Flat:
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
     """Rows first..first + L of array (N, S) into out (n, L, S): one block of bytes a window."""
-    source, target = memoryview(array).cast("B"), memoryview(out).cast("B")
+    source, target = array.data.cast("B"), out.data.cast("B")
     size = out.shape[1] * array.shape[1]
     place = 0
     for begin in (first * array.shape[1]).tolist():
