@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate verify test check format bench-env bench-eval clean
+.PHONY: help install demo generate verify test check format bench-env bench-eval bench-loader clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -49,6 +49,9 @@ bench-env: install ## environment steps/s beside JaxMARL's, JSON lines
 
 bench-eval: install ## evaluation steps/s per teammate family beside the environment alone, JSON lines
 	$(BIN)/python -m benchmarks.bench_eval
+
+bench-loader: install ## batches/s of every way of holding data beside readers of the published format, JSON lines
+	$(BIN)/python -m benchmarks.bench_loader
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

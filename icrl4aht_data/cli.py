@@ -15,8 +15,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from icrl4aht_data.benchmark import KEPT_STEPS
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.schema import KINDS
 
 _root = click.argument("root", required=False, type=click.Path(path_type=Path))
 _json = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
@@ -151,6 +153,47 @@ def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
             verdict = "whole" if report.ok else f"{len(report.findings)} problems"
             click.echo(f"{report.root}: {verdict}; checked {looked}{' and their physics' if deep else ''}")
     sys.exit(0 if report.ok else 1)
+
+
+@cli.command()
+@click.argument("source", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("target", type=click.Path(path_type=Path))
+@click.option("--to", "form", required=True, type=click.Choice(["full", "lite", "published", "parquet"]))
+@click.option(
+    "--tasks", type=click.Path(path_type=Path), help="Tasks of published files; their tasks.jsonl by default."
+)
+@click.option(
+    "--kept-steps", type=int, default=KEPT_STEPS, show_default=True, help="Steps an episode of published files."
+)
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@_filters
+def convert(
+    source: Path, target: Path, form: str, tasks: Path | None, kept_steps: int, quiet: bool, **filters: tuple[str, ...]
+) -> None:
+    """Convert SOURCE, a release or a folder with the published code's histories.h5, into TARGET.
+
+    full and lite are releases, published is the published code's two files, parquet is the index as one file.
+    """
+    from icrl4aht_data import convert as forms
+
+    console = Console(stderr=True)
+    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
+        bar = bars.add_task("histories", total=None)
+
+        def advance(done: int, total: int) -> None:
+            bars.update(bar, completed=done, total=total)
+
+        if (source / forms.HISTORIES_H5).exists():
+            if form not in KINDS or any(filters.values()):
+                raise click.UsageError("published files convert to full or lite, and whole")
+            forms.from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
+        elif form in KINDS:
+            forms.to_release(_load(source, filters), target, form, advance=advance)
+        elif form == "published":
+            forms.to_published(_load(source, filters), target, advance=advance)
+        else:
+            forms.to_parquet(_load(source, filters), target)
+    click.echo(f"{target}: {form}")
 
 
 def run(command: click.Command) -> None:

@@ -128,6 +128,10 @@ class Shards:
         self._open: dict[str, Shard] = {}
         self._cache = ChunkCache()
 
+    def forget(self) -> None:
+        """Drop decoded chunks."""
+        self._cache.clear()
+
     def open(self, name: str) -> Shard:
         if name not in self._open:
             entries = self._index.entries
@@ -238,6 +242,10 @@ class Dataset:
         """The selection's rows, as `cache` holds them; `ram` and `mmap` decode them on the first call."""
         with self._lock:
             return self._holding
+
+    def forget_chunks(self) -> None:
+        """Drop the decoded chunks that reading has kept, of all selections of this release."""
+        self._shards.forget()
 
     @cached_property
     def _holding(self) -> Holding:

@@ -12,7 +12,7 @@ from icrl4aht_data.draws import whole
 from icrl4aht_data.errors import OptionError
 
 if TYPE_CHECKING:
-    from icrl4aht_data.sampling import Sampler
+    from icrl4aht_data.sampler import Sampler
 
 B = TypeVar("B")
 _POLL = 0.1  # seconds after which a waiting producer looks whether it is still wanted

@@ -7,40 +7,23 @@ on beyond. `B` denotes the batch size, `L` the window's length, `K` the context'
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from icrl4aht_data.benchmark import unknown
-from icrl4aht_data.draws import (
-    Curriculum,
-    Episodes,
-    Weights,
-    below,
-    check_weights,
-    episode_range,
-    part_of,
-    pick,
-    whole,
-    words,
-)
+from icrl4aht_data.draws import Curriculum, Episodes, Weights, below, pick, words
 from icrl4aht_data.errors import LabelsMissingError, OptionError
-from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.paint import paint
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.prefetch import Batches
+from icrl4aht_data.sampler import Group, Sampler
 from icrl4aht_data.store import Source
-from icrl4aht_data.threads import in_slices
 
 if TYPE_CHECKING:
     from icrl4aht_data.dataset import Dataset
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
-
-_SLAB = 8192  # steps gathered and painted at a time: states in between stay few
 
 
 class ADBatch(NamedTuple):
@@ -77,213 +60,10 @@ class DPTBatch(NamedTuple):
         return _describe(self)
 
 
-B = TypeVar("B", ADBatch, DPTBatch)
-
-
 def _describe(batch: Any) -> str:
     present = {name: array for name, array in batch._asdict().items() if array is not None}
     width = max(map(len, present))
     return "\n".join(f"{name:<{width}}  {a.dtype!s:<8} {a.shape}" for name, a in present.items())
-
-
-class _Group(NamedTuple):
-    """The rows of a batch whose histories are of one layout."""
-
-    layout: Layout
-    source: Source
-    rows: slice | np.ndarray
-    select: Callable[[np.ndarray], np.ndarray]  # of an array (B, ...): the group's
-
-
-class Sampler(Generic[B]):
-    """What both samplers share. See `ADSampler` and `DPTSampler` for the options."""
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        *,
-        batch_size: int,
-        length: int,
-        seed: int,
-        teammate_actions: bool,
-        weights: Weights,
-        episodes: Episodes | None,
-        curriculum: Curriculum | None,
-        process_index: int,
-        process_count: int,
-    ) -> None:
-        self.batch_size, self.length = whole("batch_size", batch_size, 1), whole("length", length, 1)
-        self.seed = whole("seed", seed, 0)
-        self.process_index, self.process_count = whole("process_index", process_index, 0), process_count
-        if process_index >= whole("process_count", process_count, 1) or batch_size % process_count:
-            raise OptionError(
-                f"process_index = {process_index}, process_count = {process_count}, batch_size = {batch_size}: "
-                f"expected an index below the count, and a batch that divides evenly among the processes"
-            )
-        self.dataset = dataset
-        self.layouts = dataset.layouts
-        if len({layout.obs_shape for layout in self.layouts}) > 1:
-            raise OptionError(
-                f"the selection spans layouts {', '.join(layout.name for layout in self.layouts)} with observations of "
-                f"unequal shape, a sampler takes one shape: add layout={self.layouts[0].name!r}"
-            )
-        if teammate_actions and not dataset.column("has_teammate_actions").all():
-            raise LabelsMissingError("teammate actions were asked for, but some histories have none")
-        self.teammate_actions = teammate_actions
-        self.weights, self.episodes, self.curriculum = check_weights(weights, len(dataset)), episodes, curriculum
-        self._lengths = dataset.column("T")
-        self._kept = self._lengths // dataset.column("episodes")
-        self._range = episode_range(episodes, dataset.column("episodes"))
-
-    def __len__(self) -> int:
-        return max(1, int(self._lengths.sum()) // (self.batch_size * self.length))
-
-    def __getitem__(self, i: int) -> B:
-        return self.batch(i)
-
-    def __iter__(self) -> Iterator[B]:
-        return (self[i] for i in range(len(self)))
-
-    @property
-    def local_size(self) -> int:
-        """Rows of a batch that this process gets: B / process_count."""
-        return self.batch_size // self.process_count
-
-    def batch(self, i: int, out: B | None = None) -> B:
-        """Batch i; written into `out`, a batch from `empty()`, if one is given.
-
-        Raises:
-            OptionError: if `out` is of another kind, shape or dtype.
-        """
-        raise NotImplementedError
-
-    def empty(self) -> B:
-        """A batch of unset arrays, to be filled again and again: new memory costs more than filling it."""
-        raise NotImplementedError
-
-    def batches(
-        self, start: int = 0, stop: int | None = None, *, prefetch: int = 2, device: Any = None, reuse: bool = False
-    ) -> Batches[B]:
-        """Batches start, start + 1, .. made ahead by a thread; see `prefetch.Batches`."""
-        return Batches(self, start, stop, prefetch=prefetch, device=device, reuse=reuse)
-
-    def options(self) -> dict[str, Any]:
-        """What the batches are a function of, as JSON: to be stored with a position and compared on resuming."""
-        import hashlib
-
-        weights = self.weights if isinstance(self.weights, str) else self.weights.tolist()  # type: ignore[union-attr]
-        curriculum = self.curriculum and [self.curriculum.batches, *self.curriculum.first, *self.curriculum.last]
-        return {
-            "sampler": type(self).__name__,
-            "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
-            "data_version": self.dataset.info["data_version"],
-            "obs": self.dataset.obs,
-            "batch_size": self.batch_size,
-            "length": self.length,
-            "seed": self.seed,
-            "teammate_actions": self.teammate_actions,
-            "weights": weights,
-            "episodes": self.episodes and list(self.episodes),
-            "curriculum": curriculum,
-        }
-
-    def _steps(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """First step and the one behind the last of each history's range at batch i, int64 (H,) each."""
-        first, stop = self._range
-        if self.curriculum is not None:
-            first, stop = part_of(self.curriculum.part(whole("batch", i, 0)), first, stop)
-        whole_history = stop == self.dataset.column("episodes")
-        return first * self._kept, np.where(whole_history, self._lengths, stop * self._kept)
-
-    def _local(self, drawn: np.ndarray) -> np.ndarray:
-        """This process's share of draws (..., B)."""
-        return drawn[..., self.process_index * self.local_size : (self.process_index + 1) * self.local_size]
-
-    def _history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
-        """float64 (H,), or None for equal ones."""
-        if isinstance(self.weights, str):
-            return None if self.weights == "uniform" else (high - low).astype(np.float64)
-        return np.asarray(self.weights)
-
-    def _groups(self, which: np.ndarray) -> Iterator[_Group]:
-        """The batch's rows by layout; `which` (B,) are positions in the selection."""
-        holding = self.dataset.holding
-        if len(self.layouts) == 1:
-            yield _Group(self.layouts[0], holding.sources[0], slice(None), lambda array: array)
-            return
-        number = holding.layout[which]
-        for k in np.unique(number).tolist():
-            rows = np.flatnonzero(number == k)
-            yield _Group(self.layouts[k], holding.sources[k], rows, lambda array, rows=rows: array[rows])
-
-    @property
-    def _paints(self) -> bool:
-        return self.dataset.obs != "state"
-
-    @property
-    def _record_size(self) -> int:
-        return max(record_size(layout) for layout in self.layouts)
-
-    def _empty_obs(self, *shape: int) -> np.ndarray:
-        if self._paints:
-            return np.empty((*shape, *self.layouts[0].obs_shape), self.dataset.obs)
-        return np.empty((*shape, self._record_size), np.uint8)
-
-    def _empty_layouts(self) -> np.ndarray | None:
-        return np.empty(self.local_size, np.int32) if len(self.layouts) > 1 and not self._paints else None
-
-    def _slabs(self, rows: int) -> Iterator[tuple[int, int]]:
-        """Parts of the rows, few enough steps each to stay in the processor's cache."""
-        size = max(1, _SLAB // self.length)
-        return ((start, min(start + size, rows)) for start in range(0, rows, size))
-
-    def _in_slabs(self, rows: int, work: Callable[[int, int], None]) -> None:
-        """Call `work(start, stop)` for all slabs, on the dataset's threads."""
-        slabs = list(self._slabs(rows))
-
-        def some(first: int, last: int) -> None:
-            for start, stop in slabs[first:last]:
-                work(start, stop)
-
-        in_slices(some, len(slabs), self.dataset.threads)
-
-    def _present(self, group: _Group, start: int, stop: int, states: np.ndarray, out: np.ndarray) -> None:
-        """Show the state records of rows start..stop of a group in `out` (B, ...), as the dataset presents them."""
-        if isinstance(group.rows, slice):
-            if self._paints:
-                paint(group.layout, states, out[start:stop])
-            else:
-                out[start:stop] = states
-            return
-        rows = group.rows[start:stop]
-        if self._paints:
-            out[rows] = paint(group.layout, states, np.empty((len(rows), *out.shape[1:]), out.dtype))
-        else:
-            out[rows, ..., : states.shape[-1]] = states
-            out[rows, ..., states.shape[-1] :] = 0
-
-    def _checked(self, out: B | None) -> B:
-        """`out`, if batches fit in it, or a new one."""
-        expected = self._shapes
-        if out is None:
-            return self.empty()
-        found = {name: _shape_of(array) for name, array in out._asdict().items()}
-        if found != expected:
-            wrong = {name: (expected.get(name), shape) for name, shape in found.items() if expected.get(name) != shape}
-            raise OptionError(f"out: expected and found (dtype, shape): {wrong}; take a batch from sampler.empty()")
-        return out
-
-    @cached_property
-    def _shapes(self) -> dict[str, Any]:
-        return {name: _shape_of(array) for name, array in self.empty()._asdict().items()}
-
-
-def _shape_of(array: np.ndarray | None) -> tuple[str, tuple[int, ...]] | None:
-    if array is None:
-        return None
-    if not (isinstance(array, np.ndarray) and array.flags.c_contiguous and array.flags.writeable):
-        raise OptionError("out: expected writeable, C-contiguous arrays; take a batch from sampler.empty()")
-    return str(array.dtype), array.shape
 
 
 class ADSampler(Sampler[ADBatch]):
@@ -392,7 +172,7 @@ class ADSampler(Sampler[ADBatch]):
                     array[padding] = 0
         return batch
 
-    def _fill_obs(self, group: _Group, place: np.ndarray, start: np.ndarray, obs: np.ndarray) -> None:
+    def _fill_obs(self, group: Group, place: np.ndarray, start: np.ndarray, obs: np.ndarray) -> None:
         if not self._paints and isinstance(group.rows, slice):
             group.source.windows("state", place, start, obs, self.dataset.threads)
             return
@@ -531,7 +311,7 @@ class DPTSampler(Sampler[DPTBatch]):
                 batch.layouts[group.rows] = self.layouts.index(group.layout)
         return batch
 
-    def _fill_context(self, group: _Group, showing: np.ndarray, steps: np.ndarray, batch: DPTBatch) -> None:
+    def _fill_context(self, group: Group, showing: np.ndarray, steps: np.ndarray, batch: DPTBatch) -> None:
         rows = np.arange(self.local_size)[group.rows]
         scalars = [
             ("actions", batch.context_actions),
@@ -545,7 +325,7 @@ class DPTSampler(Sampler[DPTBatch]):
             for field, array in scalars:
                 if array is not None:
                     array[rows[first:last]] = self._read(group.source, field, place, when)
-            states, following = self._transitions(group.source, which, place, when)
+            states, following = self._transitions(group, which, place, when)
             self._present(group, first, last, states, batch.context_obs)
             self._present(group, first, last, following, batch.context_next_obs)
 
@@ -559,20 +339,19 @@ class DPTSampler(Sampler[DPTBatch]):
         return out
 
     def _transitions(
-        self, source: Source, which: np.ndarray, place: np.ndarray, steps: np.ndarray
+        self, group: Group, which: np.ndarray, place: np.ndarray, steps: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """State records before and after steps (n, K), uint8 (n, K, S) each.
 
         The record after an episode's last kept step is the one that followed it in that episode, never the first of
         the next.
         """
-        last = self._lengths[which][:, None] - 1
+        source, last = group.source, self._lengths[which][:, None] - 1
         if self.order == "random":
             states = source.steps("state", place, steps)
             following = source.steps("state", place, np.minimum(steps + 1, last))
         else:
-            size = source.ends(place[:1], np.zeros(1, np.int64)).shape[-1]
-            both = np.empty((len(which), self.length + 1, size), np.uint8)
+            both = np.empty((len(which), self.length + 1, record_size(group.layout)), np.uint8)
             source.windows("state", place, steps[:, 0], both)
             states, following = both[:, :-1], both[:, 1:].copy()
         row, column = np.nonzero(self._read(source, "dones", place, steps))

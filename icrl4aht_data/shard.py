@@ -163,9 +163,10 @@ class ChunkCache:
 
     def __init__(self, size: int = _CACHE_BYTES) -> None:
         self._size = size
-        self._clear()
+        self.clear()
 
-    def _clear(self) -> None:
+    def clear(self) -> None:
+        """Drop everything."""
         self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
@@ -175,7 +176,7 @@ class ChunkCache:
 
     def __setstate__(self, size: int) -> None:
         self._size = size
-        self._clear()
+        self.clear()
 
     def get(self, key: tuple[str, int]) -> np.ndarray | None:
         """The chunk of that key, if it is here."""
