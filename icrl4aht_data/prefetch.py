@@ -214,11 +214,12 @@ def _produce(numbers: Iterator[int], make: Callable, made: queue.Queue, ended: t
 def _device_put(device: Any) -> Callable[[Any], Any]:
     try:
         import jax
+        import jax.numpy as jnp
     except ImportError as error:
         raise OptionError("a device needs JAX: pip install icrl4aht-data[generation]") from error
 
     def put(batch: Any) -> Any:
-        # A copy for certain: the host buffer is filled again as soon as this returns.
-        return jax.block_until_ready(jax.device_put(batch, device, may_alias=False))
+        # jax.device_put may keep using a host buffer, on a CPU for good; ours is filled again as soon as this returns.
+        return jax.block_until_ready(jax.tree.map(lambda x: jnp.array(x, copy=True, device=device), batch))
 
     return put
