@@ -221,6 +221,7 @@ class Shard:
         self._cache = cache or ChunkCache()
         self._table = _read_table(root, name)
         self._first: dict[tuple[int, str], int] = {}
+        self._elements: dict[str, tuple[np.dtype, tuple[int, ...], int]] = {}
         self._check_rows(entries)
         self._check_size()
 
@@ -267,8 +268,7 @@ class Shard:
         Raises:
             ShardCorruptError: names the chunk whose checksum or size is wrong.
         """
-        element = field.element(self.layout, self.kind)
-        rows = np.empty((stop - start, *field.row_shape(self.layout), *element.shape), field.dtype)
+        rows = np.empty((stop - start, *self._element(field)[1]), field.dtype)
         self.read_into(history_id, field, start, rows)
         return rows
 
@@ -314,9 +314,9 @@ class Shard:
 
     def decode(self, row: int, history_id: int, field: Field) -> np.ndarray:
         """One chunk by its row in the chunk table, read from the file and checked; padding rows included."""
-        element = field.element(self.layout, self.kind)
-        shape = (self._chunk_rows(history_id, field), *field.row_shape(self.layout), *element.shape)
-        offset, size, _, expected = (int(value) for value in self._table[row])
+        element, row_shape, row_size = self._element(field)
+        length = self._chunk_rows(history_id, field)
+        offset, size, _, expected = self._table[row].item()
         data = self._bytes(offset, size)
         found = zlib.crc32(data)
         if found != expected or len(data) != size:
@@ -325,12 +325,21 @@ class Shard:
                 f"the file is damaged, fetch the shard again"
             )
         try:
-            raw = decode_chunk(data, int(np.prod(shape)) * element.base.itemsize, element.itemsize)
+            raw = decode_chunk(data, length * row_size, element.itemsize)
         except ValueError as error:
             raise ShardCorruptError(f"{self.path}: {self.describe(row)}: {error}") from error
-        rows = np.frombuffer(raw, element.base).reshape(shape)
+        rows = np.frombuffer(raw, element.base).reshape(length, *row_shape)
         rows.flags.writeable = False
         return rows
+
+    def _element(self, field: Field) -> tuple[np.dtype, tuple[int, ...], int]:
+        """A field's stored element, the shape of a row, and its bytes."""
+        known = self._elements.get(field.name)
+        if known is None:
+            element = field.element(self.layout, self.kind)
+            shape = (*field.row_shape(self.layout), *element.shape)
+            known = self._elements[field.name] = element, shape, int(np.prod(shape)) * element.base.itemsize
+        return known
 
     def _bytes(self, offset: int, size: int) -> bytes:
         try:

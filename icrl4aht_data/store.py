@@ -202,22 +202,22 @@ class Streamed:
         self._size = record_size(layout)
 
     @cached_property
-    def _lengths(self) -> np.ndarray:
-        return np.array([entry.T for entry in self._entries])
+    def _lengths(self) -> list[int]:
+        return [entry.T for entry in self._entries]
 
     def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray, threads: int = 1) -> None:
-        length, lengths = out.shape[1], self._lengths[which].tolist()
+        length, lengths = out.shape[1], self._lengths
         positions, begins = which.tolist(), starts.tolist()
 
         def part(start: int, stop: int) -> None:
             for row in range(start, stop):
-                position, begin = positions[row], begins[row]
-                low, high = max(begin, 0), min(begin + length, lengths[row])
-                out[row, : low - begin], out[row, max(high, low) - begin :] = 0, 0
+                position, begin, window = positions[row], begins[row], out[row]
+                low, high = max(begin, 0), min(begin + length, lengths[position])
+                if high - low < length:
+                    window[...] = 0
                 if low < high:
-                    self._shards[position].read_into(
-                        self._entries[position].history_id, FIELDS[field], low, out[row, low - begin : high - begin]
-                    )
+                    history_id = self._entries[position].history_id
+                    self._shards[position].read_into(history_id, FIELDS[field], low, window[low - begin : high - begin])
 
         in_slices(part, len(positions), threads)
 

@@ -41,10 +41,8 @@ def wrong_arrows(package: str, modules: set[str]) -> list[str]:
 @pytest.mark.parametrize("package", ["icrl4aht_data", "generation", "baselines"])
 def test_imports_point_down(package):
     for path in sorted((ROOT / package).rglob("*.py")):
-        allowed = (
-            {"jax", "jax.numpy"} if path.name == "prefetch.py" else set()
-        )  # inside a function, for a device that is asked for
-        assert not wrong_arrows(package, imported(path) - allowed), path
+        on_demand = {"jax", "jax.numpy"} if path.name == "prefetch.py" else set()  # when a device is asked for
+        assert not wrong_arrows(package, imported(path) - on_demand), path
 
 
 def test_a_wrong_arrow_is_seen():
