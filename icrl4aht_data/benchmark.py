@@ -46,6 +46,8 @@ EPISODE_STEPS = 400
 KEPT_STEPS = 100
 """Steps kept of each training episode, and steps of an evaluation episode (paper, App. C and Sec. 4.3)."""
 
+_LISTED, _COMPARED = 50, 1000  # names that an error lists, and looks at for the nearest
+
 
 def track_of(layout: str) -> str:
     """The track whose train or test layouts include `layout` (short name)."""
@@ -72,6 +74,7 @@ def check_place(track: object, split: object, layout: object) -> None:
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
     """The error for a name that does not exist: lists the valid names and the nearest one."""
     names = list(dict.fromkeys(valid))
-    nearest = get_close_matches(str(found), names, n=1, cutoff=0.4)
+    nearest = get_close_matches(str(found), names[:_COMPARED], n=1, cutoff=0.4)
     hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
-    return UnknownNameError(f"unknown {what} {found!r}; valid: {', '.join(names)}.{hint}")
+    more = f", and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return UnknownNameError(f"unknown {what} {found!r}; valid: {', '.join(names[:_LISTED])}{more}.{hint}")

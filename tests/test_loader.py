@@ -43,13 +43,11 @@ def samplers(dataset, **options):
 class TestHolding:
     @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
     def test_the_same_batches_from_each(self, lite, full, obs):
-        roots = [(lite[0], cache, threads) for cache in CACHES for threads in (1, 3)]
-        roots += [(full[0], cache, 2) for cache in CACHES]
-
-        def make(root: Path, cache: Cache, threads: int):
-            return samplers(load_icrl4aht(root, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
-
-        expected, *others = (make(*root) for root in roots)
+        expected, *others = (
+            samplers(load_icrl4aht(root, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
+            for cache in CACHES
+            for root, threads in ((lite[0], 1), (lite[0], 3), (full[0], 2))
+        )
         for sampler, *same in zip(expected, *others, strict=True):
             for i in (0, 1, 77):
                 for other in same:
