@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from icrl4aht_data.benchmark import HEURISTIC_KINDS, SPLITS, TRACKS, check_place, unknown
+from icrl4aht_data.benchmark import HEURISTIC_KINDS, SPLITS, TEAMMATE, TRACKS, check_place, unknown
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -124,10 +124,22 @@ def _parse(line: str) -> Task:
     teammate = fields["teammate"]
     if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
         raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
-    if teammate["kind"] == "heuristic" and teammate["family"] not in HEURISTIC_KINDS:
-        raise unknown("heuristic family", teammate["family"], HEURISTIC_KINDS)
+    if teammate["kind"] == "heuristic":
+        _check_heuristic(teammate)
     task = Task(**fields)
     expected = task_id(task.track, task.split, task.layout_name, teammate, task.seed)
     if task.task_id != expected:
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
     return task
+
+
+def _check_heuristic(teammate: dict[str, Any]) -> None:
+    if teammate["family"] not in HEURISTIC_KINDS:
+        raise unknown("heuristic family", teammate["family"], HEURISTIC_KINDS)
+    if teammate.get("slot", TEAMMATE) != TEAMMATE:
+        raise TaskFormatError(f"teammate.slot: a task's teammate plays slot {TEAMMATE}, found {teammate['slot']!r}")
+    fields = set(teammate) - {"slot"}
+    if fields != set(_HASHED):
+        raise TaskFormatError(f"teammate: expected the fields {sorted(_HASHED)}, found {sorted(fields)}")
+    if not isinstance(teammate["theta"], dict):
+        raise TaskFormatError(f"teammate.theta: expected parameters by name, found {teammate['theta']!r}")

@@ -433,16 +433,16 @@ def test_missing_and_unknown_parameters(family):
 @pytest.mark.parametrize(
     ("family", "name", "value", "expected"),
     [
-        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number\)"),
+        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number in 0..1\)"),
         (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected a whole number from 0\)"),
-        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected one of 0..5\)"),
+        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected a whole number in 0..5\)"),
         (H2, "shared_margin", True, r"shared_margin = True \(expected a whole number from 0\)"),
-        (H3, "role_mode", -1, r"role_mode = -1 \(expected one of 0..2\)"),
-        (H4, "inertia", None, r"inertia = None \(expected a number\)"),
+        (H3, "role_mode", -1, r"role_mode = -1 \(expected a whole number in 0..2\)"),
+        (H4, "inertia", None, r"inertia = None \(expected a number in 0..1\)"),
     ],
 )
 def test_impossible_parameters(family, name, value, expected):
-    with pytest.raises(TaskFormatError, match=f"teammate {family}: impossible parameters {expected}"):
+    with pytest.raises(TaskFormatError, match=f"teammate {family}: out of range: {expected}"):
         build(LAYOUTS["demo_wide"], {"family": family, "theta": MODULES[family].DEFAULTS | {name: value}})
 
 
