@@ -77,5 +77,5 @@ def _markdown(table: dict[str, dict[str, dict[str, dict[str, float]]]]) -> str:
 def _cell(references: dict[str, float] | None) -> str:
     if references is None:
         return ""
-    text = " / ".join(f"{references[agent]:.1f}" for agent in REFERENCES)
+    text = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
     return f"**{text}**" if has_headroom(references) else text
