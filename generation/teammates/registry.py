@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
+from functools import lru_cache
 from numbers import Real
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 
 from generation.teammates import assembly_line, recipe_aware_button, territory, utility_greedy
 from generation.teammates.base import Noise, Policy
-from icrl4aht_data.benchmark import EGO, SPLITS, TEAMMATE, unknown
+from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
 from icrl4aht_data.errors import TaskFormatError
 from icrl4aht_data.overcooked.layouts import Layout
 
@@ -49,9 +51,10 @@ def sample(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[s
         UnknownNameError: for a family or split that does not exist.
     """
     module = _module(family)
-    if split not in SPLITS:
-        raise unknown("split", split, SPLITS)
-    presets, ranges = (module.TRAIN, module.TEST)[SPLITS.index(split)]
+    samplings = {"train": module.TRAIN, "test": module.TEST}
+    if split not in samplings:
+        raise unknown("split", split, samplings)
+    presets, ranges = samplings[split]
     digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = module.DEFAULTS | module.PRESETS[presets[_below(own, len(presets))]]
@@ -89,7 +92,15 @@ def build(layout: Layout, teammate: dict[str, Any], slot: int = TEAMMATE, noise:
     if slot not in (EGO, TEAMMATE):
         raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
     check_theta(teammate)
-    return module.build(layout, teammate["theta"], slot, noise)
+    init, act = _functions(module, layout, slot, noise)
+    return module.build(layout, teammate["theta"], slot, noise)._replace(init=init, act=act)
+
+
+@lru_cache(maxsize=64)
+def _functions(module, layout: Layout, slot: int, noise: Noise) -> tuple[Callable, Callable]:
+    """The same functions for all teammates of a family, so that they share compilations."""
+    policy = module.build(layout, module.DEFAULTS, slot, noise)
+    return policy.init, policy.act
 
 
 def check_theta(teammate: dict[str, Any]) -> None:
