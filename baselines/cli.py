@@ -28,9 +28,18 @@ def cli() -> None:
 @click.option(
     "--manifest", type=click.Path(path_type=Path, exists=True), help="Tasks of a file instead of the tracks'."
 )
+@click.option("--suite", type=click.Path(path_type=Path, exists=True), help="Folder of learned teammates.")
 @click.option("--seeds", default=1, show_default=True, type=click.IntRange(1), help="Play every task so often.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for one JSON per task.")
-def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path | None, seeds: int, out: Path) -> None:
+def evaluate(
+    agent: str,
+    protocol: str,
+    track: tuple[str, ...],
+    manifest: Path | None,
+    suite: Path | None,
+    seeds: int,
+    out: Path,
+) -> None:
     """Evaluate an agent; goes on where a stopped run of the same settings ended."""
     from baselines.agents import get_agent
     from baselines.evaluate import evaluate as evaluate_tasks
@@ -47,6 +56,7 @@ def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path |
             tasks,
             get_protocol(protocol),
             seeds=range(seeds),
+            suite=suite,
             out=out,
             done=lambda n: bars.advance(bar, n),
         )

@@ -27,7 +27,7 @@ from generation.env import Environment, EnvState
 from generation.teammates.base import Noise, Policy
 from generation.teammates.registry import build, check_theta
 from icrl4aht_data.benchmark import ACTIONS, EGO, KEPT_STEPS, TEAMMATE, track_of, unknown
-from icrl4aht_data.errors import OptionError, TaskFormatError
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.tasks import Task
 
@@ -187,6 +187,7 @@ def evaluate(
     protocol: Protocol,
     *,
     seeds: Sequence[int] = (0,),
+    suite: Path | None = None,
     out: Path | None = None,
     done: Callable[[int], None] = lambda tasks: None,
 ) -> list[Result]:
@@ -198,6 +199,7 @@ def evaluate(
         tasks: any tasks; those of one layout and family run together.
         protocol: see `PROTOCOLS`.
         seeds: each plays every task once, all in one batch.
+        suite: the folder that learned teammates' checkpoints are in.
         out: a folder for one JSON per task; results of the same settings found there are taken instead of run again.
         done: called with the number of tasks finished, for progress.
 
@@ -209,7 +211,7 @@ def evaluate(
         TaskFormatError: for a teammate whose parameters are not possible; names the task.
     """
     for task in tasks:
-        _check_teammate(task)
+        _check_teammate(task, suite)
     settings = {
         "agent": agent,
         "seeds": list(seeds),
@@ -223,28 +225,34 @@ def evaluate(
         if task.task_id not in results:
             groups[task.layout_name, task.teammate_kind].append(task)
     for members in groups.values():
-        for result in _run_group(make_ego, members, protocol, seeds, settings):
+        for result in _run_group(make_ego, members, protocol, seeds, suite, settings):
             results[result.task_id] = result
             _store(out, result)
         done(len(members))
     return [results[task.task_id] for task in tasks]
 
 
-def _check_teammate(task: Task) -> None:
+def _check_teammate(task: Task, suite: Path | None) -> None:
     """Before any long work."""
-    if task.teammate["kind"] != "heuristic":
-        return
     try:
-        check_theta(task.teammate)
-    except TaskFormatError as error:
-        raise TaskFormatError(f"task {task.task_id}: {error}") from error
+        if task.teammate["kind"] == "heuristic":
+            check_theta(task.teammate)
+        else:
+            build(task.layout, task.teammate, suite=suite)
+    except Icrl4ahtError as error:
+        raise type(error)(f"task {task.task_id}: {error}") from error
 
 
 def _run_group(
-    make_ego, tasks: list[Task], protocol: Protocol, seeds: Sequence[int], settings: dict[str, Any]
+    make_ego,
+    tasks: list[Task],
+    protocol: Protocol,
+    seeds: Sequence[int],
+    suite: Path | None,
+    settings: dict[str, Any],
 ) -> list[Result]:
     returns = []
-    for played in play_tasks(make_ego, tasks, protocol, seeds):
+    for played in play_tasks(make_ego, tasks, protocol, seeds, suite):
         ego = played.actions[..., EGO]
         low, high = int(ego.min()), int(ego.max())
         if low < 0 or high >= len(ACTIONS):
@@ -259,6 +267,7 @@ def play_tasks(
     tasks: Sequence[Task],
     protocol: Protocol,
     seeds: Sequence[int] = (0,),
+    suite: Path | None = None,
 ) -> Iterator[Played]:
     """Episode after episode of tasks that share a layout and a teammate family.
 
@@ -266,7 +275,7 @@ def play_tasks(
         `Played` with B = tasks x seeds, seeds varying fastest.
     """
     layout = tasks[0].layout
-    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise) for task in tasks for _ in seeds]
+    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks for _ in seeds]
     rollout = Rollout(layout, make_ego(layout), mates, protocol)
     tables = rollout.start(jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds]))
     _check_ego(rollout, tables)

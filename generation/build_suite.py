@@ -41,7 +41,7 @@ def build_suite(
             own_seed = seed + 1000 * _place(name) + 100 * ALGORITHMS.index(algorithm)
             run = Run(get_layout(name), algorithm, config.members, config.ppo, own_seed)
             _train(run, suite / name / algorithm, console)
-    finished = [name for name in _names(profile.layouts) if _complete(suite, name)]
+    finished = [name for name in _names([*profile.layouts, *names]) if _complete(suite, name)]
     config = profile.teammates
     selections = [
         select(suite, name, algorithm, config.train, config.heldout, seed)
@@ -111,8 +111,13 @@ def _in_words(selection: Selection, wanted: int) -> str:
 def report_diversity(
     suite: Path, layouts: Sequence[str], algorithms: Sequence[str], greedy: bool, console: Console
 ) -> None:
-    """Print and draw, for each layout, self-play and cross-play of every population and the distances of families."""
-    for name in _names(layouts):
+    """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
+
+    Raises:
+        OptionError: if a population was not finished.
+    """
+    every = dict.fromkeys(name for splits in TRACKS.values() for name in splits["train"])
+    for name in _names(layouts) or [name for name in every if _complete(suite, name)]:
         layout = get_layout(name)
         for algorithm in algorithms or ALGORITHMS:
             _report_population(suite, layout, algorithm, greedy, console)

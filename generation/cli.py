@@ -84,8 +84,9 @@ def manifests(check: bool) -> None:
 _suite = click.option(
     "--suite",
     type=click.Path(path_type=Path),
-    default=None,
-    help="Folder of the learned teammates; build/suite-PROFILE by default.",
+    default=Path("build/suite"),
+    show_default=True,
+    help="Folder of the learned teammates.",
 )
 _layouts = click.option("--layout", "layouts", multiple=True, help="Again for more; the profile's by default.")
 _algorithms = click.option("--algorithm", "algorithms", multiple=True, help="Again for more; all by default.")
@@ -97,9 +98,7 @@ _algorithms = click.option("--algorithm", "algorithms", multiple=True, help="Aga
 @_algorithms
 @_suite
 @click.option("--seed", default=0, show_default=True)
-def teammates(
-    profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path | None, seed: int
-) -> None:
+def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, seed: int) -> None:
     """Train populations of teammates, filter their checkpoints and write manifests of tasks with them.
 
     Finished populations are kept: after a stop, the same command goes on where it was.
@@ -107,27 +106,19 @@ def teammates(
     from generation.build_suite import build_suite
     from generation.profiles import load_profile
 
-    profile = load_profile(profile_name)
-    build_suite(profile, suite or Path(f"build/suite-{profile.name}"), layouts, algorithms, seed, console)
+    build_suite(load_profile(profile_name), suite, layouts, algorithms, seed, console)
 
 
 @cli.command()
-@_profile
-@_layouts
+@click.option("--layout", "layouts", multiple=True, help="Again for more; all finished ones by default.")
 @_algorithms
 @_suite
 @click.option("--greedy", is_flag=True, help="Cross-play by likeliest actions, as teammates act, not by draws.")
-def diversity(
-    profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path | None, greedy: bool
-) -> None:
+def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Self-play and cross-play of each population, and Hamming distances of all teammates; tables and pictures."""
     from generation.build_suite import report_diversity
-    from generation.profiles import load_profile
 
-    profile = load_profile(profile_name)
-    report_diversity(
-        suite or Path(f"build/suite-{profile.name}"), layouts or profile.layouts, algorithms, greedy, console
-    )
+    report_diversity(suite, layouts, algorithms, greedy, console)
 
 
 @cli.command()

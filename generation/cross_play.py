@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from generation.env import Environment
-from generation.learners.network import ActorCritic
+from generation.learners.network import ActorCritic, Widths
 from generation.learners.rollout import Player, network_player, roll_out, take_seats
 from icrl4aht_data.benchmark import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
@@ -38,7 +39,9 @@ def matrix(
     """
     a, b = (jax.tree.leaves(params)[0].shape[0] for params in (left, right))
     first, second = np.divmod(np.arange(a * b), b)
-    returns = _play(layout, network, tuple(first), tuple(second), episodes, greedy)(left, right, jax.random.key(seed))
+    returns = _play(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)(
+        left, right, jax.random.key(seed)
+    )
     return np.asarray(returns, np.float64).reshape(a, b)
 
 
@@ -47,14 +50,18 @@ def together(
 ) -> np.ndarray:
     """Mean returns float64 (A,) of left policy i with right policy i; arguments as in `matrix`."""
     pairs = tuple(range(jax.tree.leaves(left)[0].shape[0]))
-    returns = _play(layout, network, pairs, pairs, episodes, greedy)(left, right, jax.random.key(seed))
+    returns = _play(layout, network.widths, network.partners, pairs, pairs, episodes, greedy)(
+        left, right, jax.random.key(seed)
+    )
     return np.asarray(returns, np.float64)
 
 
 @lru_cache(maxsize=32)
-def _play(layout: Layout, network: Any, first: tuple, second: tuple, episodes: int, greedy: bool):
+def _play(
+    layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
+) -> Callable[[Any, Any, jax.Array], jax.Array]:
     """A function of both stacks and a key that gives the mean return of each pair (first[k], second[k])."""
-    env = Environment(layout)
+    env, network = Environment(layout), ActorCritic(widths, partners)
     n = len(first) * episodes
     sides = [np.repeat(np.array(side), episodes) for side in (first, second)]
 

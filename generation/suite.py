@@ -147,6 +147,11 @@ class _Training:
 
     def _resume(self) -> tuple[int, PopulationState | None]:
         path = self.folder / _RESUME
+        if (self.folder / _POPULATION).exists():
+            raise OptionError(
+                f"{self.folder}: holds a finished population of other settings, or with changed files; remove it, or "
+                f"give another --suite"
+            )
         if not path.exists():
             self._log_until(0)
             return 0, None
@@ -154,7 +159,7 @@ class _Training:
             notes = file.metadata()
         if notes["settings_hash"] != self.run.settings_hash:
             raise OptionError(
-                f"{self.folder}: holds an unfinished run of other settings; remove it, or give another --out"
+                f"{self.folder}: holds an unfinished run of other settings; remove it, or give another --suite"
             )
         stage = int(notes["stage"])
         state = load_state(path, jax.eval_shape(self.run.stages[stage].init, self._key(stage)))

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.env import Environment, EnvState
@@ -112,7 +113,7 @@ class PopulationState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Policies that learn together in one layout.
+    """Policies that learn together in one layout; their learning, nearly all of the work, uses every device.
 
     Args:
         env: the layout's environment.
@@ -172,6 +173,16 @@ class Population:
             key=running,
             update=jnp.int32(0),
         )
+
+    def _learn_apart(self, group: Group) -> Callable[..., Any]:
+        """The PPO of each policy of a group, the policies shared out over as many devices as divide them evenly."""
+        learn, devices = jax.vmap(self.ppo.learn), jax.devices()
+        count = max(n for n in range(1, len(devices) + 1) if len(group.places) % n == 0)
+        if count == 1:
+            return learn
+        mesh = Mesh(np.array(devices[:count]), ("policy",))
+        each = PartitionSpec("policy")
+        return jax.shard_map(learn, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
 
     def _untrained(self, key: Key[Array, ""]) -> Any:
         obs = jnp.zeros((1, 1, 5, 5, self.env.layout.channels), jnp.uint8)
@@ -235,7 +246,7 @@ class Population:
 
             keys = jax.random.split(jax.random.fold_in(key, number), len(group.places))
             own = (group.of(state.params), group.of(state.optimizer), jax.tree.map(by_policy, played), keys)
-            new_params, new_optimizer, loss = jax.vmap(self.ppo.learn)(*own)
+            new_params, new_optimizer, loss = self._learn_apart(group)(*own)
             params, optimizer = _put(params, new_params, group), _put(optimizer, new_optimizer, group)
             losses.append(loss)
         return params, optimizer, jax.tree.map(lambda *parts: jnp.concatenate(parts).mean(), *losses)

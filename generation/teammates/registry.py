@@ -7,16 +7,18 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from generation.teammates import assembly_line, recipe_aware_button, territory, utility_greedy
+from generation.teammates import assembly_line, learned, recipe_aware_button, territory, utility_greedy
 from generation.teammates.base import Noise, Policy
 from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
+from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import TaskFormatError
-from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
 
@@ -81,19 +83,46 @@ def _between(key: jax.Array, low: float, high: float) -> float:
     return float(jax.random.uniform(key, (), minval=low, maxval=high))
 
 
-def build(layout: Layout, teammate: dict[str, Any], slot: int = TEAMMATE, noise: Noise = "seeded") -> Policy:
-    """The policy of a task's teammate entry.
+def build(
+    layout: Layout,
+    teammate: dict[str, Any],
+    slot: int = TEAMMATE,
+    noise: Noise = "seeded",
+    suite: Path | None = None,
+) -> Policy:
+    """The policy of a task's teammate entry; learned ones act greedily.
+
+    Args:
+        layout: the kitchen.
+        teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.tasks.Task`.
+        slot: 0 or 1, the agent it plays.
+        noise: of heuristics, see `base.Noise`.
+        suite: the folder that checkpoints are in: a suite's, or a release's.
 
     Raises:
         UnknownNameError: for a family that does not exist.
         TaskFormatError: for unknown or missing parameters, values out of range, and slots other than 0 and 1.
+        OptionError: for a checkpoint that is missing or does not fit the layout.
     """
-    module = _module(teammate["family"])
     if slot not in (EGO, TEAMMATE):
         raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
+    if teammate.get("kind") == "rl":
+        return learned.build_entry(layout, teammate, suite)
     check_theta(teammate)
+    module = _module(teammate["family"])
     init, act = _functions(module, layout, slot, noise)
     return module.build(layout, teammate["theta"], slot, noise)._replace(init=init, act=act)
+
+
+def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
+    """The teammate of a history, as it played.
+
+    Raises:
+        OptionError: if the release does not hold the teammate's checkpoint.
+    """
+    entry = dataset.recover_teammate(history_id)
+    layout = get_layout(dataset.index.entry(history_id).layout)
+    return build(layout, entry, entry.get("slot", TEAMMATE), entry.get("noise", "seeded"), dataset.root)
 
 
 @lru_cache(maxsize=64)
