@@ -3,13 +3,14 @@ PYTHON ?= python3
 PROFILE ?= smoke
 OUT ?= build/$(PROFILE)
 ROOT ?=
+PEER ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate verify test check format bench-env bench-eval bench-loader clean
+.PHONY: help install demo generate teammates verify test check format bench-env bench-eval bench-learner bench-loader clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -28,6 +29,9 @@ demo: install ## from nothing to a verified dataset: generate smoke, verify, sam
 
 generate: install ## rebuild a dataset: PROFILE=smoke|mini|paper, OUT=folder
 	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT)
+
+teammates: install ## train the suite of learned teammates: PROFILE=smoke|mini|paper
+	$(BIN)/python -m generation teammates --profile $(PROFILE)
 
 verify: install ## verify a release, every byte and the physics: ROOT=folder (default: the bundled mini release)
 	$(BIN)/icrl4aht-data verify --deep $(ROOT)
@@ -52,6 +56,9 @@ bench-eval: install ## evaluation steps/s per teammate family beside the environ
 
 bench-loader: install ## batches/s of every way of holding data beside readers of the published format, JSON lines
 	$(BIN)/python -m benchmarks.bench_loader
+
+bench-learner: install ## self-play learning steps/s beside JaxMARL's IPPO: PEER=ippo_rnn_overcooked_v2.py of its repository
+	$(BIN)/python -m benchmarks.bench_learner --peer $(PEER)
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import io_callback
 
+from baselines.oracle import oracle
 from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import ACTIONS, STAY, unknown
 from icrl4aht_data.errors import OptionError
@@ -95,7 +96,7 @@ def random(layout: Layout) -> Policy:
     return Policy((), lambda params, key: (), act, "observation")
 
 
-AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random}
+AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
 """Name -> maker of the ego for a layout."""
 
 

@@ -22,15 +22,24 @@ def cli() -> None:
 
 
 @cli.command()
-@click.option("--agent", required=True, help="stay or random.")
+@click.option("--agent", required=True, help="stay, random or oracle.")
 @click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
 @click.option("--track", multiple=True, default=tuple(TRACKS), show_default=True)
 @click.option(
     "--manifest", type=click.Path(path_type=Path, exists=True), help="Tasks of a file instead of the tracks'."
 )
-@click.option("--seed", default=0, show_default=True)
+@click.option("--suite", type=click.Path(path_type=Path, exists=True), help="Folder of learned teammates.")
+@click.option("--seeds", default=1, show_default=True, type=click.IntRange(1), help="Play every task so often.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for one JSON per task.")
-def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path | None, seed: int, out: Path) -> None:
+def evaluate(
+    agent: str,
+    protocol: str,
+    track: tuple[str, ...],
+    manifest: Path | None,
+    suite: Path | None,
+    seeds: int,
+    out: Path,
+) -> None:
     """Evaluate an agent; goes on where a stopped run of the same settings ended."""
     from baselines.agents import get_agent
     from baselines.evaluate import evaluate as evaluate_tasks
@@ -46,7 +55,8 @@ def evaluate(agent: str, protocol: str, track: tuple[str, ...], manifest: Path |
             get_agent(agent),
             tasks,
             get_protocol(protocol),
-            seed=seed,
+            seeds=range(seeds),
+            suite=suite,
             out=out,
             done=lambda n: bars.advance(bar, n),
         )
@@ -89,12 +99,25 @@ def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: P
 
     task = named_task(layout, teammate)
     one = dataclasses.replace(get_protocol(protocol), episodes=1)
-    (played,) = play_tasks(get_agent(ego), [task], one, seed)
+    (played,) = play_tasks(get_agent(ego), [task], one, [seed])
     record, reward = np.asarray(played.record[0]), np.asarray(played.reward[0])
     save_episode(out, task.layout, record, reward)
     console.print(
         f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {reward.sum():g}; wrote {out}"
     )
+
+
+@cli.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/headroom"), show_default=True)
+@click.option("--protocol", multiple=True, default=tuple(PROTOCOLS), show_default=True)
+def headroom(out: Path, protocol: tuple[str, ...]) -> None:
+    """Measure the reference egos on every test task and write cards/headroom.json and cards/headroom.md."""
+    from baselines.headroom import measure, write_cards
+
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        runs = measure(out, protocol, bars)
+    for path in write_cards(runs):
+        console.print(f"wrote {path}")
 
 
 def main() -> None:

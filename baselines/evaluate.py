@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +25,9 @@ from jaxtyping import Array, Float, Int, UInt8
 from baselines.agents import HostPolicy, Percept
 from generation.env import Environment, EnvState
 from generation.teammates.base import Noise, Policy
-from generation.teammates.registry import build
+from generation.teammates.registry import build, check_theta
 from icrl4aht_data.benchmark import ACTIONS, EGO, KEPT_STEPS, TEAMMATE, track_of, unknown
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.tasks import Task
 
@@ -169,7 +170,7 @@ class Result:
 
     task_id: str
     settings: dict[str, Any]
-    returns: list[float]  # team return of each episode
+    returns: list[list[float]]  # team return of each episode, by seed
 
     def to_json(self) -> dict[str, Any]:
         return {"settings_hash": settings_hash(self.settings), **asdict(self)}
@@ -185,7 +186,8 @@ def evaluate(
     tasks: Sequence[Task],
     protocol: Protocol,
     *,
-    seed: int = 0,
+    seeds: Sequence[int] = (0,),
+    suite: Path | None = None,
     out: Path | None = None,
     done: Callable[[int], None] = lambda tasks: None,
 ) -> list[Result]:
@@ -196,7 +198,8 @@ def evaluate(
         make_ego: the ego for a layout.
         tasks: any tasks; those of one layout and family run together.
         protocol: see `PROTOCOLS`.
-        seed: of the episodes.
+        seeds: each plays every task once, all in one batch.
+        suite: the folder that learned teammates' checkpoints are in.
         out: a folder for one JSON per task; results of the same settings found there are taken instead of run again.
         done: called with the number of tasks finished, for progress.
 
@@ -205,8 +208,16 @@ def evaluate(
 
     Raises:
         OptionError: if `out` holds results of other settings, or the ego's action is not one integer.
+        TaskFormatError: for a teammate whose parameters are not possible; names the task.
     """
-    settings = {"agent": agent, "seed": seed, "protocol": asdict(protocol)}
+    for task in tasks:
+        _check_teammate(task, suite)
+    settings = {
+        "agent": agent,
+        "seeds": list(seeds),
+        "protocol": asdict(protocol),
+        "code_version": version("icrl4aht-data"),
+    }
     results = {task.task_id: found for task in tasks if (found := _stored(out, task, settings))}
     done(len(results))
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
@@ -214,33 +225,59 @@ def evaluate(
         if task.task_id not in results:
             groups[task.layout_name, task.teammate_kind].append(task)
     for members in groups.values():
-        for result in _run_group(make_ego, members, protocol, seed, settings):
+        for result in _run_group(make_ego, members, protocol, seeds, suite, settings):
             results[result.task_id] = result
             _store(out, result)
         done(len(members))
     return [results[task.task_id] for task in tasks]
 
 
-def _run_group(make_ego, tasks: list[Task], protocol: Protocol, seed: int, settings: dict) -> list[Result]:
+def _check_teammate(task: Task, suite: Path | None) -> None:
+    """Before any long work."""
+    try:
+        if task.teammate["kind"] == "heuristic":
+            check_theta(task.teammate)
+        else:
+            build(task.layout, task.teammate, suite=suite)
+    except Icrl4ahtError as error:
+        raise type(error)(f"task {task.task_id}: {error}") from error
+
+
+def _run_group(
+    make_ego,
+    tasks: list[Task],
+    protocol: Protocol,
+    seeds: Sequence[int],
+    suite: Path | None,
+    settings: dict[str, Any],
+) -> list[Result]:
     returns = []
-    for played in play_tasks(make_ego, tasks, protocol, seed):
+    for played in play_tasks(make_ego, tasks, protocol, seeds, suite):
         ego = played.actions[..., EGO]
         low, high = int(ego.min()), int(ego.max())
         if low < 0 or high >= len(ACTIONS):
             raise OptionError(f"the ego returned actions {low}..{high} on {tasks[0].layout.name}, expected 0..5")
         returns.append(np.asarray(played.reward, np.float64).sum(axis=-1))
-    per_task = np.stack(returns, axis=-1)
-    return [Result(task.task_id, settings, row.tolist()) for task, row in zip(tasks, per_task, strict=True)]
+    per_task = np.stack(returns, axis=-1).reshape(len(tasks), len(seeds), -1)
+    return [Result(task.task_id, settings, rows.tolist()) for task, rows in zip(tasks, per_task, strict=True)]
 
 
 def play_tasks(
-    make_ego: Callable[[Layout], Policy | HostPolicy], tasks: Sequence[Task], protocol: Protocol, seed: int
+    make_ego: Callable[[Layout], Policy | HostPolicy],
+    tasks: Sequence[Task],
+    protocol: Protocol,
+    seeds: Sequence[int] = (0,),
+    suite: Path | None = None,
 ) -> Iterator[Played]:
-    """Episode after episode of tasks that share a layout and a teammate family."""
+    """Episode after episode of tasks that share a layout and a teammate family.
+
+    Yields:
+        `Played` with B = tasks x seeds, seeds varying fastest.
+    """
     layout = tasks[0].layout
-    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise) for task in tasks]
+    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks for _ in seeds]
     rollout = Rollout(layout, make_ego(layout), mates, protocol)
-    tables = rollout.start(jnp.stack([task_key(seed, task.task_id) for task in tasks]))
+    tables = rollout.start(jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds]))
     _check_ego(rollout, tables)
     play = jax.jit(rollout.episode)
     params = rollout.teammate_params

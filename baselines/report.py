@@ -23,6 +23,7 @@ HEURISTICS = FAMILIES[1:]
 LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 _RESAMPLES = 10_000
+_NO_HEADROOM = 1.0  # a cell whose best reference ego is within this of `stay` leaves the ego nothing to do
 
 Cell = tuple[str, str]
 """(layout, family)."""
@@ -34,7 +35,7 @@ class Run:
 
     agent: str
     protocol: str
-    cells: dict[Cell, np.ndarray]  # (instances, episodes) team returns
+    cells: dict[Cell, np.ndarray]  # (instances, episodes) team returns, means over the seeds
 
     def means(self, cell: Cell) -> np.ndarray:
         """float64 (instances,)."""
@@ -70,12 +71,12 @@ def as_run(results: list[Result], where: str = "results") -> Run:
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: results of different settings in one run")
     known = {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))}
-    cells: dict[Cell, list[list[float]]] = defaultdict(list)
+    cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
     for result in results:
         if result.task_id not in known:
             raise OptionError(f"{where}: {result.task_id!r} is not one of the published test tasks")
         task = known[result.task_id]
-        cells[task.layout.name, task.teammate_family].append(result.returns)
+        cells[task.layout.name, task.teammate_family].append(np.mean(result.returns, axis=0))
     return Run(settings["agent"], settings["protocol"]["name"], {cell: np.array(rows) for cell, rows in cells.items()})
 
 
@@ -87,8 +88,8 @@ def interval(means: np.ndarray, rng: np.random.Generator) -> tuple[float, float]
 
 
 def rows(run: Run) -> list[dict[str, Any]]:
-    """One row per cell: ours, the published number of the same agent, interval, gain."""
-    published = _published(run.agent)
+    """One row per cell: ours, the published number of the same agent, interval, gain, and the normalised score."""
+    published, headroom = _published(run.agent), read_headroom(run.protocol)
     rng = np.random.default_rng(0)
     table = []
     for layout in LAYOUTS:
@@ -114,6 +115,7 @@ def rows(run: Run) -> list[dict[str, Any]]:
                     "published_mean": theirs[0],
                     "published_std": theirs[1],
                     "gain": run.gain(cell),
+                    "normalised": normalised(float(means.mean()), headroom.get(cell)),
                 }
             )
     return table
@@ -122,6 +124,27 @@ def rows(run: Run) -> list[dict[str, Any]]:
 def _published(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
     content = json.loads((CARDS / "published.json").read_text(encoding="utf-8"))
     return content["methods"].get(agent, {})
+
+
+def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
+    """cell -> mean returns of `stay`, `random`, `oracle`; empty if none was measured under this protocol."""
+    path = CARDS / "headroom.json"
+    if not path.exists():
+        return {}
+    content = json.loads(path.read_text(encoding="utf-8")).get(protocol, {})
+    return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
+
+
+def has_headroom(references: dict[str, float]) -> bool:
+    """Whether a reference ego of this cell gets more than one that only stays."""
+    return references["oracle"] - references["stay"] > _NO_HEADROOM
+
+
+def normalised(mean: float, references: dict[str, float] | None) -> float | None:
+    """(return - stay) / (oracle - stay); None where the cell leaves no headroom or was not measured."""
+    if references is None or not has_headroom(references):
+        return None
+    return (mean - references["stay"]) / (references["oracle"] - references["stay"])
 
 
 def markdown(runs: list[Run]) -> str:
@@ -154,6 +177,8 @@ def _cell_text(row: dict[str, Any] | None) -> str:
     if row["published_mean"] is not None:
         text += f"<br>published {row['published_mean']:.1f} ± {row['published_std']:.1f}"
     text += f"<br>gain {row['gain']:+.1f}"
+    if row["normalised"] is not None:
+        text += f"<br>normalised {row['normalised']:.2f}"
     return text
 
 

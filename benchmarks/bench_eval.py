@@ -1,7 +1,8 @@
 """Evaluation speed per teammate family beside the environment alone: `make bench-eval`.
 
 One JSON line per family: episode-steps/s of the evaluator with the random ego on the family's tasks of one layout, and
-of the bare environment (random actions, no teammate, nothing observed) with as many tables, taken in turn.
+of the bare environment (random actions, no teammate, nothing observed) with as many tables, taken in turn. A last line
+says what all 160 tasks take.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from baselines.evaluate import PROTOCOLS, Rollout, task_key
 from generation.env import Environment
 from generation.teammates.instances import published_tasks
 from generation.teammates.registry import build
-from icrl4aht_data.benchmark import HEURISTIC_KINDS, track_of
+from icrl4aht_data.benchmark import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _EPISODES = 20
@@ -60,11 +61,33 @@ def steps_per_second(play: Any, n: int) -> float:
     return _EPISODES * n * PROTOCOLS["seeded"].steps / (time.perf_counter() - started)
 
 
+def whole_benchmark() -> dict[str, Any]:
+    """The 160 test tasks of both tracks, 100 episodes each, with the random ego: seconds to compile and to play."""
+    compiling = playing = 0.0
+    tasks = [task for track in TRACKS for task in published_tasks(track)]
+    groups = dict.fromkeys((task.layout, task.teammate_kind) for task in tasks)
+    for layout, family in groups:
+        started = time.perf_counter()
+        play, _ = evaluator(layout, family)
+        jax.block_until_ready(play())
+        ready = time.perf_counter()
+        for _ in range(PROTOCOLS["seeded"].episodes):
+            jax.block_until_ready(play())
+        compiling, playing = compiling + ready - started, playing + time.perf_counter() - ready
+    return {
+        "benchmark": "eval-all",
+        "tasks": len(tasks),
+        "groups": len(groups),
+        "compile_seconds": round(compiling, 1),
+        "play_seconds": round(playing, 1),
+    }
+
+
 @click.command()
 @click.option("--layout", "layout_name", default="demo_wide", show_default=True)
 @click.option("--rounds", default=5, show_default=True)
 def main(layout_name: str, rounds: int) -> None:
-    """Episode-steps/s per teammate family beside the environment alone, one JSON line each."""
+    """Episode-steps/s per teammate family beside the environment alone, one JSON line each, then all 160 tasks."""
     layout = get_layout(layout_name)
     for family, short in HEURISTIC_KINDS.items():
         play, n = evaluator(layout, family)
@@ -82,6 +105,7 @@ def main(layout_name: str, rounds: int) -> None:
             "share_of_environment_speed": round(statistics.median(a / b for a, b in pairs), 3),
         }
         click.echo(json.dumps(line))
+    click.echo(json.dumps(whole_benchmark()))
 
 
 if __name__ == "__main__":

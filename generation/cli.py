@@ -81,6 +81,46 @@ def manifests(check: bool) -> None:
         console.print(f"{path}: {len(tasks)} tasks")
 
 
+_suite = click.option(
+    "--suite",
+    type=click.Path(path_type=Path),
+    default=Path("build/suite"),
+    show_default=True,
+    help="Folder of the learned teammates.",
+)
+_layouts = click.option("--layout", "layouts", multiple=True, help="Again for more; the profile's by default.")
+_algorithms = click.option("--algorithm", "algorithms", multiple=True, help="Again for more; all by default.")
+
+
+@cli.command()
+@_profile
+@_layouts
+@_algorithms
+@_suite
+@click.option("--seed", default=0, show_default=True)
+def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, seed: int) -> None:
+    """Train populations of teammates, filter their checkpoints and write manifests of tasks with them.
+
+    Finished populations are kept: after a stop, the same command goes on where it was.
+    """
+    from generation.build_suite import build_suite
+    from generation.profiles import load_profile
+
+    build_suite(load_profile(profile_name), suite, layouts, algorithms, seed, console)
+
+
+@cli.command()
+@click.option("--layout", "layouts", multiple=True, help="Again for more; all finished ones by default.")
+@_algorithms
+@_suite
+@click.option("--greedy", is_flag=True, help="Cross-play by likeliest actions, as teammates act, not by draws.")
+def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
+    """Self-play and cross-play of each population, and Hamming distances of all teammates; tables and pictures."""
+    from generation.build_suite import report_diversity
+
+    report_diversity(suite, layouts, algorithms, greedy, console)
+
+
 @cli.command()
 @click.option("--out", type=click.Path(path_type=Path), default=Path("build/demo"), show_default=True)
 @_profile

@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from generation import record
 from generation.env import Environment
 from generation.learners.checkpoint import save_policy
-from generation.learners.ppo import Learner
+from generation.learners.ego import Learner, compiled_update
 from generation.profiles import Profile
 from generation.teammates.base import Noise
 from generation.teammates.registry import build
@@ -91,7 +91,7 @@ def _run(task: Task, profile: Profile, folder: Path, report: Report) -> None:
         }
     )
     state = jax.jit(learner.init)(jax.random.key(task.seed))
-    update = jax.jit(learner.update, donate_argnums=0)
+    update = compiled_update(learner)
     started = time.perf_counter()
     with (partial / "metrics.jsonl").open("w", encoding="utf-8") as log:
         for number in range(profile.ego.updates):

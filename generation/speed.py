@@ -7,7 +7,9 @@ from typing import Any
 
 import jax
 
-from generation.learners.ppo import Learner, Seats
+from generation.learners.ego import Learner
+from generation.learners.rollout import random_player, roll_out, take_seats
+from icrl4aht_data.benchmark import EGO, TEAMMATE
 
 _ROUNDS = 3
 
@@ -18,23 +20,19 @@ def learner_speed(learner: Learner, seed: int = 0) -> dict[str, float]:
     The parts are timed as roll-outs of the environment with the teammate and a random ego, then roll-outs with the
     ego's network, then whole updates; each share is the difference to the one before.
     """
+    config = learner.config
     state = jax.jit(learner.init)(jax.random.key(seed))
     key = jax.random.key(seed + 1)
-
-    def tables_only(seats: Seats) -> Any:
-        def step(seats: Seats, key):
-            ego = jax.random.randint(key, seats.ended.shape, 0, 6)
-            return learner.take_turn(seats, ego, seats.hidden, key)[0], None
-
-        return jax.lax.scan(step, seats, jax.random.split(key, learner.config.rollout))[0]
-
-    tables = _seconds(jax.jit(tables_only), state.seats)
-    forward = _seconds(jax.jit(lambda params, seats: learner.roll_out(params, seats, key)), state.params, state.seats)
+    players = learner.players(state.params, state.teammate)
+    by_chance = [random_player(EGO, config.environments), players[TEAMMATE]]
+    tables = take_seats(learner.env, by_chance, jax.random.split(key, config.environments))
+    bare = _seconds(jax.jit(lambda seats: roll_out(learner.env, by_chance, seats, config.rollout, key)[0]), tables)
+    forward = _seconds(jax.jit(lambda seats: roll_out(learner.env, players, seats, config.rollout, key)), state.seats)
     whole = _seconds(jax.jit(learner.update), state)
     return {
-        "steps_per_second": round(learner.config.steps_per_update / whole, 1),
-        "environment_share": round(tables / whole, 4),
-        "forward_share": round((forward - tables) / whole, 4),
+        "steps_per_second": round(config.steps_per_update / whole, 1),
+        "environment_share": round(bare / whole, 4),
+        "forward_share": round((forward - bare) / whole, 4),
         "update_share": round((whole - forward) / whole, 4),
     }
 

@@ -18,16 +18,17 @@ PUBLISHED_ACTIONS = ("right", "down", "left", "up", "stay", "interact")
 EGO, TEAMMATE = 0, 1
 """Seats. The ego learns or is evaluated (drawn blue); the teammate is fixed and unknown (drawn red)."""
 
+_TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
+_LAYOUT_LAYOUTS = ("asymm_both", "cramped_up")
+
 TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
-    "teammate": {
-        "train": ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide"),
-        "test": ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide"),
-    },
-    "layout": {"train": ("asymm_both", "cramped_up"), "test": ("asymm_right", "cramped_down")},
+    "teammate": {"train": _TEAMMATE_LAYOUTS, "test": _TEAMMATE_LAYOUTS, "heldout": _TEAMMATE_LAYOUTS},
+    "layout": {"train": _LAYOUT_LAYOUTS, "test": ("asymm_right", "cramped_down"), "heldout": _LAYOUT_LAYOUTS},
 }
 """track -> split -> layouts (paper, App. A)."""
 
-SPLITS = ("train", "test")
+SPLITS = ("train", "test", "heldout")
+"""`heldout` has the training layouts and learned teammates that `train` does not have (paper, App. F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
 """Teammate families: learned policies, and the four heuristics (paper, App. B)."""
@@ -39,6 +40,9 @@ HEURISTIC_KINDS = {
     "utility_greedy": "H4",
 }
 """teammate kind -> family, for the heuristics."""
+
+ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
+"""What makes the learned teammates; the teammate kinds of family `rl` (paper, App. B.1)."""
 
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""

@@ -12,10 +12,10 @@ import hashlib
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from icrl4aht_data.benchmark import HEURISTIC_KINDS, SPLITS, TRACKS, check_place, unknown
+from icrl4aht_data.benchmark import ALGORITHMS, HEURISTIC_KINDS, SPLITS, TEAMMATE, TRACKS, check_place, unknown
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -29,7 +29,8 @@ class Task:
     """One task. `layout_name` is the environment name, as in the published manifests.
 
     Args:
-        teammate: kind "heuristic", family, theta_id, base_seed and theta.
+        teammate: kind, family, theta_id, base_seed and theta. Kind "heuristic": theta has the parameters. Kind "rl":
+            the checkpoint's folder within its suite, and the sha256 of its weights.
     """
 
     task_id: str
@@ -124,10 +125,29 @@ def _parse(line: str) -> Task:
     teammate = fields["teammate"]
     if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
         raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
-    if teammate["kind"] == "heuristic" and teammate["family"] not in HEURISTIC_KINDS:
-        raise unknown("heuristic family", teammate["family"], HEURISTIC_KINDS)
+    _check_teammate(teammate)
     task = Task(**fields)
     expected = task_id(task.track, task.split, task.layout_name, teammate, task.seed)
     if task.task_id != expected:
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
     return task
+
+
+def _check_teammate(teammate: dict[str, Any]) -> None:
+    kinds = tuple(HEURISTIC_KINDS) if teammate["kind"] == "heuristic" else ALGORITHMS
+    if teammate["family"] not in kinds:
+        raise unknown(f"{teammate['kind']} family", teammate["family"], kinds)
+    if teammate.get("slot", TEAMMATE) != TEAMMATE:
+        raise TaskFormatError(f"teammate.slot: a task's teammate plays slot {TEAMMATE}, found {teammate['slot']!r}")
+    fields = set(teammate) - {"slot"}
+    if fields != set(_HASHED):
+        raise TaskFormatError(f"teammate: expected the fields {sorted(_HASHED)}, found {sorted(fields)}")
+    theta = teammate["theta"]
+    if not isinstance(theta, dict):
+        raise TaskFormatError(f"teammate.theta: expected parameters by name, found {theta!r}")
+    if teammate["kind"] == "rl":
+        if set(theta) != {"checkpoint", "sha256"} or not all(isinstance(value, str) for value in theta.values()):
+            raise TaskFormatError(f"teammate.theta: expected the strings checkpoint and sha256, found {theta!r}")
+        path = PurePosixPath(theta["checkpoint"])
+        if path.is_absolute() or ".." in path.parts:
+            raise TaskFormatError(f"teammate.theta.checkpoint: expected a path within the suite, found {str(path)!r}")

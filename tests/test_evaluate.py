@@ -13,16 +13,19 @@ from click.testing import CliRunner
 from baselines.agents import Percept, from_host, get_agent, random, stay
 from baselines.cli import cli
 from baselines.evaluate import PROTOCOLS, evaluate, get_protocol, play_tasks, read_result
-from baselines.report import as_run, csv_text, interval, markdown, read_run
+from baselines.headroom import write_cards
+from baselines.report import Run, as_run, csv_text, interval, markdown, normalised, read_headroom, read_run
 from generation.teammates.base import Policy
 from generation.teammates.instances import published_tasks
-from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step
 
 PUBLISHED = dataclasses.replace(PROTOCOLS["published"], episodes=4)
-H4 = [task for task in published_tasks("teammate") if task.teammate_family == "H4"]
+ALL = [task for track in TRACKS for task in published_tasks(track)]
+H4 = [task for task in ALL if task.teammate_family == "H4"]
 SIMPLE, RING = ([task for task in H4 if task.layout.name == name] for name in ("coord_simple", "coord_ring"))
 
 
@@ -59,15 +62,23 @@ def test_an_interrupted_run_goes_on_to_the_same_results(together, tmp_path):
 
 
 def test_seeds_and_tasks_differ(together):
-    other = returns(evaluate("random", random, SIMPLE, PUBLISHED, seed=1))
+    other = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[1]))
     assert other != {task.task_id: together[task.task_id] for task in SIMPLE}
-    assert len({tuple(together[task.task_id]) for task in SIMPLE}) > 1
+    assert len({tuple(together[task.task_id][0]) for task in SIMPLE}) > 1
+
+
+def test_several_seeds_play_at_once(together):
+    both = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[0, 1]))
+    other = returns(evaluate("random", random, SIMPLE[1:2], PUBLISHED, seeds=[1]))
+    for task in SIMPLE:
+        assert both[task.task_id][0] == together[task.task_id][0]
+    assert both[SIMPLE[1].task_id][1:] == other[SIMPLE[1].task_id]
 
 
 def test_results_of_other_settings_are_never_reused(tmp_path):
     evaluate("stay", stay, SIMPLE[:1], PUBLISHED, out=tmp_path)
     with pytest.raises(OptionError, match="holds a result of other settings"):
-        evaluate("stay", stay, SIMPLE[:1], PUBLISHED, seed=1, out=tmp_path)
+        evaluate("stay", stay, SIMPLE[:1], PUBLISHED, seeds=[1], out=tmp_path)
     with pytest.raises(OptionError, match="holds a result of other settings"):
         evaluate("random", random, SIMPLE[:1], PUBLISHED, out=tmp_path)
 
@@ -76,7 +87,7 @@ def test_damaged_results_are_named(tmp_path):
     evaluate("stay", stay, SIMPLE[:1], PUBLISHED, out=tmp_path)
     (path,) = (tmp_path / "tasks").iterdir()
     content = json.loads(path.read_text())
-    content["settings"]["seed"] = 5
+    content["settings"]["seeds"] = [5]
     path.write_text(json.dumps(content))
     with pytest.raises(OptionError, match="do not match their hash"):
         read_run(tmp_path)
@@ -87,7 +98,7 @@ def test_damaged_results_are_named(tmp_path):
 
 def test_a_motionless_ego_gets_exactly_the_published_40_beside_h4():
     for result in evaluate("stay", stay, SIMPLE, PUBLISHED):
-        assert result.returns == [40.0] * 4
+        assert result.returns == [[40.0] * 4]
 
 
 class Watcher:
@@ -110,7 +121,7 @@ class Watcher:
 def test_host_agents_are_given_what_happened():
     watcher = Watcher()
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    played = list(play_tasks(from_host(watcher), SIMPLE[:3], protocol, seed=0))
+    played = list(play_tasks(from_host(watcher), SIMPLE[:3], protocol))
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played], axis=1) for k in range(3))
     assert len(watcher.seen) == 200
     layout = LAYOUTS["coord_simple"]
@@ -128,7 +139,7 @@ def test_host_agents_are_given_what_happened():
 
 def test_recorded_play_follows_the_rules():
     protocol = dataclasses.replace(PUBLISHED, episodes=1)
-    (played,) = play_tasks(random, RING[:2], protocol, seed=3)
+    (played,) = play_tasks(random, RING[:2], protocol, [3])
     record, actions = np.asarray(played.record), np.asarray(played.actions)
     layout = LAYOUTS["coord_ring"]
     outcome = step(layout, record[:, :-1], actions[:, :-1], record[:, 1:, 6])
@@ -169,9 +180,18 @@ def test_memory_lives_through_the_task():
         return Policy((), lambda params, key: jnp.int32(0), act, "observation")
 
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    first, second = play_tasks(mine, SIMPLE[:2], protocol, seed=0)
+    first, second = play_tasks(mine, SIMPLE[:2], protocol)
     assert (first.actions[..., 0] == 4).all()
     assert (second.actions[..., 0] == 5).all()
+
+
+def test_impossible_teammates_are_found_before_any_work(tmp_path):
+    wrong = dataclasses.replace(
+        SIMPLE[1], teammate=SIMPLE[1].teammate | {"theta": SIMPLE[1].teammate["theta"] | {"inertia": 2.0}}
+    )
+    with pytest.raises(TaskFormatError, match=r"task .*_t1_.*inertia = 2.0 \(expected a number in 0..1\)"):
+        evaluate("stay", stay, [SIMPLE[0], wrong], PUBLISHED, out=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_unknown_names():
@@ -213,3 +233,30 @@ def test_commands(tmp_path):
     (tmp_path / "two.jsonl").write_text("{}\n")
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert "line 1" in str(result.exception)
+
+
+def test_headroom_cards_name_the_cells_that_leave_nothing_to_do(tmp_path):
+    def run(agent, values):
+        returns = {cell: np.full((5, 2), value) for cell, value in values.items()}
+        return Run(agent, "seeded", returns)
+
+    flat, open_ = ("coord_simple", "H4"), ("demo_wide", "H1")
+    runs = [run("stay", {flat: 40.0, open_: 0.0}), run("random", {flat: 35.0, open_: 0.0})]
+    write_cards([*runs, run("oracle", {flat: 40.5, open_: 39.9})], tmp_path)
+    content = json.loads((tmp_path / "headroom.json").read_text())
+    assert content["seeded"]["demo_wide"]["H1"] == {"stay": 0.0, "random": 0.0, "oracle": 39.9}
+    text = (tmp_path / "headroom.md").read_text()
+    assert "**0.0 / 0.0 / 39.9**" in text
+    assert "No headroom: coord_simple/H4." in text
+
+
+def test_normalised_scores_stand_only_where_there_is_headroom():
+    table = {"stay": 10.0, "random": 5.0, "oracle": 30.0}
+    assert normalised(20.0, table) == 0.5
+    assert normalised(10.0, {**table, "oracle": 10.5}) is None
+    assert normalised(10.0, None) is None
+
+
+def test_headroom_cards_cover_every_cell():
+    for protocol in PROTOCOLS:
+        assert set(read_headroom(protocol)) == {(task.layout.name, task.teammate_family) for task in ALL}

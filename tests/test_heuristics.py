@@ -19,7 +19,7 @@ from generation.teammates.base import Noise, draw
 from generation.teammates.instances import published_thetas
 from generation.teammates.paths import Paths, Scene
 from generation.teammates.registry import build, heuristic_teammate, sample
-from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS, SPLITS, STAY
+from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS, STAY
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, PLATE, Layout
@@ -180,7 +180,7 @@ def many_params(name: str) -> dict:
     params = {}
     for family, module in MODULES.items():
         presets = [heuristic_teammate(family, preset, 0)["theta"] for preset in module.PRESETS]
-        sampled = [sample(family, number, split)["theta"] for number in range(3) for split in SPLITS]
+        sampled = [sample(family, number, split)["theta"] for number in range(3) for split in ("train", "test")]
         thetas = [*published_thetas(name, family), *presets, *sampled]
         params[family, 0] = params[family, 1] = stacked(family, [thetas[i % len(thetas)] for i in range(ROWS)])
     return params
@@ -433,16 +433,16 @@ def test_missing_and_unknown_parameters(family):
 @pytest.mark.parametrize(
     ("family", "name", "value", "expected"),
     [
-        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number\)"),
+        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number in 0..1\)"),
         (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected a whole number from 0\)"),
-        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected one of 0..5\)"),
+        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected a whole number in 0..5\)"),
         (H2, "shared_margin", True, r"shared_margin = True \(expected a whole number from 0\)"),
-        (H3, "role_mode", -1, r"role_mode = -1 \(expected one of 0..2\)"),
-        (H4, "inertia", None, r"inertia = None \(expected a number\)"),
+        (H3, "role_mode", -1, r"role_mode = -1 \(expected a whole number in 0..2\)"),
+        (H4, "inertia", None, r"inertia = None \(expected a number in 0..1\)"),
     ],
 )
 def test_impossible_parameters(family, name, value, expected):
-    with pytest.raises(TaskFormatError, match=f"teammate {family}: impossible parameters {expected}"):
+    with pytest.raises(TaskFormatError, match=f"teammate {family}: out of range: {expected}"):
         build(LAYOUTS["demo_wide"], {"family": family, "theta": MODULES[family].DEFAULTS | {name: value}})
 
 
@@ -477,7 +477,7 @@ def test_samples_stay_in_their_ranges(line):
     assert entries == [sample(family, number, split) for number in range(12)]
     assert len({str(entry["theta"]) for entry in entries}) == 12
     assert sample(family, 0, split, 1)["theta"] != entries[0]["theta"]
-    assert sample(family, 0, SPLITS[split == "train"])["theta"] != entries[0]["theta"]
+    assert sample(family, 0, ("train", "test")[split == "train"])["theta"] != entries[0]["theta"]
     for entry in entries:
         assert list(entry) == ["kind", "family", "theta_id", "base_seed", "theta"]
         assert list(entry["theta"]) == list(module.DEFAULTS)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark import TRACKS
-from icrl4aht_data.errors import UnknownNameError
-from icrl4aht_data.tasks import manifest_path, read_tasks
+from icrl4aht_data.errors import TaskFormatError, UnknownNameError
+from icrl4aht_data.tasks import manifest_path, read_tasks, write_tasks
 
 PUBLISHED_HASHES = """
 grounded_coord_simple recipe_aware_button 9bc579c9 57546c8f ebc58b53 5f64c6e3 f465bd31
@@ -78,3 +80,20 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
 def test_unknown_manifest():
     with pytest.raises(UnknownNameError, match="unknown track 'tracks'"):
         manifest_path("tracks", "test")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"family": "utility"}, r"line 1: unknown heuristic family 'utility'.*Did you mean 'utility_greedy'"),
+        ({"slot": 0}, r"line 1: teammate\.slot: a task's teammate plays slot 1, found 0"),
+        ({"colour": "red"}, r"line 1: teammate: expected the fields .*found .*'colour'"),
+        ({"theta": [1]}, r"line 1: teammate\.theta: expected parameters by name, found \[1\]"),
+    ],
+)
+def test_wrong_teammates_are_named_with_their_line(tmp_path, change, message):
+    task = published_tasks("layout")[0]
+    path = tmp_path / "tasks.jsonl"
+    write_tasks(path, [replace(task, teammate=task.teammate | change)])
+    with pytest.raises(TaskFormatError, match=message):
+        read_tasks(path)

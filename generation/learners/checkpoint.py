@@ -1,12 +1,15 @@
-"""Policies on disk: weights as safetensors, beside them a JSON card that says what they are."""
+"""Policies and learner states on disk: arrays as safetensors, beside them JSON that says what they are. No pickle."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file, save_file
@@ -14,25 +17,83 @@ from safetensors.numpy import load_file, save_file
 from generation.learners.network import ActorCritic, Widths
 from icrl4aht_data.errors import OptionError
 
+WEIGHTS, CARD = "policy.safetensors", "policy.json"
+
 
 def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
+    """Write policy.safetensors and policy.json into a folder, which appears whole or not at all."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    write_policy(partial, network, params, card)
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
+def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
     """Write policy.safetensors and policy.json into an existing folder."""
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
-    save_file(weights, folder / "policy.safetensors")
+    save_file(weights, folder / WEIGHTS)
     shapes = {name: list(w.shape) for name, w in weights.items()}
-    content = card | {"widths": asdict(network.widths), "shapes": shapes}
-    (folder / "policy.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
+    (folder / CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     """The network, its weights, and the card.
 
     Raises:
-        OptionError: if the weights have not the shapes that the card states.
+        OptionError: if the files are missing or not readable, or the weights have not the shapes that the card states.
     """
-    card = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
-    weights = load_file(folder / "policy.safetensors")
+    try:
+        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+        weights = load_file(folder / WEIGHTS)
+        network = ActorCritic(Widths.from_table(card["widths"]), card["partners"])
+        stated = card["shapes"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
     shapes = {name: list(w.shape) for name, w in weights.items()}
-    if shapes != card["shapes"]:
-        raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {card['shapes']}")
-    return ActorCritic(Widths.from_table(card["widths"])), unflatten_dict(weights, sep="/"), card
+    if shapes != stated:
+        raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {stated}")
+    return network, unflatten_dict(weights, sep="/"), card
+
+
+def save_state(path: Path, state: Any, notes: dict[str, str]) -> None:
+    """Write a pytree of arrays, typed keys included, and notes; the file is replaced at once or not at all."""
+    leaves = {str(n): np.asarray(_raw(leaf)) for n, leaf in enumerate(jax.tree.leaves(state))}
+    partial = path.with_suffix(".partial")
+    save_file(leaves, partial, metadata=notes)
+    partial.replace(path)
+
+
+def load_state(path: Path, like: Any) -> Any:
+    """The pytree that was saved.
+
+    Args:
+        like: a pytree of the same structure; its leaves' shapes and dtypes are what the file's must have.
+
+    Raises:
+        OptionError: if they differ; names the first leaf that does.
+    """
+    stored = load_file(path)
+    leaves, structure = jax.tree.flatten(like)
+    if len(stored) != len(leaves):
+        raise OptionError(f"{path}: holds {len(stored)} arrays, expected {len(leaves)}; remove it to start anew")
+    found = []
+    for n, leaf in enumerate(leaves):
+        expected, array = jax.eval_shape(_raw, leaf), stored[str(n)]
+        if (array.shape, array.dtype) != (expected.shape, expected.dtype):
+            raise OptionError(
+                f"{path}: array {n} is {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}; "
+                f"remove it to start anew"
+            )
+        found.append(jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(leaf) else jnp.asarray(array))
+    return jax.tree.unflatten(structure, found)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _raw(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf

@@ -116,15 +116,28 @@ class GRU(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """Observations over time -> action logits and values."""
+    """Observations over time -> action logits and values.
+
+    Args:
+        widths: of the layers.
+        partners: how many policies may sit opposite, for a critic that is told which one does (BRDiv, Rahman et al.
+            2023, Sec. 5); 0 for one that is not. The actor is never told.
+        critic: False for policies that only act; their values are 0.
+    """
 
     widths: Widths = Widths()
+    partners: int = 0
+    critic: bool = True
 
     @nn.compact
     def __call__(
-        self, hidden: Float[Array, "N H"], obs: Integer[Array, "T N 5 5 C"], reset: Bool[Array, "T N"]
+        self,
+        hidden: Float[Array, "N H"],
+        obs: Integer[Array, "T N 5 5 C"],
+        reset: Bool[Array, "T N"],
+        partner: Integer[Array, " N"] | None = None,
     ) -> tuple[Float[Array, "N H"], Float[Array, "T N 6"], Float[Array, "T N"]]:
-        """Args: the hidden state before the first step, observations, and where an episode starts.
+        """Args: the hidden state before the first step, observations, where an episode starts, who sits opposite.
 
         Returns: the hidden state after the last step, logits, values.
         """
@@ -132,6 +145,12 @@ class ActorCritic(nn.Module):
         hidden, states = GRU(self.widths.gru, name="gru")(hidden, features, reset)
         actor = nn.relu(_dense(self.widths.head, 2.0, "actor_hidden")(states))
         logits = _dense(len(ACTIONS), 0.01, "actor")(actor)
+        if not self.critic:
+            return hidden, logits, jnp.zeros(logits.shape[:2])
+        if self.partners:
+            told = jnp.zeros(hidden.shape[0], int) if partner is None else partner
+            told = jnp.broadcast_to(jax.nn.one_hot(told, self.partners), (*states.shape[:2], self.partners))
+            states = jnp.concatenate([states, told], axis=-1)
         critic = nn.relu(_dense(self.widths.head, 2.0, "critic_hidden")(states))
         value = _dense(1, 1.0, "critic")(critic)
         return hidden, logits, value[..., 0]

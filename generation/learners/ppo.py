@@ -1,7 +1,8 @@
-"""The one recurrent PPO (paper, App. B.1 and C.2): an ego in seat 0 learns beside a fixed teammate in seat 1.
+"""The one recurrent PPO (paper, App. B.1 and C.2): how a policy learns from actor sequences, wherever they were played.
 
-One update is one jitted function: a roll-out by scan, then epochs over minibatches of whole actor sequences by scan.
-Roll-outs keep state records; observations are rendered where they are used.
+Epochs over minibatches of whole sequences, by scan; the recurrent state is replayed from the one stored at the first
+step. Sequences hold state records; observations are rendered where they are used. What tells the algorithms apart is
+who sat opposite and the weight of each sequence's advantage.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from generation.env import Environment, EnvState, EnvStep
 from generation.learners.network import ActorCritic, Widths
-from generation.teammates.base import Policy
-from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, KEPT_STEPS, TEAMMATE
+from generation.learners.rollout import Rollout, seen_from
+from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
 
@@ -29,7 +31,7 @@ class PPOConfig:
     environments: int = 1024
     rollout: int = 256  # steps of each environment between updates
     epochs: int = 4
-    minibatches: int = 64  # each of environments / minibatches whole sequences
+    minibatches: int = 64  # each of sequences / minibatches whole sequences
     learning_rate: float = 2.5e-4
     warmup: float = 0.1  # share of the updates
     discount: float = 0.99
@@ -59,169 +61,81 @@ class PPOConfig:
         """Episodes of each environment whose kept steps, and the state after them, are within the updates."""
         return max(0, (self.updates * self.rollout - KEPT_STEPS - 1) // EPISODE_STEPS + 1)
 
-
-class Seats(NamedTuple):
-    """Everything a roll-out carries: the tables, and what the players remember. N environments."""
-
-    env: EnvState
-    ended: Bool[Array, " N"]  # the last step ended an episode
-    hidden: Float[Array, "N H"]  # the ego's
-    teammate: Any  # the teammates' memories, batched
-    returns: Float[Array, " N"]  # of the running episodes so far, the team's unshaped reward
-
-
-class LearnerState(NamedTuple):
-    """What an update maps to the next one; all that a resume needs."""
-
-    params: Any
-    optimizer: optax.OptState
-    seats: Seats
-    key: Key[Array, ""]
-    update: Int[Array, ""]
-
-
-class Rollout(NamedTuple):
-    """T steps of N environments."""
-
-    record: UInt8[Array, "T N S"]  # before the step
-    reset: Bool[Array, "T N"]  # `record` starts an episode
-    actions: Int[Array, "T N 2"]
-    log_prob: Float[Array, "T N"]
-    value: Float[Array, "T N"]
-    reward: Float[Array, "T N"]  # the team's, unshaped
-    shaped: Float[Array, "T N"]  # the ego's own
-    done: Bool[Array, "T N"]
-    returns: Float[Array, "T N"]  # of the episode that ended here, where `done`
-
-
-@dataclass(frozen=True, eq=False)
-class Learner:
-    """An ego that learns from scratch beside one teammate."""
-
-    env: Environment
-    teammate: Policy
-    config: PPOConfig
-
-    @property
-    def network(self) -> ActorCritic:
-        return ActorCritic(self.config.widths)
-
     @property
     def optimizer(self) -> optax.GradientTransformation:
         """Adam under a linear warm-up and a cosine decay (paper, App. C.2.3), gradients clipped by global norm."""
-        config = self.config
-        steps = config.updates * config.epochs * config.minibatches
+        steps = self.updates * self.epochs * self.minibatches
         schedule = optax.warmup_cosine_decay_schedule(
-            0.0, config.learning_rate, max(1, round(config.warmup * steps)), steps
+            0.0, self.learning_rate, max(1, round(self.warmup * steps)), steps
         )
-        return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule, eps=1e-5))
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), optax.adam(schedule, eps=1e-5))
 
-    def init(self, key: Key[Array, ""]) -> LearnerState:
-        """An untrained ego at fresh tables."""
-        weights, tables, running = jax.random.split(key, 3)
-        n = self.config.environments
-        env = self.env.init(jax.random.split(tables, n))
-        hidden = self.network.initial_hidden(n)
-        obs = self.env.observe_one(env, EGO)[None]
-        params = self.network.init(weights, hidden, obs, jnp.ones((1, n), bool))
-        seats = Seats(env, jnp.ones(n, bool), hidden, self._teammate_memory(env), jnp.zeros(n))
-        return LearnerState(params, self.optimizer.init(params), seats, running, jnp.int32(0))
+    def shaping(self, update: Int[Array, ""]) -> Float[Array, ""]:
+        """The weight of shaped rewards in an update: linearly from 1 to 0 (paper, App. B.1)."""
+        return jnp.maximum(0.0, 1.0 - update * self.steps_per_update / self.shaping_horizon)
 
-    def update(self, state: LearnerState) -> tuple[LearnerState, Rollout, dict[str, Array]]:
-        """One roll-out and the epochs over it. Jit it once; it is a pure function of the state."""
-        rolling, learning = jax.random.split(jax.random.fold_in(state.key, state.update))
-        seats, rollout, last_value = self.roll_out(state.params, state.seats, rolling)
-        steps_so_far = state.update * self.config.steps_per_update
-        shaping = jnp.maximum(0.0, 1.0 - steps_so_far / self.config.shaping_horizon)
-        advantage = generalised_advantage(
-            rollout.reward + shaping * rollout.shaped, rollout.value, rollout.done, last_value, self.config
-        )
-        batch = Batch(rollout, state.seats.hidden[None], advantage, advantage + rollout.value)
-        params, optimizer, losses = self._epochs(state.params, state.optimizer, batch, learning)
-        ended = jnp.sum(rollout.done)
-        metrics = losses | {
-            "episodes": ended,
-            "return": jnp.sum(jnp.where(rollout.done, rollout.returns, 0.0)) / jnp.maximum(ended, 1),
-            "reward_per_step": jnp.mean(rollout.reward),
-            "shaped_per_step": jnp.mean(rollout.shaped),
-            "shaping": shaping,
-        }
-        return LearnerState(params, optimizer, seats, state.key, state.update + 1), rollout, metrics
 
-    def roll_out(self, params, seats: Seats, key: Key[Array, ""]) -> tuple[Seats, Rollout, Float[Array, " N"]]:
-        """`rollout` steps of every environment, and the value of the observation after the last."""
+class Sequences(NamedTuple):
+    """T steps at the M places of one policy; every array has the places on axis 1."""
 
-        def step(seats: Seats, key: Key[Array, ""]):
-            return self._step(params, seats, key)
+    record: UInt8[Array, "T M S"]  # the actor's own columns first
+    reset: Bool[Array, "T M"]
+    action: Int[Array, "T M"]
+    log_prob: Float[Array, "T M"]
+    value: Float[Array, "T M"]
+    reward: Float[Array, "T M"]  # the team's, and the actor's own shaped one by its weight
+    done: Bool[Array, "T M"]
+    hidden: Float[Array, "1 M H"]  # before the first step
+    partner: Int[Array, "1 M"]  # who sits opposite, for the critic
+    weight: Float[Array, "1 M"]  # of the advantage; negative to bring the return down
+    last_value: Float[Array, "1 M"]  # of the observation after the last step
 
-        seats, rollout = jax.lax.scan(step, seats, jax.random.split(key, self.config.rollout))
-        _, _, value = self._forward(params, seats)
-        return seats, rollout, value
 
-    def _forward(self, params, seats: Seats):
-        obs = self.env.observe_one(seats.env, EGO)
-        hidden, logits, value = self._apply(params, seats.hidden, obs[None], seats.ended[None])
-        return hidden, logits[0], value[0]
+def sequences(
+    rollout: Rollout, player: int, places: np.ndarray, hidden: Array, last_value: Array, shaping: Array
+) -> Sequences:
+    """What one player's roll-out is to its learning; all partners 0, all weights 1."""
+    seat, table = np.divmod(places, rollout.done.shape[1])
+    choice = rollout.choices[player]
+    return Sequences(
+        record=seen_from(rollout.record, places),
+        reset=rollout.reset[:, table],
+        action=choice.action,
+        log_prob=choice.log_prob,
+        value=choice.value,
+        reward=rollout.reward[:, table] + shaping * rollout.shaped[:, table, seat],
+        done=rollout.done[:, table],
+        hidden=hidden[None],
+        partner=jnp.zeros((1, places.size), jnp.int32),
+        weight=jnp.ones((1, places.size)),
+        last_value=last_value[None],
+    )
 
-    def _apply(self, params, hidden, obs, reset) -> tuple[Array, Array, Array]:
-        result: Any = self.network.apply(params, hidden, obs, reset)
-        return result
 
-    def _step(self, params, seats: Seats, key: Key[Array, ""]) -> tuple[Seats, Rollout]:
-        mine, theirs = jax.random.split(key)
-        hidden, logits, value = self._forward(params, seats)
-        ego = jax.random.categorical(mine, logits)
-        log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), ego[:, None], axis=-1)[:, 0]
-        after, actions, step = self.take_turn(seats, ego, hidden, theirs)
-        transition = Rollout(
-            record=seats.env.record,
-            reset=seats.ended,
-            actions=actions,
-            log_prob=log_prob,
-            value=value,
-            reward=step.reward,
-            shaped=step.shaped[:, EGO],
-            done=step.done,
-            returns=seats.returns + step.reward,
-        )
-        return after, transition
+@dataclass(frozen=True)
+class PPO:
+    """Learning from sequences."""
 
-    def take_turn(
-        self, seats: Seats, ego: Int[Array, " N"], hidden: Float[Array, "N H"], key: Key[Array, ""]
-    ) -> tuple[Seats, Int[Array, "N 2"], EnvStep]:
-        """The teammate answers the ego's actions and the tables move on; memories start anew with each episode."""
-        mate, memory = self._teammate_acts(seats, key)
-        actions = jnp.stack([ego, mate], axis=-1)
-        step = self.env.step(seats.env, actions)
-        fresh = self._teammate_memory(step.state)
-        memory = jax.tree.map(lambda new, old: _where(step.done, new, old), fresh, memory)
-        returns = jnp.where(step.done, 0.0, seats.returns + step.reward)
-        return Seats(step.state, step.done, hidden, memory, returns), actions, step
+    layout: Layout
+    network: ActorCritic
+    config: PPOConfig
 
-    def _teammate_memory(self, env: EnvState):
-        """Fresh memories for the running episodes: a function of each episode's own key."""
-        keys = jax.vmap(jax.random.fold_in)(self.env.episode_key(env), jnp.full(env.clock.shape, TEAMMATE))
-        return jax.vmap(self.teammate.init, in_axes=(None, 0))(self.teammate.params, keys)
-
-    def _teammate_acts(self, seats: Seats, key: Key[Array, ""]):
-        view = seats.env.record
-        if self.teammate.sees == "observation":
-            view = self.env.observe_one(seats.env, TEAMMATE)
-        keys = jax.random.split(key, view.shape[0])
-        act = jax.vmap(self.teammate.act, in_axes=(None, 0, 0, 0))
-        return act(self.teammate.params, seats.teammate, view, keys)
-
-    def _epochs(self, params, optimizer, batch: Batch, key: Key[Array, ""]):
+    def learn(
+        self, params: Any, optimizer: optax.OptState, played: Sequences, key: Key[Array, ""]
+    ) -> tuple[Any, optax.OptState, dict[str, Array]]:
+        """The epochs over one roll-out: parameters, optimiser state, mean losses."""
         config = self.config
+        advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)
+        batch = Batch(played, advantage, advantage + played.value)
 
         def epoch(carry, key):
-            order = jax.random.permutation(key, config.environments)
+            order = jax.random.permutation(key, played.done.shape[1])
 
             def minibatch(carry, chosen):
                 params, optimizer = carry
                 part = jax.tree.map(lambda x: x[:, chosen], batch)
-                losses, gradient = jax.value_and_grad(self._loss, has_aux=True)(params, part)
-                change, optimizer = self.optimizer.update(gradient, optimizer, params)
+                losses, gradient = jax.value_and_grad(self.loss, has_aux=True)(params, part)
+                change, optimizer = config.optimizer.update(gradient, optimizer, params)
                 return (optax.apply_updates(params, change), optimizer), losses[1]
 
             return jax.lax.scan(minibatch, carry, order.reshape(config.minibatches, -1))
@@ -229,18 +143,19 @@ class Learner:
         (params, optimizer), losses = jax.lax.scan(epoch, (params, optimizer), jax.random.split(key, config.epochs))
         return params, optimizer, jax.tree.map(jnp.mean, losses)
 
-    def _loss(self, params, batch: Batch):
+    def loss(self, params: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
         """Clipped surrogate, clipped value error, entropy (paper, App. B.1 table of PPO hyper-parameters)."""
-        config, rollout = self.config, batch.rollout
-        obs = observe(self.env.layout, rollout.record, EGO)
-        _, logits, value = self._apply(params, batch.hidden[0], obs, rollout.reset)
+        config, played = self.config, batch.played
+        obs = observe(self.layout, played.record, EGO)
+        result: Any = self.network.apply(params, played.hidden[0], obs, played.reset, played.partner[0])
+        _, logits, value = result
         log_probs = jax.nn.log_softmax(logits)
-        log_prob = jnp.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
-        ratio = jnp.exp(log_prob - rollout.log_prob)
-        advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
+        log_prob = jnp.take_along_axis(log_probs, played.action[..., None], axis=-1)[..., 0]
+        ratio = jnp.exp(log_prob - played.log_prob)
+        advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8) * played.weight
         clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
         policy = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-        near = rollout.value + jnp.clip(value - rollout.value, -config.clip, config.clip)
+        near = played.value + jnp.clip(value - played.value, -config.clip, config.clip)
         error = jnp.maximum((value - batch.target) ** 2, (near - batch.target) ** 2)
         value_loss = 0.5 * error.mean()
         entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1).mean()
@@ -249,21 +164,20 @@ class Learner:
 
 
 class Batch(NamedTuple):
-    """A roll-out ready to learn from; every array has the environments on axis 1."""
+    """Sequences ready to learn from; every array has the places on axis 1."""
 
-    rollout: Rollout
-    hidden: Float[Array, "1 N H"]  # the ego's before the first step
-    advantage: Float[Array, "T N"]
-    target: Float[Array, "T N"]  # of the value
+    played: Sequences
+    advantage: Float[Array, "T M"]
+    target: Float[Array, "T M"]  # of the value
 
 
 def generalised_advantage(
-    reward: Float[Array, "T N"],
-    value: Float[Array, "T N"],
-    done: Bool[Array, "T N"],
-    last_value: Float[Array, " N"],
+    reward: Float[Array, "T M"],
+    value: Float[Array, "T M"],
+    done: Bool[Array, "T M"],
+    last_value: Float[Array, " M"],
     config: PPOConfig,
-) -> Float[Array, "T N"]:
+) -> Float[Array, "T M"]:
     """GAE (Schulman et al. 2016, eq. 16); an episode's end cuts both the bootstrap and the trace."""
     following = jnp.concatenate([value[1:], last_value[None]])
     going_on = 1.0 - done
@@ -277,6 +191,12 @@ def generalised_advantage(
     return jax.lax.scan(back, jnp.zeros_like(last_value), (delta, going_on), reverse=True)[1]
 
 
-def _where(mask: Bool[Array, " N"], new: Array, old: Array) -> Array:
-    """`jnp.where` with the mask on the leading axis; also for typed keys."""
-    return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
+def episode_metrics(rollout: Rollout) -> dict[str, Array]:
+    """What a roll-out says of its episodes; `return` is 0 where none ended."""
+    ended = jnp.sum(rollout.done)
+    return {
+        "episodes": ended,
+        "return": jnp.sum(jnp.where(rollout.done, rollout.returns, 0.0)) / jnp.maximum(ended, 1),
+        "reward_per_step": jnp.mean(rollout.reward),
+        "shaped_per_step": jnp.mean(rollout.shaped),
+    }

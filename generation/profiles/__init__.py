@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,26 @@ _MAY_BE_ZERO: dict[str, str] = {
 
 
 @dataclass(frozen=True)
+class TeammateConfig:
+    """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1)."""
+
+    members: int = 10  # of each algorithm's population
+    train: int = 20  # teammates of each algorithm for the training tasks
+    heldout: int = 5  # others, for the in-distribution check
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            total_steps=30_000_000, environments=256, warmup=0.05, shaping_horizon=15_000_000
+        )
+    )
+
+
+@dataclass(frozen=True)
 class Profile:
     """How large a rebuild is."""
 
     name: str
     ego: PPOConfig
+    teammates: TeammateConfig
     data_version: str  # of the release, SemVer
     keep: int  # streams of each task that the release keeps, best first
     layouts: tuple[str, ...]
@@ -69,13 +84,14 @@ def load_profile(name: str) -> Profile:
         raise unknown("profile", name, names())
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-        _only(content, "", {"ego", "release", "tasks"})
+        _only(content, "", {"ego", "teammates", "release", "tasks"})
         _only(content["release"], "release.", {"keep", "data_version"})
         _only(content["tasks"], "tasks.", {"layouts", "presets"})
         tasks = content["tasks"]
         profile = Profile(
             name=path.stem,
-            ego=_ego(dict(content["ego"])),
+            ego=_ppo("ego", content["ego"], PPOConfig()),
+            teammates=_teammates(content.get("teammates", {})),
             data_version=_typed("release.data_version", content["release"]["data_version"], str),
             keep=_typed("release.keep", content["release"]["keep"], int),
             layouts=tuple(get_layout(layout).name for layout in _names("tasks.layouts", tasks["layouts"])),
@@ -99,18 +115,30 @@ def load_profile(name: str) -> Profile:
     return profile
 
 
-def _ego(table: dict[str, Any]) -> PPOConfig:
-    _only(table, "ego.", {field.name for field in fields(PPOConfig)})
+def _teammates(table: dict[str, Any]) -> TeammateConfig:
+    sizes = ("members", "train", "heldout")
+    rest = {name: value for name, value in table.items() if name not in sizes}
+    counts = {name: _typed(f"teammates.{name}", table[name], int) for name in sizes if name in table}
+    for name, count in counts.items():
+        if count < (name != "heldout"):
+            raise OptionError(f"teammates.{name} = {count}: expected a positive number")
+    return TeammateConfig(**counts, ppo=_ppo("teammates", rest, TeammateConfig().ppo))
+
+
+def _ppo(section: str, table: dict[str, Any], defaults: PPOConfig) -> PPOConfig:
+    table = dict(table)
+    _only(table, f"{section}.", {field.name for field in fields(PPOConfig)})
     if "widths" in table:
-        _only(table["widths"], "ego.widths.", {field.name for field in fields(Widths)})
+        _only(table["widths"], f"{section}.widths.", {field.name for field in fields(Widths)})
         table["widths"] = Widths.from_table(table["widths"])
-    for field in fields(PPOConfig):
-        if field.name in table and field.name != "widths":
-            value = _typed(f"ego.{field.name}", table[field.name], int if field.type == "int" else float)
-            expected = _MAY_BE_ZERO.get(field.name, "a positive number")
-            if value < 0 or (value == 0 and field.name not in _MAY_BE_ZERO) or ("1" in expected and value > 1):
-                raise OptionError(f"ego.{field.name} = {value}: expected {expected}")
-    return PPOConfig(**table)
+    for known in fields(PPOConfig):
+        if known.name in table and known.name != "widths":
+            key = f"{section}.{known.name}"
+            value = _typed(key, table[known.name], int if known.type == "int" else float)
+            expected = _MAY_BE_ZERO.get(known.name, "a positive number")
+            if value < 0 or (value == 0 and known.name not in _MAY_BE_ZERO) or ("1" in expected and value > 1):
+                raise OptionError(f"{key} = {value}: expected {expected}")
+    return replace(defaults, **table)
 
 
 def _names(key: str, value: Any) -> tuple[str, ...]:

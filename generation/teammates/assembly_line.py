@@ -53,6 +53,9 @@ PRESETS: dict[str, dict[str, float]] = {
 CHOICES: dict[str, int] = {"role_mode": 3, "handoff_style": 3}
 """Parameters that are one of 0..n-1."""
 
+UNBOUNDED = frozenset[str]()
+"""Parameters without an upper limit; the others are in 0..1, or one of `CHOICES`."""
+
 TRAIN = Sampling(
     ("default", "ingredient_runner"),
     {"role_mode": [0, 2], "plate_urgency": (0.0, 0.6), "prestage_bias": (0.2, 0.6)},

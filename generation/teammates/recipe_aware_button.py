@@ -70,6 +70,10 @@ PRESETS: dict[str, dict[str, float]] = {
 }
 """Preset -> what differs from the defaults."""
 
+CHOICES: dict[str, int] = {}
+UNBOUNDED = frozenset({"refresh_interval"})
+"""Parameters without an upper limit; the others are in 0..1, or one of `CHOICES`."""
+
 TRAIN = Sampling(
     ("default", "high_L_priority"),
     {

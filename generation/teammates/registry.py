@@ -4,63 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
+from functools import lru_cache
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from generation.teammates import assembly_line, recipe_aware_button, territory, utility_greedy
-from generation.teammates.base import Noise, Policy, Sampling
-from icrl4aht_data.benchmark import SPLITS, TEAMMATE, unknown
+from generation.teammates import assembly_line, learned, recipe_aware_button, territory, utility_greedy
+from generation.teammates.base import Noise, Policy
+from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
+from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import TaskFormatError
-from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
 
-_CHOICES: dict[str, dict[str, int]] = {
-    territory.KIND: territory.CHOICES,
-    assembly_line.KIND: assembly_line.CHOICES,
-}
-
-_H4_TRAIN = Sampling(
-    ("default", "delivery_focused"),
-    {
-        "w_deliver": (8.0, 18.0),
-        "w_pickup_cooked": (6.0, 14.0),
-        "w_add_ingredient": (3.0, 8.0),
-        "dist_weight": (0.2, 0.7),
-        "inertia": (0.1, 0.5),
-    },
-)
-_H4_TEST = Sampling(
-    ("prep_focused", "high_inertia", "distance_sensitive"),
-    {
-        "w_deliver": (5.0, 12.0),
-        "w_pickup_cooked": (3.0, 8.0),
-        "w_add_ingredient": (7.0, 12.0),
-        "dist_weight": (0.6, 1.2),
-        "inertia": (0.5, 0.9),
-    },
-)
-_H4_SPANS = {
-    "w_deliver": (5.0, 20.0),
-    "w_pickup_cooked": (3.0, 15.0),
-    "w_get_plate": (2.0, 10.0),
-    "w_add_ingredient": (3.0, 12.0),
-    "w_fetch_ingredient": (2.0, 10.0),
-    "w_stage_on_counter": (0.5, 5.0),
-    "w_start_cooking": (3.0, 15.0),
-    "w_press_L": (1.0, 8.0),
-    "dist_weight": (0.1, 1.5),
-    "inertia": (0.0, 1.0),
-    "counter_preference": (0.0, 1.0),
-}
-
-_SAMPLING: dict[str, tuple[Sampling, Sampling, dict[str, tuple[float, float]]]] = {
-    utility_greedy.KIND: (_H4_TRAIN, _H4_TEST, _H4_SPANS),
-    **{m.KIND: (m.TRAIN, m.TEST, m.SPANS) for m in (recipe_aware_button, territory, assembly_line)},
-}
 _JITTER = 0.2
 """How far a sampled parameter strays from its preset, as a share of its full range."""
 
@@ -92,10 +53,10 @@ def sample(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[s
         UnknownNameError: for a family or split that does not exist.
     """
     module = _module(family)
-    if split not in SPLITS:
-        raise unknown("split", split, SPLITS)
-    *samplings, spans = _SAMPLING[family]
-    presets, ranges = samplings[SPLITS.index(split)]
+    samplings = {"train": module.TRAIN, "test": module.TEST}
+    if split not in samplings:
+        raise unknown("split", split, samplings)
+    presets, ranges = samplings[split]
     digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = module.DEFAULTS | module.PRESETS[presets[_below(own, len(presets))]]
@@ -105,8 +66,8 @@ def sample(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[s
             theta[name] = ranges[name][_below(own, len(ranges[name]))]
         elif name in ranges:
             theta[name] = _between(own, *ranges[name])
-        elif name in spans:
-            low, high = spans[name]
+        elif name in module.SPANS:
+            low, high = module.SPANS[name]
             away = _JITTER * (high - low)
             theta[name] = _between(own, max(value - away, low), min(value + away, high))
         elif isinstance(value, float):
@@ -122,40 +83,94 @@ def _between(key: jax.Array, low: float, high: float) -> float:
     return float(jax.random.uniform(key, (), minval=low, maxval=high))
 
 
-def build(layout: Layout, teammate: dict[str, Any], slot: int = TEAMMATE, noise: Noise = "seeded") -> Policy:
-    """The policy of a task's teammate entry.
+def build(
+    layout: Layout,
+    teammate: dict[str, Any],
+    slot: int = TEAMMATE,
+    noise: Noise = "seeded",
+    suite: Path | None = None,
+) -> Policy:
+    """The policy of a task's teammate entry; learned ones act greedily.
+
+    Args:
+        layout: the kitchen.
+        teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.tasks.Task`.
+        slot: 0 or 1, the agent it plays.
+        noise: of heuristics, see `base.Noise`.
+        suite: the folder that checkpoints are in: a suite's, or a release's.
 
     Raises:
         UnknownNameError: for a family that does not exist.
-        TaskFormatError: for unknown or missing parameters and impossible values; names them.
+        TaskFormatError: for unknown or missing parameters, values out of range, and slots other than 0 and 1.
+        OptionError: for a checkpoint that is missing or does not fit the layout.
     """
+    if slot not in (EGO, TEAMMATE):
+        raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
+    if teammate.get("kind") == "rl":
+        return learned.build_entry(layout, teammate, suite)
+    check_theta(teammate)
     module = _module(teammate["family"])
-    theta = teammate["theta"]
+    init, act = _functions(module, layout, slot, noise)
+    return module.build(layout, teammate["theta"], slot, noise)._replace(init=init, act=act)
+
+
+def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
+    """The teammate of a history, as it played.
+
+    Raises:
+        OptionError: if the release does not hold the teammate's checkpoint.
+    """
+    entry = dataset.recover_teammate(history_id)
+    layout = get_layout(dataset.index.entry(history_id).layout)
+    return build(layout, entry, entry.get("slot", TEAMMATE), entry.get("noise", "seeded"), dataset.root)
+
+
+@lru_cache(maxsize=64)
+def _functions(module, layout: Layout, slot: int, noise: Noise) -> tuple[Callable, Callable]:
+    """The same functions for all teammates of a family, so that they share compilations."""
+    policy = module.build(layout, module.DEFAULTS, slot, noise)
+    return policy.init, policy.act
+
+
+def check_theta(teammate: dict[str, Any]) -> None:
+    """Whether a heuristic's entry has every parameter, no other, and each within its range.
+
+    Raises:
+        UnknownNameError: for a family that does not exist.
+        TaskFormatError: names the parameters, what was found and what was expected.
+    """
+    module, theta = _module(teammate["family"]), teammate["theta"]
     if set(theta) != set(module.DEFAULTS):
         raise TaskFormatError(
             f"teammate {teammate['family']}: missing parameters {sorted(set(module.DEFAULTS) - set(theta))}, "
             f"unknown parameters {sorted(set(theta) - set(module.DEFAULTS))}"
         )
-    wrong = {name: value for name, value in theta.items() if not _possible(module, name, value)}
+    wrong = [
+        f"{name} = {value!r} (expected {_expected(module, name)})"
+        for name, value in theta.items()
+        if not _possible(module, name, value)
+    ]
     if wrong:
-        raise TaskFormatError(f"teammate {teammate['family']}: impossible parameters {_in_words(module, wrong)}")
-    return module.build(layout, theta, slot, noise)
+        raise TaskFormatError(f"teammate {teammate['family']}: out of range: {', '.join(wrong)}")
 
 
 def _possible(module, name: str, value: Any) -> bool:
     if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
         return False
-    number, choices = float(value), _CHOICES.get(module.KIND, {}).get(name, math.inf)
-    return isinstance(module.DEFAULTS[name], float) or (number.is_integer() and 0 <= number < choices)
+    whole = isinstance(module.DEFAULTS[name], float) or float(value).is_integer()
+    return whole and 0 <= float(value) <= _highest(module, name)
 
 
-def _in_words(module, wrong: dict[str, Any]) -> str:
-    def expected(name: str) -> str:
-        choices = _CHOICES.get(module.KIND, {}).get(name)
-        whole = "a whole number from 0" if isinstance(module.DEFAULTS[name], int) else "a number"
-        return f"one of 0..{choices - 1}" if choices else whole
+def _highest(module, name: str) -> float:
+    if name in module.CHOICES:
+        return module.CHOICES[name] - 1
+    return math.inf if name in module.UNBOUNDED else 1.0
 
-    return ", ".join(f"{name} = {value!r} (expected {expected(name)})" for name, value in wrong.items())
+
+def _expected(module, name: str) -> str:
+    kind = "a whole number" if isinstance(module.DEFAULTS[name], int) else "a number"
+    highest = _highest(module, name)
+    return f"{kind} from 0" if math.isinf(highest) else f"{kind} in 0..{highest:g}"
 
 
 def _module(family: str):

@@ -48,6 +48,9 @@ PRESETS: dict[str, dict[str, float]] = {
 CHOICES: dict[str, int] = {"split_mode": 3, "behavior_mode": 6}
 """Parameters that are one of 0..n-1."""
 
+UNBOUNDED = frozenset({"shared_margin"})
+"""Parameters without an upper limit; the others are in 0..1, or one of `CHOICES`."""
+
 TRAIN = Sampling(
     ("default", "flexible"),
     {"split_mode": [0, 1], "strictness": (0.0, 0.3), "shared_margin": [1, 2, 3], "rescue_threshold": (0.2, 0.4)},

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from generation.teammates.base import Noise, Policy, first_key, next_key
+from generation.teammates.base import Noise, Policy, Sampling, first_key, next_key
 from generation.teammates.paths import UNREACHABLE, Paths, Scene
 from icrl4aht_data.benchmark import STAY
 from icrl4aht_data.overcooked.layouts import Layout
@@ -63,6 +63,45 @@ PRESETS: dict[str, dict[str, float]] = {
     "distance_sensitive": {"dist_weight": 1.0, "inertia": 0.3, "counter_preference": 0.5},
 }
 """Preset -> what differs from the defaults."""
+
+CHOICES: dict[str, int] = {}
+UNBOUNDED = frozenset(name for name in DEFAULTS if name not in ("inertia", "counter_preference"))
+"""Parameters without an upper limit; the others are in 0..1."""
+
+TRAIN = Sampling(
+    ("default", "delivery_focused"),
+    {
+        "w_deliver": (8.0, 18.0),
+        "w_pickup_cooked": (6.0, 14.0),
+        "w_add_ingredient": (3.0, 8.0),
+        "dist_weight": (0.2, 0.7),
+        "inertia": (0.1, 0.5),
+    },
+)
+TEST = Sampling(
+    ("prep_focused", "high_inertia", "distance_sensitive"),
+    {
+        "w_deliver": (5.0, 12.0),
+        "w_pickup_cooked": (3.0, 8.0),
+        "w_add_ingredient": (7.0, 12.0),
+        "dist_weight": (0.6, 1.2),
+        "inertia": (0.5, 0.9),
+    },
+)
+SPANS: dict[str, tuple[float, float]] = {
+    "w_deliver": (5.0, 20.0),
+    "w_pickup_cooked": (3.0, 15.0),
+    "w_get_plate": (2.0, 10.0),
+    "w_add_ingredient": (3.0, 12.0),
+    "w_fetch_ingredient": (2.0, 10.0),
+    "w_stage_on_counter": (0.5, 5.0),
+    "w_start_cooking": (3.0, 15.0),
+    "w_press_L": (1.0, 8.0),
+    "dist_weight": (0.1, 1.5),
+    "inertia": (0.0, 1.0),
+    "counter_preference": (0.0, 1.0),
+}
+"""Full ranges of the parameters that a sampler jitters around a preset."""
 
 DELIVER, PICK_UP, PLATE_UP, ADD, FETCH, STAGE, START, PRESS = range(8)
 

@@ -75,6 +75,13 @@ def pack(state: State) -> Array:
     return xp.concat([*state[:3], *single, *state[5:]], axis=-1)
 
 
+def swapped(record: Array) -> Array:
+    """The same records with the two agents exchanged: uint8 (B, S); the ego's view of it is the teammate's."""
+    order = np.arange(record.shape[-1])
+    order[:6] = 1, 0, 3, 2, 5, 4  # positions, facings, hands
+    return record[..., order]
+
+
 def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Array:
     """The record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
 

@@ -1,0 +1,81 @@
+"""What the benchmark leaves an ego to do: the reference egos on every test task."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.progress import Progress
+
+from baselines.agents import get_agent
+from baselines.evaluate import evaluate, get_protocol
+from baselines.report import CARDS, HEURISTICS, LAYOUTS, Run, as_run, has_headroom
+from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.tasks import manifest_path, read_tasks
+
+REFERENCES = ("stay", "random", "oracle")
+
+
+def measure(out: Path, protocols: Sequence[str], bars: Progress) -> list[Run]:
+    """Evaluate every reference ego under every protocol, resumably, into out/<protocol>/<agent>."""
+    tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
+    runs = []
+    for protocol in protocols:
+        for agent in REFERENCES:
+            bar = bars.add_task(f"{agent}, {protocol}", total=len(tasks))
+            results = evaluate(
+                agent,
+                get_agent(agent),
+                tasks,
+                get_protocol(protocol),
+                out=out / protocol / agent,
+                done=lambda n, bar=bar: bars.advance(bar, n),
+            )
+            runs.append(as_run(results))
+    return runs
+
+
+def write_cards(runs: Sequence[Run], folder: Path = CARDS) -> list[Path]:
+    """headroom.json (protocol -> layout -> family -> agent -> mean return) and headroom.md."""
+    table: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for run in runs:
+        for layout, family in run.cells:
+            cell = table.setdefault(run.protocol, {}).setdefault(layout, {}).setdefault(family, {})
+            cell[run.agent] = round(float(run.means((layout, family)).mean()), 3)
+    paths = [folder / "headroom.json", folder / "headroom.md"]
+    paths[0].write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    paths[1].write_text(_markdown(table), encoding="utf-8")
+    return paths
+
+
+def _markdown(table: dict[str, dict[str, dict[str, dict[str, float]]]]) -> str:
+    lines = [
+        "# Headroom: what an ego can change",
+        "",
+        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the",
+        "published test instances. **bold**: the oracle gets more than staying does; elsewhere no reference ego can",
+        "raise the return, so a method's score there says nothing about adaptation.",
+    ]
+    for protocol, layouts in table.items():
+        names = [layout for layout in LAYOUTS if layout in layouts]
+        lines += [
+            "",
+            f"## Protocol `{protocol}`",
+            "",
+            f"| family | {' | '.join(names)} |",
+            "|---|" + "---|" * len(names),
+        ]
+        for family in HEURISTICS:
+            cells = [layouts[layout].get(family) for layout in names]
+            lines.append(f"| {family} | {' | '.join(_cell(cell) for cell in cells)} |")
+        flat = [f"{n}/{f}" for n in names for f in HEURISTICS if f in layouts[n] and not has_headroom(layouts[n][f])]
+        lines += ["", f"No headroom: {', '.join(flat) or 'none'}."]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(references: dict[str, float] | None) -> str:
+    if references is None:
+        return ""
+    text = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
+    return f"**{text}**" if has_headroom(references) else text

@@ -1,0 +1,168 @@
+"""A whole suite of learned teammates, and what it looks like."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from generation.diversity import actions_on_common_states, between_families, hamming
+from generation.figures import plot_matrix
+from generation.profiles import Profile
+from generation.progress import progress
+from generation.select import Selection, make_tasks, select, write_manifests
+from generation.suite import Run, checkpoints, is_finished, play_matrix, train
+from generation.teammates import learned
+from generation.teammates.instances import published_thetas
+from generation.teammates.registry import build
+from icrl4aht_data.benchmark import ALGORITHMS, HEURISTIC_KINDS, TRACKS, track_of, unknown
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+
+
+def build_suite(
+    profile: Profile,
+    suite: Path,
+    layouts: Sequence[str],
+    algorithms: Sequence[str],
+    seed: int,
+    console: Console,
+) -> None:
+    """Train what is unfinished, then write manifests of tasks for every layout that has all its populations."""
+    names = _names(layouts or profile.layouts)
+    for name in algorithms:
+        if name not in ALGORITHMS:
+            raise unknown("algorithm", name, ALGORITHMS)
+    for name in names:
+        for algorithm in algorithms or ALGORITHMS:
+            config = profile.teammates
+            own_seed = seed + 1000 * _place(name) + 100 * ALGORITHMS.index(algorithm)
+            run = Run(get_layout(name), algorithm, config.members, config.ppo, own_seed)
+            _train(run, suite / name / algorithm, console)
+    finished = [name for name in _names([*profile.layouts, *names]) if _complete(suite, name)]
+    config = profile.teammates
+    selections = [
+        select(suite, name, algorithm, config.train, config.heldout, seed)
+        for name in finished
+        for algorithm in ALGORITHMS
+    ]
+    for selection in selections:
+        console.print(_in_words(selection, config.train))
+    for path in write_manifests(suite, selections):
+        console.print(f"wrote {path}")
+
+
+def suite_tasks(profile: Profile, suite: Path) -> list:
+    """The training tasks of every layout of a profile, one for each learned teammate that the filter chose."""
+    config = profile.teammates
+    selections = [
+        select(suite, name, algorithm, config.train, config.heldout)
+        for name in _names(profile.layouts)
+        for algorithm in ALGORITHMS
+    ]
+    return make_tasks(suite, selections, "train")
+
+
+def _names(layouts: Sequence[str]) -> list[str]:
+    return list(dict.fromkeys(get_layout(name).name for name in layouts))
+
+
+def _place(layout: str) -> int:
+    """The layout's number among all, so that every population of a suite has a seed of its own."""
+    every = [name for splits in TRACKS.values() for names in splits.values() for name in names]
+    return list(dict.fromkeys(every)).index(layout)
+
+
+def _complete(suite: Path, layout: str) -> bool:
+    return all((suite / layout / algorithm / "population.json").is_file() for algorithm in ALGORITHMS)
+
+
+def _train(run: Run, folder: Path, console: Console) -> None:
+    label = f"{run.algorithm} on {run.layout.name}"
+    if is_finished(folder, run):
+        console.print(f"{label}: finished before")
+        return
+    last: dict[str, float] = {}
+    with progress(console) as bars:
+        bar = bars.add_task(label, total=run.updates, note="compiling")
+
+        def report(update: int, updates: int, metrics: dict[str, float]) -> None:
+            last.update(metrics)
+            note = f"{metrics['steps_per_second']:,.0f} steps/s, self-play {last.get('self_play', 0.0):.1f}"
+            bars.update(bar, completed=update, note=note)
+
+        train(run, folder, report)
+    console.print(
+        f"{label}: {last['step']:,} steps a member at {last['steps_per_second']:,.0f} steps/s (all tables), "
+        f"last self-play return {last.get('self_play', 0.0):.1f} (400 steps)"
+    )
+
+
+def _in_words(selection: Selection, wanted: int) -> str:
+    few = f"; only {len(selection.train)} of {wanted}" if len(selection.train) < wanted else ""
+    return (
+        f"{selection.algorithm} on {selection.layout}: {selection.good} of {selection.candidates} checkpoints exceed "
+        f"the threshold; {len(selection.train)} for training, {len(selection.heldout)} held out{few}"
+    )
+
+
+def report_diversity(
+    suite: Path, layouts: Sequence[str], algorithms: Sequence[str], greedy: bool, console: Console
+) -> None:
+    """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
+
+    Raises:
+        OptionError: if a population was not finished.
+    """
+    every = dict.fromkeys(name for splits in TRACKS.values() for name in splits["train"])
+    for name in _names(layouts) or [name for name in every if _complete(suite, name)]:
+        layout = get_layout(name)
+        for algorithm in algorithms or ALGORITHMS:
+            _report_population(suite, layout, algorithm, greedy, console)
+        _report_distances(suite, layout, algorithms or ALGORITHMS, console)
+
+
+def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
+    returns = play_matrix(suite, layout, algorithm, greedy)
+    members = [f"m{k}" for k in range(len(returns))]
+    own = np.eye(len(returns), dtype=bool)
+    table = Table(title=f"{algorithm} on {layout.name}: mean return of 20 episodes of 400 steps")
+    table.add_column("seat 0 \\ seat 1")
+    for member in members:
+        table.add_column(member, justify="right")
+    for member, row in zip(members, returns, strict=True):
+        table.add_row(member, *(f"{value:.1f}" for value in row))
+    console.print(table)
+    across = returns[~own].mean() if len(returns) > 1 else float("nan")
+    console.print(
+        f"self-play {returns[own].mean():.1f}, cross-play {across:.1f}, gap {returns[own].mean() - across:.1f}"
+    )
+    path = suite / layout.name / algorithm / "cross_play.png"
+    plot_matrix(returns, members, members, path, f"{algorithm}, {layout.name}: return", ("seat 0", "seat 1"))
+    console.print(f"wrote {path}")
+
+
+def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], console: Console) -> None:
+    policies, families = [], {}
+    for algorithm in algorithms:
+        points = list(checkpoints(suite, layout.name, algorithm))
+        families[algorithm] = range(len(policies), len(policies) + len(points))
+        policies += [learned.build(layout, suite / point.path) for point in points]
+    for kind, short in HEURISTIC_KINDS.items():
+        thetas = published_thetas(layout.name, kind)
+        families[short] = range(len(policies), len(policies) + len(thetas))
+        policies += [build(layout, {"family": kind, "theta": theta}) for theta in thetas]
+    distances = between_families(hamming(actions_on_common_states(layout, policies)), families)
+    table = Table(title=f"{layout.name}: mean Hamming distance of families")
+    table.add_column("")
+    for family in families:
+        table.add_column(family, justify="right")
+    for family, row in zip(families, distances, strict=True):
+        table.add_row(family, *(f"{value:.2f}" for value in row))
+    console.print(table)
+    path = suite / layout.name / "distances.png"
+    labels = list(families)
+    plot_matrix(distances, labels, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
+    console.print(f"wrote {path} ({track_of(layout.name)} track)")

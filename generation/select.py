@@ -1,0 +1,85 @@
+"""From a suite's checkpoints to tasks: the quality filter (paper, App. B.1 "Checkpoint Quality Filtering")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from generation.learners.checkpoint import WEIGHTS
+from generation.suite import Checkpoint, checkpoints
+from icrl4aht_data.benchmark import ALGORITHMS, TRACKS, track_of
+from icrl4aht_data.release import file_hash
+from icrl4aht_data.tasks import Task, make_task, write_tasks
+
+THRESHOLD = 20.0
+"""Returns of 400 steps that a teammate must exceed (paper, App. B.1)."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What the filter left of one population."""
+
+    layout: str
+    algorithm: str
+    candidates: int
+    good: int  # above the threshold
+    train: list[Checkpoint]
+    heldout: list[Checkpoint]
+
+
+def select(suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0) -> Selection:
+    """Draw teammates from the checkpoints whose greedy return exceeds the threshold.
+
+    Greedy, because that is how they will play. Drawn from the sorted list with a fixed seed. Where there are too few
+    for both, the held-out ones are at most a fifth.
+
+    Raises:
+        OptionError: if the population was not finished.
+    """
+    candidates = list(checkpoints(suite, layout, algorithm))
+    good = [point for point in candidates if point.card["greedy_return"] > THRESHOLD]
+    order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
+    apart = min(heldout, max(len(good) - train, len(good) // 5))
+    chosen = [good[k] for k in order]
+    return Selection(layout, algorithm, len(candidates), len(good), chosen[apart : apart + train], chosen[:apart])
+
+
+def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list[Task]:
+    """One task per teammate, each with a seed of its own."""
+    tasks = []
+    for selection in selections:
+        chosen = selection.train if split == "train" else selection.heldout
+        for number, point in enumerate(chosen):
+            entry = _entry(suite, selection.algorithm, number, point)
+            tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed=len(tasks)))
+    return tasks
+
+
+def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[str, Any]:
+    return {
+        "kind": "rl",
+        "family": algorithm,
+        "theta_id": number,
+        "base_seed": point.card["seed"],
+        "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / WEIGHTS)},
+    }
+
+
+def write_manifests(suite: Path, selections: Sequence[Selection]) -> list[Path]:
+    """SUITE/manifests/<track>_train.jsonl and _heldout.jsonl of the tracks that have teammates."""
+    folder = suite / "manifests"
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for track in TRACKS:
+        for split in ("train", "heldout"):
+            own = [selection for selection in selections if track_of(selection.layout) == track]
+            tasks = make_tasks(suite, own, split)
+            if tasks:
+                path = folder / f"{track}_{split}.jsonl"
+                write_tasks(path, tasks)
+                written.append(path)
+    return written
