@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from generation import record
-from generation.collect import METADATA, TEAMMATE_NOISE
+from generation.artefact import METADATA
+from generation.collect import TEAMMATE_NOISE
 from generation.curate import best_streams, relabel
 from generation.learners.checkpoint import load_policy
 from generation.profiles import Profile

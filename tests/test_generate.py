@@ -13,9 +13,10 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from generation import build, collect
+from generation import artefact as artefacts
+from generation import build, collect, run
+from generation.artefact import METADATA
 from generation.cli import cli
-from generation.collect import METADATA
 from generation.learners.checkpoint import load_policy
 from generation.profiles import load_profile
 from icrl4aht_data import load_icrl4aht, verify_release
@@ -102,7 +103,7 @@ def test_a_finished_task_is_not_done_again(built, monkeypatch):
     def never(*arguments):
         raise AssertionError("the task was collected again")
 
-    monkeypatch.setattr(build, "run_task", never)
+    monkeypatch.setattr(run, "run_task", never)
     output = StringIO()
     before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
     build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
@@ -115,15 +116,15 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
     (task,) = profile.tasks()
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
-    assert collect.is_finished(folder, task, profile)
+    assert artefacts.is_finished(folder, task, profile)
     (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
-    assert not collect.is_finished(folder, task, load_profile(str(built / "other.toml")))
+    assert not artefacts.is_finished(folder, task, load_profile(str(built / "other.toml")))
     actions = bytearray((folder / "actions.npy").read_bytes())
     actions[-1] ^= 1
     (folder / "actions.npy").write_bytes(actions)
-    assert not collect.is_finished(folder, task, profile)
+    assert not artefacts.is_finished(folder, task, profile)
     (folder / METADATA).unlink()
-    assert not collect.is_finished(folder, task, profile)
+    assert not artefacts.is_finished(folder, task, profile)
 
 
 def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
