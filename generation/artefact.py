@@ -1,13 +1,13 @@
 """A task's artefact on disk: what is in the folder, when it counts as finished, and how it fills.
 
-    <task_id>/            finished: its hashes hold
-      metadata.json       task, settings, versions, SHA-256 of the files below
-      state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
-      metrics.jsonl       one line per update
-      policy.safetensors policy.json   the final ego
-      timing.jsonl        wall-clock figures, and therefore no part of what is hashed
-    <task_id>.partial/    the same while it fills, and `learner.safetensors`: the state after its last saved update
-    .<task_id>.lock       held by the collector that is at it
+<task_id>/            finished: its hashes hold
+  metadata.json       task, settings, versions, SHA-256 of the files below
+  state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
+  metrics.jsonl       one line per update
+  policy.safetensors policy.json   the final ego
+  timing.jsonl        wall-clock figures, and therefore no part of what is hashed
+<task_id>.partial/    the same while it fills, and `learner.safetensors`: the state after its last saved update
+.<task_id>.lock       held by the collector that is at it
 """
 
 from __future__ import annotations

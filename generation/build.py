@@ -7,12 +7,15 @@ from pathlib import Path
 
 from rich.console import Console
 
+from generation.options import Options
 from generation.package import package
 from generation.profiles import Profile, load_profile
 from generation.progress import progress
-from generation.run import Options, collect_tasks
+from generation.run import collect_tasks
+from icrl4aht_data.index import read_info
 from icrl4aht_data.release import check_replaceable
 from icrl4aht_data.schema import Kind
+from icrl4aht_data.statistics import print_statistics
 from icrl4aht_data.tasks import Task
 
 
@@ -29,7 +32,10 @@ def build_releases(
     for kind in kinds:
         check_replaceable(out / kind)  # before the long work, not after it
     collect_tasks(tasks, profile, out, console, options or Options())
-    return [_pack(out / "artefacts", out / kind, tasks, profile, kind, console) for kind in kinds]
+    releases = [_pack(out / "artefacts", out / kind, tasks, profile, kind, console) for kind in kinds]
+    for release in releases:
+        print_statistics(read_info(release), console)
+    return releases
 
 
 def _pack(artefacts: Path, target: Path, tasks: list[Task], profile: Profile, kind: Kind, console: Console) -> Path:

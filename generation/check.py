@@ -16,6 +16,8 @@ from icrl4aht_data.release import file_hash
 _APART = {TIMING, FAILED}
 """Files that say how a rebuild went, not what it made."""
 
+_TEXT = {".json", ".jsonl", ".md", ".sha256"}
+
 
 @dataclass
 class Comparison:
@@ -67,7 +69,7 @@ def _how(a: Path, b: Path) -> str:
     wrong = np.flatnonzero(np.asarray(ours[:common]) != np.asarray(theirs[:common]))
     first = int(wrong[0]) if len(wrong) else common
     size = f"{sizes[0]} bytes" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} bytes"
-    line = f", line {1 + int(np.count_nonzero(np.asarray(ours[:first]) == ord('\n')))}" if _is_text(a) else ""
+    line = f", line {1 + bytes(ours[:first]).count(10)}" if a.suffix in _TEXT else ""
     return f"{size}, the first difference at byte {first}{line}"
 
 
@@ -79,7 +81,3 @@ def _how_arrays(a: np.ndarray, b: np.ndarray) -> str:
         return "the same array, stored in another way"
     at = tuple(wrong[0].tolist())
     return f"{len(wrong)} of {a.size} values, the first at {at}: {a[at]} and {b[at]}"
-
-
-def _is_text(path: Path) -> bool:
-    return path.suffix in (".json", ".jsonl", ".md", ".sha256")

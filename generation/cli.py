@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from generation.run import EXECUTORS, Executor, Options, ask_for_determinism
+from generation.options import EXECUTORS, Executor, Options, ask_for_determinism
 from icrl4aht_data.cli import run
 from icrl4aht_data.schema import KINDS, Kind
 
@@ -30,7 +30,9 @@ def cli() -> None:
 @click.option("--kind", type=click.Choice(KINDS), multiple=True, default=("lite",), show_default=True)
 @click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
 @click.option("--executor", type=click.Choice(EXECUTORS), default="local", show_default=True)
-@click.option("--address", help="Of a running Ray cluster; by default a Ray on this machine is started for the occasion.")
+@click.option(
+    "--address", help="Of a running Ray cluster; by default a Ray on this machine is started for the occasion."
+)
 @click.option("--workers", type=click.IntRange(min=1), help="Tasks at a time on a Ray of our own; default: all cores.")
 @click.option("--retries", type=click.IntRange(min=0), default=0, show_default=True, help="Of a task that failed.")
 @click.option("--fail-fast", is_flag=True, help="Begin no task after one has failed.")
@@ -47,9 +49,9 @@ def generate(
 ) -> None:
     """Train an ego for every task of a profile, record it, and pack the releases OUT/lite or OUT/full.
 
-    Finished tasks are kept, and an unfinished one goes on from its last saved update, so after a stop or a kill the same
-    command goes on where it was. Tasks that fail are listed in OUT/failed.jsonl; the others are finished, nothing is
-    packed, and the exit code is 1.
+    Finished tasks are kept, and an unfinished one goes on from its last saved update, so after a stop or a kill the
+    same command goes on where it was. Tasks that fail are listed in OUT/failed.jsonl; the others are finished, nothing
+    is packed, and the exit code is 1.
     """
     from generation.build import build_releases
     from generation.package import bundle_release
@@ -89,7 +91,7 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 @click.argument("b", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 def check(a: Path, b: Path, as_json: bool) -> None:
-    """Compare two rebuilds bit for bit: two releases, two artefacts, or two whole folders. Exits with 1 if they differ."""
+    """Compare two rebuilds bit for bit: releases, artefacts, or whole folders. Exits with 1 if they differ."""
     from generation.check import compare
 
     compared = compare(a, b)

@@ -11,8 +11,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from generation.artefact import last_timing
+from generation.options import Options, ask_for_determinism
 from generation.progress import Board
-from generation.run import Job, Options, Outcome, ask_for_determinism
+from generation.run import Job, Outcome
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.tasks import Task
 
@@ -70,8 +71,8 @@ def _outcome(ray: Any, reference: Any, task: Task, options: Options) -> Outcome:
 @contextmanager
 def _connected(options: Options) -> Iterator[Any]:
     if options.address is None:
-        # Read when Ray is first imported. The name is that of its main use; what it does is to take the loopback address
-        # for the machine's, and Ray's servers listen on the machine's address.
+        # Read when Ray is first imported. It is named after its main use; what it does is to take the loopback address
+        # for this machine's, which is where Ray's servers listen.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     elif options.workers is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -16,6 +15,7 @@ from rich.console import Console
 
 from generation.artefact import is_finished, last_timing
 from generation.collect import Report, TaskBusyError, run_task
+from generation.options import Options
 from generation.profiles import Profile
 from generation.progress import Board
 from icrl4aht_data.errors import Icrl4ahtError
@@ -24,31 +24,9 @@ from icrl4aht_data.tasks import Task
 
 FAILED = "failed.jsonl"
 
-Executor = Literal["local", "ray"]
-EXECUTORS: tuple[Executor, ...] = ("local", "ray")
-
 
 class CollectionError(Icrl4ahtError):
     """Some tasks have no finished artefact."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to collect.
-
-    Args:
-        executor: "local" for one task after the other in this process; "ray".
-        address: of a running Ray cluster; a local Ray is started for the occasion by default.
-        workers: of the Ray that is started, and so tasks at a time; one per GPU, or else per core, by default.
-        retries: of a task that failed.
-        fail_fast: whether to begin no task after one has failed.
-    """
-
-    executor: Executor = "local"
-    address: str | None = None
-    workers: int | None = None
-    retries: int = 0
-    fail_fast: bool = False
 
 
 @dataclass(frozen=True)
@@ -184,16 +162,6 @@ class FailureLog:
                 partial = self.path.with_name(f".{self.path.name}.partial")
                 partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")
                 partial.replace(self.path)
-
-
-def ask_for_determinism() -> None:
-    """Have XLA choose only operations that give the same bits in every run; before JAX is first used.
-
-    On a CPU they are; on a GPU they are chosen by measured speed, and some add up in any order.
-    """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_gpu_deterministic_ops" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
 
 
 def _executor(options: Options) -> Execute:

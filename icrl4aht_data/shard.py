@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,8 @@ from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 if TYPE_CHECKING:  # libhdf5 is needed to write and to check, not to read
     import h5py
 
+_Arrays = Mapping[str, np.ndarray]
+
 _DEFLATE_LEVEL = 6
 _CACHE_BYTES = 256 * 2**20
 
@@ -38,7 +40,7 @@ def chunk_table_path(root: Path, shard: str) -> Path:
     return (root / "meta" / "chunks" / Path(shard).relative_to("data")).with_suffix(".npy")
 
 
-def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[dict]) -> None:
+def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[_Arrays]) -> None:
     """Write a shard and its chunk table into a folder that no reader has seen yet.
 
     Args:
@@ -93,19 +95,29 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
         )
 
 
-def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: dict) -> list[int]:
+def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> list[int]:
     """Write every chunk of a history; their checksums, in table order."""
     checksums = []
+    for field, start, data in _encoded(layout, kind, entry, arrays):
+        place = (start, *(0,) * len(field.row_shape(layout)))
+        group[field.name].id.write_direct_chunk(place if entry.h5_row is None else (entry.h5_row, *place), data)
+        checksums.append(zlib.crc32(data))
+    return checksums
+
+
+def stored_bytes(kind: Kind, entry: Entry, arrays: _Arrays) -> int:
+    """What the chunks of a history take in a shard."""
+    return sum(len(data) for _, _, data in _encoded(get_layout(entry.layout), kind, entry, arrays))
+
+
+def _encoded(layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> Iterator[tuple[Field, int, bytes]]:
+    """Every chunk of a history as (field, first row, bytes), in table order."""
     for field in entry.stored_fields(kind):
         element = field.element(layout, kind)
         stored = _as_stored(field, element, arrays[field.name], entry)
         step = min(field.chunk, len(stored))
         for start in range(0, len(stored), step):
-            data = encode_chunk(stored[start : start + step], step, element.itemsize)
-            place = (start, *(0,) * len(field.row_shape(layout)))
-            group[field.name].id.write_direct_chunk(place if entry.h5_row is None else (entry.h5_row, *place), data)
-            checksums.append(zlib.crc32(data))
-    return checksums
+            yield field, start, encode_chunk(stored[start : start + step], step, element.itemsize)
 
 
 def _as_stored(field: Field, element: np.dtype, array: np.ndarray, entry: Entry) -> np.ndarray:
