@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from generation.profiles import Profile
 from icrl4aht_data.benchmark import KEPT_STEPS
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import KINDS, Kind
+from icrl4aht_data.schema import KINDS, TASKS, Kind
 from icrl4aht_data.tasks import Task, read_tasks
 
 _WORTH_MEASURING = 20.0
@@ -129,16 +130,13 @@ def bytes_per_transition(kind: Kind) -> float:
     """Of the bundled release's data, one history of each of its tasks, if packed so."""
     dataset = load_icrl4aht()
     with tempfile.TemporaryDirectory() as folder:
-        new = [
-            NewTask(task, {}, 1, lambda first=_first_history(task): [first])
-            for task in read_tasks(dataset.root / "meta" / "tasks.jsonl")
-        ]
+        new = [NewTask(task, {}, 1, partial(_first_history, task)) for task in read_tasks(dataset.root / TASKS)]
         root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
         shards = sum(path.stat().st_size for path in (root / "data").rglob("*.h5"))
         return shards / sum(entry.T for entry in load_icrl4aht(root).entries)
 
 
-def _first_history(task: Task) -> NewHistory:
+def _first_history(task: Task) -> list[NewHistory]:
     history = load_icrl4aht(task_id=task.task_id)[0]
     names = [field.name for field in history.entry.stored_fields("lite")]
-    return NewHistory(history.entry.env_idx, {name: history.read(name) for name in names})
+    return [NewHistory(history.entry.env_idx, {name: history.read(name) for name in names})]

@@ -122,4 +122,6 @@ def _card(datasets: Sequence[Dataset]) -> str:
         for dataset in datasets
     )
     cards = "\n".join(read_text(dataset.root / "README.md") for dataset in datasets)
-    return f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
+    return (
+        f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
+    )
