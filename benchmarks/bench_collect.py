@@ -17,6 +17,7 @@ import resource
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,10 +63,8 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
 
     with tempfile.TemporaryDirectory() as folder:
         artefact = Path(folder) / task.task_id
-        try:
+        with suppress(_EnoughError):
             run_task(task, profile, artefact, report, save_seconds=save_seconds)
-        except _EnoughError:
-            pass
         return last_timing(artefact) or {}
 
 

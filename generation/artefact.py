@@ -34,6 +34,7 @@ from icrl4aht_data.release import file_hash
 from icrl4aht_data.tasks import Task
 
 METADATA, METRICS, TIMING, LEARNER = "metadata.json", "metrics.jsonl", "timing.jsonl", "learner.safetensors"
+FILTER_CURVES = "filter.png"
 
 _HASHED = {f"{name}.npy" for name in record.Histories._fields} | {METRICS, "policy.safetensors", "policy.json"}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from filelock import FileLock
 from rich.console import Console
 
 from generation.options import Options
@@ -32,7 +33,8 @@ def build_releases(
     for kind in kinds:
         check_replaceable(out / kind)  # before the long work, not after it
     collect_tasks(tasks, profile, out, console, options or Options())
-    releases = [_pack(out / "artefacts", out / kind, tasks, profile, kind, console) for kind in kinds]
+    with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same, before or after
+        releases = [_pack(out / "artefacts", out / kind, tasks, profile, kind, console) for kind in kinds]
     for release in releases:
         print_statistics(read_info(release), console)
     return releases

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from generation.artefact import TIMING
+from generation.artefact import FILTER_CURVES, TIMING
 from generation.run import FAILED
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.release import file_hash
 
-_APART = {TIMING, FAILED}
-"""Files that say how a rebuild went, not what it made."""
+_APART = {TIMING, FAILED, FILTER_CURVES}
+"""Files that say how a rebuild went, and pictures of what it made."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
@@ -31,7 +31,7 @@ class Comparison:
 
 
 def compare(a: Path, b: Path) -> Comparison:
-    """Compare two folders. Wall-clock figures, failures and hidden files are left out.
+    """Compare two folders. Wall-clock figures, failures, pictures and hidden files are left out.
 
     Raises:
         OptionError: if there is nothing to compare.

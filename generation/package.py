@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from generation import record
-from generation.artefact import METADATA
+from generation.artefact import FILTER_CURVES, METADATA
 from generation.collect import TEAMMATE_NOISE
 from generation.curate import best_streams, filter_report, plot_filter, relabel
 from generation.learners.checkpoint import load_policy
@@ -21,9 +21,6 @@ from icrl4aht_data.release import NewHistory, NewTask, folder_in_place_of, write
 from icrl4aht_data.schema import Kind, episode_ends
 from icrl4aht_data.statistics import STREAMS_RECORDED
 from icrl4aht_data.tasks import Task
-
-FILTER_CURVES = "filter.png"
-"""In each artefact: learning curves before and after the stream filter."""
 
 
 def package(

@@ -6,12 +6,12 @@ import json
 import re
 import shutil
 from io import StringIO
-from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
+from tiny import TINY, artefact
 
 from generation import artefact as artefacts
 from generation import build, collect, run
@@ -22,40 +22,6 @@ from generation.profiles import load_profile
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-
-TINY = """
-[ego]
-total_steps = 16_000
-environments = 8
-rollout = 80
-minibatches = 2
-shaping_horizon = 16_000
-widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
-
-[release]
-data_version = "0.0.1"
-keep = 3
-
-[tasks]
-layouts = ["demo_wide"]
-presets = ["default"]
-"""
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory) -> Path:
-    """One task collected and packed both ways by the command."""
-    out = tmp_path_factory.mktemp("built")
-    (out / "tiny.toml").write_text(TINY)
-    arguments = ["generate", "--profile", str(out / "tiny.toml"), "--out", str(out / "a")]
-    result = CliRunner().invoke(cli, [*arguments, "--kind", "lite", "--kind", "full"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return out
-
-
-def artefact(out: Path) -> Path:
-    (folder,) = (path for path in (out / "artefacts").iterdir() if path.is_dir())
-    return folder
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
