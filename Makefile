@@ -3,13 +3,14 @@ PYTHON ?= python3
 PROFILE ?= smoke
 OUT ?= build/$(PROFILE)
 ROOT ?=
+OPTIONS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate verify test check format bench-env bench-eval clean
+.PHONY: help install demo generate verify test check format bench-env bench-eval bench-collect clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -26,8 +27,8 @@ $(STAMP): pyproject.toml
 demo: install ## from nothing to a verified dataset: generate smoke, verify, sample, draw (at most 10 minutes)
 	$(BIN)/python -m generation demo
 
-generate: install ## rebuild a dataset: PROFILE=smoke|mini|paper, OUT=folder
-	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT)
+generate: install ## rebuild a dataset, or go on with it: PROFILE=smoke|mini|paper, OUT=folder, OPTIONS=...
+	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
 verify: install ## verify a release, every byte and the physics: ROOT=folder (default: the bundled mini release)
 	$(BIN)/icrl4aht-data verify --deep $(ROOT)
@@ -49,6 +50,9 @@ bench-env: install ## environment steps/s beside JaxMARL's, JSON lines
 
 bench-eval: install ## evaluation steps/s per teammate family beside the environment alone, JSON lines
 	$(BIN)/python -m benchmarks.bench_eval
+
+bench-collect: install ## collection: speed, memory, bytes a transition beside the paper's format, JSON lines
+	$(BIN)/python -m benchmarks.bench_collect
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

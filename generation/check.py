@@ -34,8 +34,11 @@ def compare(a: Path, b: Path) -> Comparison:
     """Compare two folders. Wall-clock figures, failures, pictures and hidden files are left out.
 
     Raises:
-        OptionError: if there is nothing to compare.
+        OptionError: if one is no folder, or there is nothing to compare.
     """
+    for folder in (a, b):
+        if not folder.is_dir():
+            raise OptionError(f"{folder}: no such folder")
     ours, theirs = _files(a), _files(b)
     result = Comparison(len(ours | theirs))
     if not result.files:

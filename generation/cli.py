@@ -87,8 +87,8 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("a", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.argument("b", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 def check(a: Path, b: Path, as_json: bool) -> None:
     """Compare two rebuilds bit for bit: releases, artefacts, or whole folders. Exits with 1 if they differ."""

@@ -66,3 +66,5 @@ def test_nothing_to_compare(tmp_path):
     (tmp_path / ".hidden").touch()
     with pytest.raises(OptionError, match="no files to compare"):
         compare(tmp_path, tmp_path)
+    with pytest.raises(OptionError, match=r"nowhere: no such folder"):
+        compare(tmp_path, tmp_path / "nowhere")
