@@ -15,15 +15,16 @@ from generation import artefact as artefacts
 from generation import collect
 from generation.artefact import LEARNER, METADATA, METRICS, TIMING, partial_folder
 from generation.check import compare
-from generation.profiles import load_profile
+from generation.profiles import Profile, load_profile
 from generation.snapshot import read_card
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.tasks import Task
 
 COLLECT = """
 import sys, time
 from pathlib import Path
 from generation.collect import run_task
-from generation.profiles import load_profile
+from generation.profiles import Profile, load_profile
 
 def report(update, metrics):
     print(update, flush=True)
@@ -38,6 +39,10 @@ run_task(*profile.tasks(), profile, Path(sys.argv[2]), report, save_seconds=floa
 def task(built):
     profile = load_profile(str(built / "tiny.toml"))
     return profile.tasks()[0], profile
+
+
+def run_task(task: tuple[Task, Profile], *arguments, **options) -> bool:
+    return collect.run_task(task[0], task[1], *arguments, **options)
 
 
 def stop_after(update: int):
@@ -76,9 +81,9 @@ def test_killed_at_three_random_moments_the_artefact_is_the_same(built, tmp_path
 def test_resumed_from_the_last_saved_update(built, task, tmp_path, update):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
-        collect.run_task(*task, folder, stop_after(update), save_seconds=0)
+        run_task(task, folder, stop_after(update), save_seconds=0)
     seen = []
-    collect.run_task(*task, folder, lambda number, metrics: seen.append(number))
+    run_task(task, folder, lambda number, metrics: seen.append(number))
     assert seen == list(range(update, 25))
     assert not compare(folder, artefact(built / "a")).differences
 
@@ -86,15 +91,15 @@ def test_resumed_from_the_last_saved_update(built, task, tmp_path, update):
 def test_what_came_after_the_last_save_is_done_again(built, task, tmp_path):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
-        collect.run_task(*task, folder, stop_after(6), save_seconds=0)
+        run_task(task, folder, stop_after(6), save_seconds=0)
     partial = partial_folder(folder)
     assert (read_card(partial / LEARNER) or {})["updates"] == "6"
     with (partial / METRICS).open("a") as stream:
         stream.write('{"update": 6, "half a li')
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
-    rewards[:, 100:] = 77
+    rewards[:, 180:] = 77  # six updates of 80 steps led to the first 180 that are kept
     rewards.flush()
-    collect.run_task(*task, folder)
+    run_task(task, folder)
     assert not compare(folder, artefact(built / "a")).differences
 
 
@@ -110,9 +115,9 @@ def test_killed_near_the_end(built, task, tmp_path, monkeypatch, moment):
     with monkeypatch.context() as patch:
         patch.setattr(collect, moment, kill)
         with pytest.raises(KeyboardInterrupt):
-            collect.run_task(*task, folder)
+            run_task(task, folder)
     seen = []
-    assert collect.run_task(*task, folder, lambda number, metrics: seen.append(number))
+    assert run_task(task, folder, lambda number, metrics: seen.append(number))
     assert not seen
     assert not compare(folder, artefact(built / "a")).differences
 
@@ -120,7 +125,7 @@ def test_killed_near_the_end(built, task, tmp_path, monkeypatch, moment):
 def test_a_partial_of_other_settings_is_begun_anew(built, task, tmp_path, monkeypatch):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
-        collect.run_task(*task, folder, stop_after(3), save_seconds=0)
+        run_task(task, folder, stop_after(3), save_seconds=0)
     (tmp_path / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 80\nclip = 0.1"))
     firsts = []
 
@@ -131,7 +136,7 @@ def test_a_partial_of_other_settings_is_begun_anew(built, task, tmp_path, monkey
     monkeypatch.setattr(collect, "Writer", writer)
     for profile in (task[1], load_profile(str(tmp_path / "other.toml"))):
         with pytest.raises(KeyboardInterrupt):
-            collect.run_task(task[0], profile, folder)
+            run_task((task[0], profile), folder)
     assert firsts == [3, 0]
 
 
@@ -140,14 +145,14 @@ def test_a_damaged_state_is_named_not_guessed_at(task, tmp_path):
     partial.mkdir()
     (partial / LEARNER).write_bytes(b"junk")
     with pytest.raises(OptionError, match=r"learner\.safetensors: not a state of this learner: .*begin the task anew"):
-        collect.run_task(*task, tmp_path / "task")
+        run_task(task, tmp_path / "task")
 
 
 def test_a_finished_task_is_left_alone(built, task, tmp_path):
     folder = tmp_path / "task"
     shutil.copytree(artefact(built / "a"), folder)
     before = (folder / METADATA).stat().st_mtime_ns
-    assert not collect.run_task(*task, folder, stop_after(0))
+    assert not run_task(task, folder, stop_after(0))
     assert (folder / METADATA).stat().st_mtime_ns == before
 
 

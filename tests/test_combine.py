@@ -16,7 +16,7 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.cli import cli
 from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.errors import FormatTooNewError, OptionError
-from icrl4aht_data.schema import INFO
+from icrl4aht_data.schema import INFO, Kind
 
 _FIELDS = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state")
 
@@ -61,7 +61,8 @@ def test_a_task_in_two_releases_is_refused(parts, tmp_path):
 
 
 def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
-    for name, kind, length in (("a", "lite", 20), ("b", "full", 20), ("c", "lite", 10), ("d", "lite", 20)):
+    cases: list[tuple[str, Kind, int]] = [("a", "lite", 20), ("b", "full", 20), ("c", "lite", 10), ("d", "lite", 20)]
+    for name, kind, length in cases:
         layout = "coord_simple" if name == "a" else "demo_wide"
         random_release(tmp_path / name, kind, (layout,), teammates=1, streams=1, length=length)
     a, b, c, d = (tmp_path / name for name in "abcd")

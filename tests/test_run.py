@@ -42,7 +42,7 @@ def failures(out: Path) -> list[dict]:
 def collect(tasks, out: Path, **options) -> str:
     """What the collection printed."""
     output = StringIO()
-    collect_tasks(*tasks, out, Console(file=output, width=200), Options(**options))
+    collect_tasks(tasks[0], tasks[1], out, Console(file=output, width=200), Options(**options))
     return output.getvalue()
 
 
