@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from rich.text import Text
+
 from generation.artefact import last_timing
 from generation.options import Options, ask_for_determinism
 from generation.progress import Board
@@ -61,11 +63,10 @@ def _work(job: Job, task: Task) -> str:
 def _outcome(ray: Any, reference: Any, task: Task, options: Options) -> Outcome:
     try:
         return Outcome(task, ray.get(reference))
-    except ray.exceptions.RayTaskError as error:
-        cause = error.cause
-        return Outcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", str(error))
-    except ray.exceptions.RayError as error:  # the worker itself is gone
-        return Outcome(task, "failed", options.retries + 1, f"{type(error).__name__}: {error}", str(error))
+    except ray.exceptions.RayError as error:  # what the task raised, or the worker itself is gone
+        cause = getattr(error, "cause", error)
+        trace = Text.from_ansi(str(error)).plain
+        return Outcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
 
 
 @contextmanager
