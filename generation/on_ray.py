@@ -6,7 +6,7 @@ A Ray that is started here listens on 127.0.0.1 only, without dashboard and usag
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,7 +23,7 @@ _POLL_SECONDS = 1.0
 _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the disk; nothing large passes through Ray
 
 
-def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Iterator[Outcome]:
+def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
     """Tasks as workers are free. The artefacts' folder must be the same on every machine.
 
     Raises:
