@@ -6,9 +6,11 @@ A Ray that is started here listens on 127.0.0.1 only, without dashboard and usag
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
+
+from rich.text import Text
 
 from generation.artefact import last_timing
 from generation.options import Options, ask_for_determinism
@@ -21,7 +23,7 @@ _POLL_SECONDS = 1.0
 _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the disk; nothing large passes through Ray
 
 
-def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Iterator[Outcome]:
+def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
     """Tasks as workers are free. The artefacts' folder must be the same on every machine.
 
     Raises:
@@ -61,11 +63,10 @@ def _work(job: Job, task: Task) -> str:
 def _outcome(ray: Any, reference: Any, task: Task, options: Options) -> Outcome:
     try:
         return Outcome(task, ray.get(reference))
-    except ray.exceptions.RayTaskError as error:
-        cause = error.cause
-        return Outcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", str(error))
-    except ray.exceptions.RayError as error:  # the worker itself is gone
-        return Outcome(task, "failed", options.retries + 1, f"{type(error).__name__}: {error}", str(error))
+    except ray.exceptions.RayError as error:  # what the task raised, or the worker itself is gone
+        cause = getattr(error, "cause", error)
+        trace = Text.from_ansi(str(error)).plain
+        return Outcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,10 +62,10 @@ class Job:
 class Execute(Protocol):
     """Does tasks in any order; closing the generator calls off those that are not done."""
 
-    def __call__(self, job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Iterator[Outcome]: ...
+    def __call__(self, job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]: ...
 
 
-def in_process(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Iterator[Outcome]:
+def in_process(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
     """One task after the other."""
     for task in tasks:
         yield _attempt(job, task, board, options.retries + 1)
@@ -75,15 +75,13 @@ def _attempt(job: Job, task: Task, board: Board, attempts: int) -> Outcome:
     def report(update: int, metrics: dict[str, float]) -> None:
         board.running(task.task_id, update + 1, metrics["steps_per_second"])
 
-    for attempt in range(1, attempts):
+    outcome = Outcome(task, "failed")
+    for attempt in range(1, attempts + 1):
         try:
             return Outcome(task, job(task, report), attempt)
-        except Exception:  # tried again; the last attempt's is kept
-            continue
-    try:
-        return Outcome(task, job(task, report), attempts)
-    except Exception as error:
-        return Outcome(task, "failed", attempts, f"{type(error).__name__}: {error}", traceback.format_exc())
+        except Exception as error:  # whatever it is, the other tasks go on
+            outcome = Outcome(task, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
+    return outcome
 
 
 def collect_tasks(tasks: Sequence[Task], profile: Profile, out: Path, console: Console, options: Options) -> None:
@@ -106,7 +104,7 @@ def collect_tasks(tasks: Sequence[Task], profile: Profile, out: Path, console: C
         for wait in (False, True):
             job = Job(profile, artefacts, wait)
             busy: list[Task] = []
-            with closing(execute(job, todo, board, options)) as outcomes:  # type: ignore[type-var]
+            with closing(execute(job, todo, board, options)) as outcomes:
                 for outcome in outcomes:
                     if outcome.status == "busy":
                         console.print(f"{_label(outcome.task, tasks)}: another collector is at it")

@@ -77,14 +77,13 @@ def test_killed_at_three_random_moments_the_artefact_is_the_same(built, tmp_path
     assert not partial_folder(folder).exists()
 
 
-@pytest.mark.parametrize("update", [0, 11, 24])
-def test_resumed_from_the_last_saved_update(built, task, tmp_path, update):
+def test_resumed_from_the_last_saved_update(built, task, tmp_path):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
-        run_task(task, folder, stop_after(update), save_seconds=0)
+        run_task(task, folder, stop_after(11), save_seconds=0)
     seen = []
     run_task(task, folder, lambda number, metrics: seen.append(number))
-    assert seen == list(range(update, 25))
+    assert seen == list(range(11, 25))
     assert not compare(folder, artefact(built / "a")).differences
 
 
@@ -103,22 +102,25 @@ def test_what_came_after_the_last_save_is_done_again(built, task, tmp_path):
     assert not compare(folder, artefact(built / "a")).differences
 
 
-@pytest.mark.parametrize("moment", ["_learn", "finish", "publish"])
-def test_killed_near_the_end(built, task, tmp_path, monkeypatch, moment):
-    folder, original = tmp_path / "task", getattr(collect, moment)
+def test_killed_after_the_last_update(built, task, tmp_path, monkeypatch):
+    folder = tmp_path / "task"
 
     def kill(*arguments):
-        if moment != "publish":
-            original(*arguments)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(collect, moment, kill)
+        patch.setattr(collect, "finish", kill)
         with pytest.raises(KeyboardInterrupt):
             run_task(task, folder)
-    seen = []
-    assert run_task(task, folder, lambda number, metrics: seen.append(number))
-    assert not seen
+    assert run_task(task, folder, kill)
+    assert not compare(folder, artefact(built / "a")).differences
+
+
+def test_killed_before_it_got_its_name(built, task, tmp_path):
+    folder = tmp_path / "task"
+    shutil.copytree(artefact(built / "a"), partial_folder(folder))
+    (partial_folder(folder) / LEARNER).write_bytes(b"no longer needed")
+    assert run_task(task, folder)
     assert not compare(folder, artefact(built / "a")).differences
 
 
