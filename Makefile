@@ -4,13 +4,14 @@ PROFILE ?= smoke
 OUT ?= build/$(PROFILE)
 ROOT ?=
 PEER ?=
+OPTIONS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify test check format bench-env bench-eval bench-learner bench-loader clean
+.PHONY: help install demo generate teammates verify test check format bench-env bench-eval bench-learner bench-collect bench-loader clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -27,8 +28,8 @@ $(STAMP): pyproject.toml
 demo: install ## from nothing to a verified dataset: generate smoke, verify, sample, draw (at most 10 minutes)
 	$(BIN)/python -m generation demo
 
-generate: install ## rebuild a dataset: PROFILE=smoke|mini|paper, OUT=folder
-	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT)
+generate: install ## rebuild a dataset, or go on with it: PROFILE=smoke|mini|paper, OUT=folder, OPTIONS=...
+	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
 teammates: install ## train the suite of learned teammates: PROFILE=smoke|mini|paper
 	$(BIN)/python -m generation teammates --profile $(PROFILE)
@@ -59,6 +60,9 @@ bench-loader: install ## batches/s of every way of holding data beside readers o
 
 bench-learner: install ## self-play learning steps/s beside JaxMARL's IPPO: PEER=ippo_rnn_overcooked_v2.py of its repository
 	$(BIN)/python -m benchmarks.bench_learner --peer $(PEER)
+
+bench-collect: install ## collection: speed, memory, bytes a transition beside the paper's format, JSON lines
+	$(BIN)/python -m benchmarks.bench_collect
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -2,7 +2,8 @@
 
 The peer is JaxMARL's `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which its package does not contain: give the path of
 a copy. Both learn on the same map with the same network, environments and hyper-parameters, in turn in one process.
-What the peer imports only to log and to read its configuration (hydra, omegaconf, wandb) is left out.
+What the peer imports only to log and to read its configuration (hydra, omegaconf, wandb) is left out; it also needs
+distrax, from the extra `peers`.
 """
 
 from __future__ import annotations

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import click
 from rich.console import Console
 
+from generation.options import EXECUTORS, Executor, Options, ask_for_determinism
 from icrl4aht_data.cli import run
 from icrl4aht_data.schema import KINDS, Kind
 
@@ -27,21 +29,80 @@ def cli() -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for artefacts and releases.")
 @click.option("--kind", type=click.Choice(KINDS), multiple=True, default=("lite",), show_default=True)
 @click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
-def generate(profile_name: str, out: Path, kind: tuple[Kind, ...], bundle: bool) -> None:
+@click.option("--executor", type=click.Choice(EXECUTORS), default="local", show_default=True)
+@click.option(
+    "--address", help="Of a running Ray cluster; by default a Ray on this machine is started for the occasion."
+)
+@click.option("--workers", type=click.IntRange(min=1), help="Tasks at a time on a Ray of our own; default: all cores.")
+@click.option("--retries", type=click.IntRange(min=0), default=0, show_default=True, help="Of a task that failed.")
+@click.option("--fail-fast", is_flag=True, help="Begin no task after one has failed.")
+def generate(
+    profile_name: str,
+    out: Path,
+    kind: tuple[Kind, ...],
+    bundle: bool,
+    executor: Executor,
+    address: str | None,
+    workers: int | None,
+    retries: int,
+    fail_fast: bool,
+) -> None:
     """Train an ego for every task of a profile, record it, and pack the releases OUT/lite or OUT/full.
 
-    Finished tasks are kept: after a stop, the same command goes on with the first unfinished one.
+    Finished tasks are kept, and an unfinished one goes on from its last saved update, so after a stop or a kill the
+    same command goes on where it was. Tasks that fail are listed in OUT/failed.jsonl; the others are finished, nothing
+    is packed, and the exit code is 1.
     """
     from generation.build import build_releases
     from generation.package import bundle_release
 
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
-    releases = dict(zip(kind, build_releases(profile_name, out, kind, console), strict=True))
+    if executor == "local" and (address or workers):
+        raise click.UsageError("--address and --workers need --executor ray")
+    ask_for_determinism()
+    options = Options(executor, address, workers, retries, fail_fast)
+    releases = dict(zip(kind, build_releases(profile_name, out, kind, console, options), strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
         console.print(f"bundled: {bundle_release(releases['lite'])}")
+
+
+@cli.command()
+@_profile
+@click.option("--devices", type=click.IntRange(min=1), default=8, show_default=True, help="The N of the last lines.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+def plan(profile_name: str, devices: int, as_json: bool) -> None:
+    """Say what a rebuild will cost: tasks, environment steps, disk, and hours at this machine's measured speed."""
+    from generation.plan import cost
+    from generation.profiles import load_profile
+
+    costs = cost(load_profile(profile_name), devices)
+    if as_json:
+        click.echo(json.dumps(costs.to_json(), indent=2))
+    else:
+        for name, value in costs.in_words():
+            click.echo(f"{name:<28} {value}")
+
+
+@cli.command()
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+def check(a: Path, b: Path, as_json: bool) -> None:
+    """Compare two rebuilds bit for bit: releases, artefacts, or whole folders. Exits with 1 if they differ."""
+    from generation.check import compare
+
+    compared = compare(a, b)
+    if as_json:
+        click.echo(json.dumps(compared.to_json(), indent=2))
+    else:
+        for name, how in compared.differences.items():
+            click.echo(f"{name}: {how}")
+        verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+        click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
+    sys.exit(1 if compared.differences else 0)
 
 
 @cli.command()

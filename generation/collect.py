@@ -1,45 +1,53 @@
-"""One task -> one finished artefact folder: histories, final ego, metrics, metadata.
+"""One task -> one finished artefact, whatever happens on the way.
 
-The folder appears under its name only when it is complete, and is taken for finished only if its hashes hold.
+The learner's state is saved every so often, after the histories it has led to; a killed task goes on from there, and
+since an update is a pure function of that state, the artefact is bit for bit that of an uninterrupted run.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from filelock import FileLock, Timeout
 
-from generation import record
+from generation.artefact import (
+    LEARNER,
+    Writer,
+    finish,
+    is_finished,
+    lock_file,
+    partial_folder,
+    publish,
+    resumable_settings,
+)
 from generation.env import Environment
-from generation.learners.checkpoint import save_policy
+from generation.learners.checkpoint import write_policy
 from generation.learners.ego import Learner, compiled_update
 from generation.profiles import Profile
+from generation.snapshot import load_state, read_card, save_state
 from generation.teammates.base import Noise
 from generation.teammates.registry import build
 from icrl4aht_data.benchmark import TEAMMATE
-from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.files import parse_json, read_text
-from icrl4aht_data.release import file_hash
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.tasks import Task
-
-METADATA = "metadata.json"
 
 TEAMMATE_NOISE: Noise = "seeded"
 """Heuristic teammates of training histories draw from each episode's own key."""
 
-_FILES = {f"{name}.npy" for name in record.Histories._fields} | {"metrics.jsonl", "policy.safetensors", "policy.json"}
+SAVE_SECONDS = 30.0
+"""Between two saves: what a kill can cost."""
 
 Report = Callable[[int, dict[str, float]], None]
 """Called after each update with its number and metrics."""
+
+
+class TaskBusyError(OptionError):
+    """Another process is at this task."""
 
 
 def make_learner(task: Task, profile: Profile) -> Learner:
@@ -48,87 +56,85 @@ def make_learner(task: Task, profile: Profile) -> Learner:
     return Learner(Environment(task.layout), mate, profile.ego)
 
 
-def is_finished(folder: Path, task: Task, profile: Profile) -> bool:
-    """Whether the folder holds this task's artefact under these settings, every file as it was written."""
-    try:
-        metadata = parse_json(read_text(folder / METADATA))
-        same = (
-            metadata["task"] == asdict(task)
-            and metadata["ego_hash"] == profile.ego_hash
-            and metadata["code_version"] == version("icrl4aht-data")
-            and set(metadata["files"]) == _FILES
-        )
-        return same and all(file_hash(folder / name) == digest for name, digest in metadata["files"].items())
-    except (IndexFormatError, OSError, KeyError, TypeError):
-        return False
+def run_task(
+    task: Task,
+    profile: Profile,
+    folder: Path,
+    report: Report = lambda update, metrics: None,
+    *,
+    wait: bool = False,
+    save_seconds: float = SAVE_SECONDS,
+) -> bool:
+    """Train the ego of a task and record its histories into `folder`, from the last saved update if there is one.
 
+    Args:
+        wait: for another process that is at this task, rather than leaving it to that.
+        save_seconds: least time between two saves of the learner's state.
 
-def run_task(task: Task, profile: Profile, folder: Path, report: Report = lambda update, metrics: None) -> None:
-    """Train the ego of a task from scratch and record its histories into `folder`.
+    Returns:
+        Whether there was anything to do; False if the artefact was finished before.
 
     Raises:
-        OptionError: if another process is at this task.
+        TaskBusyError: if another process is at this task.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=0):
-            _run(task, profile, folder, report)
+        with FileLock(lock_file(folder), timeout=-1 if wait else 0):
+            if is_finished(folder, task, profile):
+                return False
+            _run(task, profile, folder, report, save_seconds)
+            return True
     except Timeout as error:
-        raise OptionError(
+        raise TaskBusyError(
             f"{folder}: another process is collecting this task; wait for it, or give another --out"
         ) from error
 
 
-def _run(task: Task, profile: Profile, folder: Path, report: Report) -> None:
-    partial = folder.with_name(f"{folder.name}.partial")
+def _run(task: Task, profile: Profile, folder: Path, report: Report, save_seconds: float) -> None:
+    partial = partial_folder(folder)
+    if not is_finished(partial, task, profile):  # else it was killed just before it got its name
+        _learn(task, profile, partial, report, save_seconds)
+        finish(partial, task, profile)
+    publish(partial, folder)
+
+
+def _learn(task: Task, profile: Profile, partial: Path, report: Report, save_seconds: float) -> None:
+    learner, card = make_learner(task, profile), resumable_settings(task, profile)
+    state, first = _state(learner, task, partial, card)
+    update = compiled_update(learner)
+    writer = Writer(partial, task, profile.ego, first)
+    waiting: Any = None  # the last roll-out is written while the next one runs
+    saved = time.monotonic()
+
+    def write(number: int, rollout: Any, metrics: Any) -> None:
+        report(number, writer.write(number, rollout, metrics))
+
+    try:
+        for number in range(first, profile.ego.updates):
+            state, rollout, metrics = update(state)
+            if waiting is not None:
+                write(*waiting)
+            waiting = number, rollout, metrics
+            if number + 1 == profile.ego.updates or time.monotonic() - saved >= save_seconds:
+                write(*waiting)
+                waiting = None
+                writer.sync()
+                began = time.perf_counter()
+                save_state(partial / LEARNER, state, card | {"updates": str(number + 1)})
+                writer.count(time.perf_counter() - began)
+                saved = time.monotonic()
+    finally:
+        writer.close()
+    steps = profile.ego.updates * profile.ego.steps_per_update
+    write_policy(partial, learner.network, state.params, {"task_id": task.task_id, "steps": steps})
+
+
+def _state(learner: Learner, task: Task, partial: Path, card: dict[str, str]) -> tuple[Any, int]:
+    """The learner's state and the number of updates it has had: as saved under the same settings, or new."""
+    init, key = jax.jit(learner.init), jax.random.key(task.seed)
+    saved = read_card(partial / LEARNER)
+    if saved is not None and card | {"updates": saved.get("updates")} == saved:
+        return load_state(partial / LEARNER, jax.eval_shape(init, key)), int(saved["updates"])
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    learner = make_learner(task, profile)
-    histories = record.Histories(
-        **{
-            name: np.lib.format.open_memmap(partial / f"{name}.npy", "w+", dtype, shape)
-            for name, (shape, dtype) in record.shapes(task.layout, profile.ego).items()
-        }
-    )
-    state = jax.jit(learner.init)(jax.random.key(task.seed))
-    update = compiled_update(learner)
-    started = time.perf_counter()
-    with (partial / "metrics.jsonl").open("w", encoding="utf-8") as log:
-        for number in range(profile.ego.updates):
-            state, rollout, metrics = update(state)
-            record.keep(histories, number, rollout)
-            line = _metrics_line(number, metrics, profile, time.perf_counter() - started)
-            log.write(json.dumps(line) + "\n")
-            report(number, line)
-    for array in histories:
-        array.flush()  # type: ignore[attr-defined]
-    save_policy(
-        partial,
-        learner.network,
-        state.params,
-        {"task_id": task.task_id, "steps": profile.ego.updates * profile.ego.steps_per_update},
-    )
-    _finish(partial, folder, task, profile)
-
-
-def _metrics_line(number: int, metrics: dict[str, Any], profile: Profile, seconds: float) -> dict[str, float]:
-    values = {name: float(value) for name, value in metrics.items()}
-    if not values["episodes"]:
-        del values["return"]
-    step = (number + 1) * profile.ego.steps_per_update
-    return {"update": number, "step": step, "steps_per_second": round(step / seconds, 1), **values}
-
-
-def _finish(partial: Path, folder: Path, task: Task, profile: Profile) -> None:
-    files = {path.name: file_hash(path) for path in sorted(partial.iterdir())}
-    metadata = {
-        "task": asdict(task),
-        "profile": profile.name,
-        "ego": asdict(profile.ego),
-        "ego_hash": profile.ego_hash,
-        "code_version": version("icrl4aht-data"),
-        "files": files,
-    }
-    (partial / METADATA).write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+    return init(key), 0

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,9 +12,19 @@ import numpy as np
 
 from generation.learners.network import ActorCritic
 from icrl4aht_data.benchmark import EGO, KEPT_STEPS
+from icrl4aht_data.figures import plot_curves
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.schema import stream_score
+from icrl4aht_data.schema import curve_ends, stream_score
+
+
+def stream_returns(rewards: np.ndarray) -> np.ndarray:
+    """float64 (N, E): the return of every episode's kept steps.
+
+    Args:
+        rewards: (N, T).
+    """
+    return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
 
 def best_streams(rewards: np.ndarray, keep: int) -> np.ndarray:
@@ -22,17 +33,37 @@ def best_streams(rewards: np.ndarray, keep: int) -> np.ndarray:
     Args:
         rewards: (N, T).
     """
-    returns = rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
-    return np.argsort(-stream_score(returns), kind="stable")[:keep]
+    return np.argsort(-stream_score(stream_returns(rewards)), kind="stable")[:keep]
 
 
-def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarray) -> Iterator[np.ndarray]:
+def filter_report(rewards: np.ndarray, streams: np.ndarray) -> dict[str, dict[str, float]]:
+    """Mean returns at the start and at the end of learning, before the filter and after it."""
+    returns = stream_returns(rewards)
+    report = {}
+    for name, part in (("before", returns), ("after", returns[streams])):
+        start, end = curve_ends(part)
+        report[name] = {
+            "streams": len(part),
+            "return_start": round(float(start.mean()), 3),
+            "return_end": round(float(end.mean()), 3),
+        }
+    return report
+
+
+def plot_filter(path: Path, title: str, rewards: np.ndarray, streams: np.ndarray) -> None:
+    """The learning curves of all streams and of the chosen ones, into a PNG."""
+    returns = stream_returns(rewards)
+    curves = {f"before: {len(returns)} streams": returns, f"after: {len(streams)} streams": returns[streams]}
+    plot_curves(path, [(title, curves)])
+
+
+def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """What the final checkpoint would do, greedily, at every step of each stream.
 
     Its recurrent state starts from zero at each episode and is carried through it.
 
     Args:
-        states: uint8 (N, T, S).
+        states: uint8 (T, S) of each stream.
 
     Yields:
         int8 (T,) for each stream.

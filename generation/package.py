@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from generation import record
-from generation.collect import METADATA, TEAMMATE_NOISE
-from generation.curate import best_streams, relabel
+from generation.artefact import FILTER_CURVES, METADATA
+from generation.collect import TEAMMATE_NOISE
+from generation.curate import best_streams, filter_report, plot_filter, relabel
 from generation.learners.checkpoint import load_policy
 from generation.profiles import Profile
 from icrl4aht_data.benchmark import KEPT_STEPS, TEAMMATE
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.release import NewHistory, NewTask, folder_in_place_of, write_release
 from icrl4aht_data.schema import Kind, episode_ends
+from icrl4aht_data.statistics import STREAMS_RECORDED
 from icrl4aht_data.tasks import Task
 
 
@@ -43,26 +45,33 @@ def bundle_release(release: Path) -> Path:
 
 def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
     metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+    rewards = np.load(folder / "rewards.npy", mmap_mode="r")
+    streams = best_streams(rewards, profile.keep)
+    plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
     provenance = {
         "profile": metadata["profile"],
+        "profile_hash": profile.hash,
         "ego": metadata["ego"],
         "ego_hash": metadata["ego_hash"],
         "code_version": metadata["code_version"],
+        "jax_version": metadata["jax_version"],
+        "platform": metadata["platform"],
+        "seed": task.seed,
         "teammate": {"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
-        "streams_recorded": metadata["ego"]["environments"],
+        STREAMS_RECORDED: metadata["ego"]["environments"],
         "streams_kept": profile.keep,
+        "filter": filter_report(rewards, streams),
         "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
     }
-    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, profile))
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams))
 
 
-def _histories(folder: Path, task: Task, profile: Profile) -> Iterator[NewHistory]:
+def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHistory]:
     arrays = record.Histories(
         **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in record.Histories._fields}
     )
-    streams = best_streams(np.asarray(arrays.rewards), profile.keep)
     network, params, _ = load_policy(folder)
-    labels = relabel(task.layout, network, params, arrays.state[streams])
+    labels = relabel(task.layout, network, params, (arrays.state[stream] for stream in streams))
     dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)
     for stream, expert in zip(streams, labels, strict=True):
         recorded = {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}

@@ -24,18 +24,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from filelock import FileLock, Timeout
-from safetensors import safe_open
 
 from generation import cross_play
 from generation.env import Environment
 from generation.figures import plot_training
 from generation.learners.brdiv import BRDiv
-from generation.learners.checkpoint import WEIGHTS, load_policy, load_state, save_policy, save_state
+from generation.learners.checkpoint import WEIGHTS, load_policy, save_policy
 from generation.learners.comedi import CoMeDi
 from generation.learners.fcp import FCP
 from generation.learners.lbrdiv import LBRDiv
 from generation.learners.population import Population, PopulationState
 from generation.learners.ppo import PPOConfig
+from generation.snapshot import load_state, read_card, save_state
 from icrl4aht_data.benchmark import ALGORITHMS, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout
@@ -152,11 +152,10 @@ class _Training:
                 f"{self.folder}: holds a finished population of other settings, or with changed files; remove it, or "
                 f"give another --suite"
             )
-        if not path.exists():
+        notes = read_card(path)
+        if notes is None:
             self._log_until(0)
             return 0, None
-        with safe_open(path, framework="numpy") as file:
-            notes = file.metadata()
         if notes["settings_hash"] != self.run.settings_hash:
             raise OptionError(
                 f"{self.folder}: holds an unfinished run of other settings; remove it, or give another --suite"

@@ -196,6 +196,23 @@ def convert(
     click.echo(f"{target}: {form}")
 
 
+@cli.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("releases", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RELEASE...")
+@click.option("--data-version", help="SemVer of the combination; that of the releases by default, if they agree.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+def combine(out: Path, releases: tuple[Path, ...], data_version: str | None, quiet: bool) -> None:
+    """Combine releases of one kind, no two with a task in common, into the release OUT."""
+    from icrl4aht_data.combine import combine_releases
+    from icrl4aht_data.index import read_info
+    from icrl4aht_data.statistics import print_statistics
+
+    combine_releases(out, releases, data_version)
+    if not quiet:
+        click.echo(f"release: {out}")
+        print_statistics(read_info(out), Console())
+
+
 def run(command: click.Command) -> None:
     """Run a command line; what is wrong with the input becomes one line and exit code 1."""
     try:

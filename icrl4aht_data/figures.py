@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,30 +17,43 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    if path.suffix not in (".png", ".svg", ".pdf"):
-        raise OptionError(f"{path}: expected a name that ends in .png, .svg or .pdf")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OptionError("drawing needs matplotlib: pip install icrl4aht-data[plot]") from error
     tasks: dict[str, list[np.ndarray]] = {}
     titles = {}
     for history in dataset:
         entry = history.entry
         tasks.setdefault(entry.task_id, []).append(history.returns())
         titles[entry.task_id] = f"{entry.layout} with {entry.teammate_kind}"
-    columns = min(3, len(tasks))
-    rows = -(-len(tasks) // columns)
-    figure = Figure(figsize=(4.6 * columns, 3.3 * rows), layout="constrained")
-    for number, (task_id, streams) in enumerate(tasks.items(), start=1):
-        axes = figure.add_subplot(rows, columns, number)
+    panels = {}
+    for task_id, streams in tasks.items():
         length = min(map(len, streams))
         returns = np.stack([stream[:length] for stream in streams])
-        episodes = np.arange(1, length + 1)
-        low, high = np.percentile(returns, (10, 90), axis=0)
-        axes.fill_between(episodes, low, high, alpha=0.25, linewidth=0, label="10th to 90th percentile")
-        axes.plot(episodes, returns.mean(axis=0), label=f"mean of {len(streams)} streams")
-        axes.set_title(titles[task_id], fontsize=10)
+        panels[task_id] = {f"mean of {len(streams)} streams": returns}
+    plot_curves(path, [(titles[task_id], curves) for task_id, curves in panels.items()])
+
+
+def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> None:
+    """Panels of learning curves: title, and label -> returns (N streams, E episodes), drawn as mean and band.
+
+    Raises:
+        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
+    """
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise OptionError(f"{path}: expected a name that ends in .png, .svg or .pdf")
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OptionError("drawing needs matplotlib: pip install icrl4aht-data[plot]") from error
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.3 * rows), layout="constrained")
+    for number, (title, curves) in enumerate(panels, start=1):
+        axes = figure.add_subplot(rows, columns, number)
+        for label, returns in curves.items():
+            episodes = np.arange(1, returns.shape[1] + 1)
+            low, high = np.percentile(returns, (10, 90), axis=0)
+            (line,) = axes.plot(episodes, returns.mean(axis=0), label=label)
+            axes.fill_between(episodes, low, high, alpha=0.25, linewidth=0, color=line.get_color())
+        axes.set_title(f"{title} (band: 10th to 90th percentile)", fontsize=9)
         axes.set_xlabel("episode")
         axes.set_ylabel("return of the kept steps")
         axes.grid(alpha=0.3)

@@ -6,17 +6,17 @@ import hashlib
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
 
-from icrl4aht_data.benchmark import ACTIONS, EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import write_json
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -36,8 +36,12 @@ from icrl4aht_data.schema import (
     episode_returns,
     stream_score,
 )
-from icrl4aht_data.shard import write_shard
+from icrl4aht_data.shard import stored_bytes, write_shard
+from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import Task, write_tasks
+
+SHARD_BYTES = 256 * 2**20
+"""The size that shards should have, where there is data enough."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +50,12 @@ class NewHistory:
 
     Args:
         env_idx: stream within the learner's parallel roll-out.
-        arrays: field name -> array for every field of `schema.FIELDS` but `obs`, which is rendered from the state.
+        arrays: field name -> array for every field of `schema.FIELDS` but `obs`, which is rendered from the state. May
+            read on access: a shard's histories are held until it is written.
     """
 
     env_idx: int
-    arrays: dict[str, np.ndarray]
+    arrays: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,7 @@ def write_release(
     card: str,
     kept_steps: int = KEPT_STEPS,
     shard_histories: int = 1024,
+    shard_bytes: int = SHARD_BYTES,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
     """Write a release folder; an existing one at `target` is replaced when the new one is complete.
@@ -91,6 +97,7 @@ def write_release(
         card: README.md of the release.
         kept_steps: steps of every episode.
         shard_histories: at most this many histories a shard.
+        shard_bytes: about how large a shard should be, judged by the first history of each layout.
         done: called when a task's histories have been taken, for progress.
 
     Raises:
@@ -102,7 +109,7 @@ def write_release(
     if not new or len(set(ids)) < len(ids):
         raise OptionError(f"expected at least one task and none twice, found {ids}")
     with folder_in_place_of(target) as partial:
-        _fill(partial, kind, new, data_version, card, kept_steps, shard_histories, done)
+        _fill(partial, kind, new, data_version, card, kept_steps, (shard_histories, shard_bytes), done)
     return target
 
 
@@ -153,7 +160,7 @@ def _fill(
     data_version: str,
     card: str,
     kept_steps: int,
-    shard_histories: int,
+    shard_limits: tuple[int, int],
     done: Callable[[Task], None],
 ) -> None:
     entries: list[Entry] = []
@@ -162,9 +169,12 @@ def _fill(
         groups[new.task.track, new.task.layout.name, new.task.split].append(new)
     for (track, layout, split), members in groups.items():
         histories = (pair for new in members for pair in _loaded(new, done))
-        shards = -(-sum(new.streams for new in members) // shard_histories)
+        first = list(islice(histories, 1))
+        total = sum(new.streams for new in members)
+        shards = _shards(first, total, kind, kept_steps, *shard_limits)
+        histories = chain(first, histories)
         for number in range(shards):
-            part = list(islice(histories, shard_histories))
+            part = list(islice(histories, total * (number + 1) // shards - total * number // shards))
             name = f"data/{track}/{layout}/{split}-{number:05}-of-{shards:05}.h5"
             new = [_entry(task, history, name, kept_steps) for task, history in part]
             new_entries = _placed(new, kind, len(entries))
@@ -175,10 +185,23 @@ def _fill(
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
     write_tasks(root / TASKS, [new.task for new in tasks])
-    write_json(root / PROVENANCE, {new.task.task_id: new.provenance for new in tasks})
-    write_json(root / INFO, describe(kind, data_version, kept_steps, entries))
+    provenance = {new.task.task_id: new.provenance for new in tasks}
+    write_json(root / PROVENANCE, provenance)
+    statistics = layout_statistics(root, entries, [new.task for new in tasks], provenance, kept_steps)
+    write_json(root / INFO, describe(kind, data_version, kept_steps, entries) | {"statistics": statistics})
     (root / "README.md").write_text(card, encoding="utf-8")
     write_manifest(root)
+
+
+def _shards(
+    first: list[tuple[Task, NewHistory]], total: int, kind: Kind, kept_steps: int, most: int, target: int
+) -> int:
+    """How many shards: of about the target size if all histories are as large as the first, at most `most` in each."""
+    size = 1
+    for task, history in first:
+        (entry,) = _placed([_entry(task, history, "", kept_steps)], kind, 0)
+        size = stored_bytes(kind, entry, _with_obs(task, history, kind))
+    return max(1, -(-total // most), min(total, round(total * size / target)))
 
 
 def _loaded(new: NewTask, done: Callable[[Task], None]) -> Iterator[tuple[Task, NewHistory]]:
@@ -241,10 +264,10 @@ def _placed(entries: list[Entry], kind: Kind, first_id: int) -> list[Entry]:
     return placed
 
 
-def _with_obs(task: Task, history: NewHistory, kind: Kind) -> dict[str, np.ndarray]:
+def _with_obs(task: Task, history: NewHistory, kind: Kind) -> Mapping[str, np.ndarray]:
     if kind == "lite":
         return history.arrays
-    return history.arrays | {"obs": observe(task.layout, history.arrays["state"], 0)}
+    return {**history.arrays, "obs": observe(task.layout, history.arrays["state"], EGO)}
 
 
 def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry]) -> dict[str, Any]:

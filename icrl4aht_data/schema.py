@@ -49,8 +49,9 @@ class Field:
         dtype: what the reader presents, and what a `full` shard stores (paper, App. D.1).
         compact: what a `lite` shard stores; the writer checks that it is lossless.
         axis: "T" for one row a step, "E" for one row an episode.
-        row: what a row is: "scalar", "state" (S bytes, one HDF5 element, so that the shuffle filter groups columns) or
-            "obs" (5 x 5 x C).
+        row: what a row is: "scalar", "state" (S bytes) or "obs" (5 x 5 x C bytes). The latter two are one HDF5 element
+            each, of array type, so that the shuffle filter groups what lies at one place in time; h5py gives them as
+            (T, S) and (T, 5, 5, C).
         chunk: rows per chunk.
         optional: whether a history may lack it.
     """
@@ -64,14 +65,10 @@ class Field:
     optional: bool = False
 
     def element(self, layout: Layout, kind: Kind) -> np.dtype:
-        """The stored element: a scalar, or the S bytes of a state record."""
-        if self.row == "state":
-            return np.dtype(("u1", (record_size(layout),)))
-        return np.dtype(self.compact if kind == "lite" else self.dtype)
-
-    def row_shape(self, layout: Layout) -> tuple[int, ...]:
-        """The shape of a row in the stored dataset, beyond the element."""
-        return layout.obs_shape if self.row == "obs" else ()
+        """The stored element: a scalar, the S bytes of a state record, or the 5 x 5 x C of an observation."""
+        if self.row == "scalar":
+            return np.dtype(self.compact if kind == "lite" else self.dtype)
+        return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
 
 FIELDS: dict[str, Field] = {

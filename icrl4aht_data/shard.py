@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,8 @@ from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 if TYPE_CHECKING:  # libhdf5 is needed to write and to check, not to read
     import h5py
 
+_Arrays = Mapping[str, np.ndarray]
+
 _DEFLATE_LEVEL = 6
 _CACHE_BYTES = 256 * 2**20
 
@@ -38,7 +40,7 @@ def chunk_table_path(root: Path, shard: str) -> Path:
     return (root / "meta" / "chunks" / Path(shard).relative_to("data")).with_suffix(".npy")
 
 
-def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[dict]) -> None:
+def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[_Arrays]) -> None:
     """Write a shard and its chunk table into a folder that no reader has seen yet.
 
     Args:
@@ -78,14 +80,14 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
     first = entries[0]
     group = file.create_group(first.h5_group)
     for field in first.stored_fields(kind):
-        row = (first.rows(field), *field.row_shape(layout))
-        chunk = (min(field.chunk, row[0]), *row[1:])
+        rows = first.rows(field)
+        chunk = min(field.chunk, rows)
         stacked = first.h5_row is not None
         element = field.element(layout, kind)
         group.create_dataset(
             field.name,
-            shape=(len(entries), *row) if stacked else row,
-            chunks=(1, *chunk) if stacked else chunk,
+            shape=(len(entries), rows) if stacked else (rows,),
+            chunks=(1, chunk) if stacked else (chunk,),
             dtype=element,
             shuffle=element.itemsize > 1,
             compression="gzip",
@@ -93,19 +95,29 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
         )
 
 
-def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: dict) -> list[int]:
+def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> list[int]:
     """Write every chunk of a history; their checksums, in table order."""
     checksums = []
+    for field, start, data in _encoded(layout, kind, entry, arrays):
+        place = (start,) if entry.h5_row is None else (entry.h5_row, start)
+        group[field.name].id.write_direct_chunk(place, data)
+        checksums.append(zlib.crc32(data))
+    return checksums
+
+
+def stored_bytes(kind: Kind, entry: Entry, arrays: _Arrays) -> int:
+    """What the chunks of a history take in a shard."""
+    return sum(len(data) for _, _, data in _encoded(get_layout(entry.layout), kind, entry, arrays))
+
+
+def _encoded(layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> Iterator[tuple[Field, int, bytes]]:
+    """Every chunk of a history as (field, first row, bytes), in table order."""
     for field in entry.stored_fields(kind):
         element = field.element(layout, kind)
         stored = _as_stored(field, element, arrays[field.name], entry)
         step = min(field.chunk, len(stored))
         for start in range(0, len(stored), step):
-            data = encode_chunk(stored[start : start + step], step, element.itemsize)
-            place = (start, *(0,) * len(field.row_shape(layout)))
-            group[field.name].id.write_direct_chunk(place if entry.h5_row is None else (entry.h5_row, *place), data)
-            checksums.append(zlib.crc32(data))
-    return checksums
+            yield field, start, encode_chunk(stored[start : start + step], step, element.itemsize)
 
 
 def _as_stored(field: Field, element: np.dtype, array: np.ndarray, entry: Entry) -> np.ndarray:
@@ -150,9 +162,8 @@ def _chunk_places(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, 
     places = []
     for field in entry.stored_fields(kind):
         dataset: Any = file[f"{entry.h5_group}/{field.name}"]
-        single = (0,) * (dataset.ndim - (1 if entry.h5_row is None else 2))
         for start in range(0, entry.rows(field), field.chunk):
-            at = (start, *single) if entry.h5_row is None else (entry.h5_row, start, *single)
+            at = (start,) if entry.h5_row is None else (entry.h5_row, start)
             info = dataset.id.get_chunk_info_by_coord(at)
             places.append((info.byte_offset or 0, info.size, min(field.chunk, entry.rows(field) - start)))
     return places
@@ -314,7 +325,7 @@ class Shard:
 
     def decode(self, row: int, history_id: int, field: Field) -> np.ndarray:
         """One chunk by its row in the chunk table, read from the file and checked; padding rows included."""
-        element, row_shape, row_size = self._element(field)
+        element, shape, size_of_row = self._element(field)
         length = self._chunk_rows(history_id, field)
         offset, size, _, expected = self._table[row].item()
         data = self._bytes(offset, size)
@@ -325,10 +336,10 @@ class Shard:
                 f"the file is damaged, fetch the shard again"
             )
         try:
-            raw = decode_chunk(data, length * row_size, element.itemsize)
+            raw = decode_chunk(data, length * size_of_row, element.itemsize)
         except ValueError as error:
             raise ShardCorruptError(f"{self.path}: {self.describe(row)}: {error}") from error
-        rows = np.frombuffer(raw, element.base).reshape(length, *row_shape)
+        rows = np.frombuffer(raw, element.base).reshape(length, *shape)
         rows.flags.writeable = False
         return rows
 
@@ -337,8 +348,7 @@ class Shard:
         known = self._elements.get(field.name)
         if known is None:
             element = field.element(self.layout, self.kind)
-            shape = (*field.row_shape(self.layout), *element.shape)
-            known = self._elements[field.name] = element, shape, int(np.prod(shape)) * element.base.itemsize
+            known = self._elements[field.name] = element, element.shape, element.itemsize
         return known
 
     def _bytes(self, offset: int, size: int) -> bytes:
@@ -395,8 +405,8 @@ class Shard:
         for entry in self._entries.values():
             for field in entry.stored_fields(self.kind):
                 dataset: Any = file[f"{entry.h5_group}/{field.name}"]
-                row = (entry.rows(field), *field.row_shape(self.layout))
-                shape = row if entry.h5_row is None else (groups[entry.h5_group], *row)
+                rows = entry.rows(field)
+                shape = (rows,) if entry.h5_row is None else (groups[entry.h5_group], rows)
                 element = field.element(self.layout, self.kind)
                 if dataset.shape != shape or dataset.dtype != element:
                     faults.append(

@@ -13,6 +13,7 @@ import numpy as np
 from icrl4aht_data.benchmark import ACTIONS, EGO
 from icrl4aht_data.dataset import MINI, History
 from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -23,6 +24,7 @@ from icrl4aht_data.schema import (
     HISTORIES,
     INFO,
     MANIFEST,
+    PROVENANCE,
     TASKS,
     Entry,
     curve_ends,
@@ -31,6 +33,7 @@ from icrl4aht_data.schema import (
     stream_score,
 )
 from icrl4aht_data.shard import Shard
+from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import Task, read_tasks
 
 
@@ -125,6 +128,8 @@ def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
     info = index.info
     kept_steps = info["environment"]["kept_steps"]
     expected = describe(info["kind"], info["data_version"], kept_steps, list(index.entries))
+    if "statistics" in info and report.ok:  # else what they are made of is at fault
+        expected["statistics"] = _statistics(index, tasks)
     for name in expected:
         if info.get(name) != expected[name]:
             report.add(INFO, f"{name}: expected {expected[name]!r}, found {info.get(name)!r}")
@@ -134,6 +139,15 @@ def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
         missing = {f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count)} - shards
         for name in sorted(missing):
             report.add(name, f"the name of {shard} promises this shard, the index has no history in it")
+
+
+def _statistics(index: Index, tasks: list[Task]) -> Any:
+    try:
+        provenance = parse_json(read_text(index.root / PROVENANCE))
+        kept_steps = index.info["environment"]["kept_steps"]
+        return layout_statistics(index.root, index.entries, tasks, provenance, kept_steps)
+    except (Icrl4ahtError, OSError, AttributeError, TypeError) as error:
+        return f"what {PROVENANCE} and the shards give: {error}"
 
 
 def _check_manifest(root: Path, report: Report, advance: Advance) -> None:

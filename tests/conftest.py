@@ -9,7 +9,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from plays import random_release
+from tiny import PAIR, TINY
+
+from generation.cli import cli
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -51,3 +55,24 @@ def damaged(lite, tmp_path) -> Path:
     root = tmp_path / "release"
     shutil.copytree(lite[0], root)
     return root
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory) -> Path:
+    """tiny.toml and pair.toml; `a`, the first collected and packed both ways by the command. Read only."""
+    out = tmp_path_factory.mktemp("built")
+    (out / "tiny.toml").write_text(TINY)
+    (out / "pair.toml").write_text(PAIR)
+    arguments = ["generate", "--profile", str(out / "tiny.toml"), "--out", str(out / "a")]
+    result = CliRunner().invoke(cli, [*arguments, "--kind", "lite", "--kind", "full"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return out
+
+
+@pytest.fixture(scope="session")
+def pair(built) -> Path:
+    """pair.toml, collected and packed by the command. Read only."""
+    arguments = ["generate", "--profile", str(built / "pair.toml"), "--out", str(built / "pair")]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return built / "pair"

@@ -6,55 +6,22 @@ import json
 import re
 import shutil
 from io import StringIO
-from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
+from tiny import TINY, artefact
 
-from generation import build, collect
+from generation import artefact as artefacts
+from generation import build, collect, run
+from generation.artefact import METADATA
 from generation.cli import cli
-from generation.collect import METADATA
 from generation.learners.checkpoint import load_policy
 from generation.profiles import load_profile
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-
-TINY = """
-[ego]
-total_steps = 16_000
-environments = 8
-rollout = 80
-minibatches = 2
-shaping_horizon = 16_000
-widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
-
-[release]
-data_version = "0.0.1"
-keep = 3
-
-[tasks]
-layouts = ["demo_wide"]
-presets = ["default"]
-"""
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory) -> Path:
-    """One task collected and packed both ways by the command."""
-    out = tmp_path_factory.mktemp("built")
-    (out / "tiny.toml").write_text(TINY)
-    arguments = ["generate", "--profile", str(out / "tiny.toml"), "--out", str(out / "a")]
-    result = CliRunner().invoke(cli, [*arguments, "--kind", "lite", "--kind", "full"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return out
-
-
-def artefact(out: Path) -> Path:
-    (folder,) = (path for path in (out / "artefacts").iterdir() if path.is_dir())
-    return folder
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
@@ -102,7 +69,7 @@ def test_a_finished_task_is_not_done_again(built, monkeypatch):
     def never(*arguments):
         raise AssertionError("the task was collected again")
 
-    monkeypatch.setattr(build, "run_task", never)
+    monkeypatch.setattr(run, "run_task", never)
     output = StringIO()
     before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
     build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
@@ -115,15 +82,15 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
     (task,) = profile.tasks()
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
-    assert collect.is_finished(folder, task, profile)
+    assert artefacts.is_finished(folder, task, profile)
     (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
-    assert not collect.is_finished(folder, task, load_profile(str(built / "other.toml")))
+    assert not artefacts.is_finished(folder, task, load_profile(str(built / "other.toml")))
     actions = bytearray((folder / "actions.npy").read_bytes())
     actions[-1] ^= 1
     (folder / "actions.npy").write_bytes(actions)
-    assert not collect.is_finished(folder, task, profile)
+    assert not artefacts.is_finished(folder, task, profile)
     (folder / METADATA).unlink()
-    assert not collect.is_finished(folder, task, profile)
+    assert not artefacts.is_finished(folder, task, profile)
 
 
 def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):

@@ -1,4 +1,4 @@
-"""Policies and learner states on disk: arrays as safetensors, beside them JSON that says what they are. No pickle."""
+"""Policies on disk: weights as safetensors, beside them a JSON card that says what they are."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file, save_file
@@ -56,44 +54,3 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     if shapes != stated:
         raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {stated}")
     return network, unflatten_dict(weights, sep="/"), card
-
-
-def save_state(path: Path, state: Any, notes: dict[str, str]) -> None:
-    """Write a pytree of arrays, typed keys included, and notes; the file is replaced at once or not at all."""
-    leaves = {str(n): np.asarray(_raw(leaf)) for n, leaf in enumerate(jax.tree.leaves(state))}
-    partial = path.with_suffix(".partial")
-    save_file(leaves, partial, metadata=notes)
-    partial.replace(path)
-
-
-def load_state(path: Path, like: Any) -> Any:
-    """The pytree that was saved.
-
-    Args:
-        like: a pytree of the same structure; its leaves' shapes and dtypes are what the file's must have.
-
-    Raises:
-        OptionError: if they differ; names the first leaf that does.
-    """
-    stored = load_file(path)
-    leaves, structure = jax.tree.flatten(like)
-    if len(stored) != len(leaves):
-        raise OptionError(f"{path}: holds {len(stored)} arrays, expected {len(leaves)}; remove it to start anew")
-    found = []
-    for n, leaf in enumerate(leaves):
-        expected, array = jax.eval_shape(_raw, leaf), stored[str(n)]
-        if (array.shape, array.dtype) != (expected.shape, expected.dtype):
-            raise OptionError(
-                f"{path}: array {n} is {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}; "
-                f"remove it to start anew"
-            )
-        found.append(jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(leaf) else jnp.asarray(array))
-    return jax.tree.unflatten(structure, found)
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _raw(leaf: Any) -> Any:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf

@@ -65,7 +65,16 @@ class Profile:
     @property
     def ego_hash(self) -> str:
         """Of what decides an artefact beyond its task; a change makes artefacts anew."""
-        return hashlib.sha256(json.dumps(asdict(self.ego), sort_keys=True).encode()).hexdigest()[:16]
+        return _hash(asdict(self.ego))
+
+    @property
+    def hash(self) -> str:
+        """Of all of it."""
+        return _hash(asdict(self))
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def names() -> list[str]:

@@ -1,0 +1,127 @@
+"""Several releases as one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.dataset import Dataset, History, load_icrl4aht
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import parse_json, read_text
+from icrl4aht_data.release import NewHistory, NewTask, file_hash, write_release
+from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.tasks import Task, read_tasks
+
+
+def combine_releases(
+    target: Path,
+    roots: Sequence[Path],
+    data_version: str | None = None,
+    done: Callable[[Task], None] = lambda task: None,
+) -> Path:
+    """Write a release that has the histories of several, in order, under new history ids.
+
+    Args:
+        target: the folder to make; a release there is replaced when the new one is complete.
+        roots: releases of one kind, one format and one episode length, no two with a task in common.
+        data_version: of the combination; that of the releases by default, if they agree.
+        done: called when a task's histories have been taken.
+
+    Raises:
+        OptionError: if the releases do not go together; names both, and what they disagree on.
+        ReleaseError: if one of them cannot be read.
+    """
+    if not roots:
+        raise OptionError("expected at least one release to combine")
+    datasets = [load_icrl4aht(root) for root in roots]
+    for root in roots:
+        if root.resolve() == target.resolve():
+            raise OptionError(f"{target}: is one of the releases to combine; give another folder")
+    _check_alike(datasets)
+    owners: dict[str, Path] = {}
+    new = []
+    for dataset in datasets:
+        provenance = parse_json(read_text(dataset.root / PROVENANCE))
+        for task in read_tasks(dataset.root / TASKS):
+            if task.task_id in owners:
+                raise OptionError(f"{dataset.root}: task {task.task_id} is also in {owners[task.task_id]}")
+            owners[task.task_id] = dataset.root
+            new.append(_new_task(dataset, task, provenance.get(task.task_id, {})))
+    first = datasets[0].info
+    return write_release(
+        target,
+        first["kind"],
+        new,
+        data_version=data_version or _one_version(datasets),
+        card=_card(datasets),
+        kept_steps=first["environment"]["kept_steps"],
+        done=done,
+    )
+
+
+def _check_alike(datasets: Sequence[Dataset]) -> None:
+    first = datasets[0]
+    for other in datasets[1:]:
+        for name, remedy in (
+            ("format_version", "rebuild the older one"),
+            ("kind", "combine releases of one kind"),
+            ("environment", "they cannot be combined"),
+        ):
+            if other.info[name] != first.info[name]:
+                raise OptionError(
+                    f"{other.root}: {name} {other.info[name]!r}, but {first.root} has {first.info[name]!r}; {remedy}"
+                )
+
+
+def _one_version(datasets: Sequence[Dataset]) -> str:
+    versions = {dataset.info["data_version"] for dataset in datasets}
+    if len(versions) > 1:
+        raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
+    return versions.pop()
+
+
+def _new_task(dataset: Dataset, task: Task, provenance: dict[str, Any]) -> NewTask:
+    ids = dataset.index.query(task_id=task.task_id)
+
+    def load() -> Iterator[NewHistory]:
+        for history in dataset.select(ids):
+            yield NewHistory(history.entry.env_idx, _Stored(history))
+
+    return NewTask(task, provenance, len(ids), load)
+
+
+class _Stored(Mapping[str, np.ndarray]):
+    """A history's arrays, each read when it is asked for, so that a shard's worth of them need not fit in memory."""
+
+    def __init__(self, history: History) -> None:
+        self._history = history
+        self._names = [field.name for field in history.entry.stored_fields("lite")]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._history.read(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _card(datasets: Sequence[Dataset]) -> str:
+    parts = "\n".join(
+        f"* {dataset.root.name}: data version {dataset.info['data_version']}, {len(dataset):,} histories, "
+        f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
+        for dataset in datasets
+    )
+    cards = "\n".join(read_text(dataset.root / "README.md") for dataset in datasets)
+    return (
+        f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
+    )
