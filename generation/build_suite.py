@@ -13,7 +13,7 @@ from generation.diversity import actions_on_common_states, between_families, ham
 from generation.figures import plot_matrix
 from generation.profiles import Profile
 from generation.progress import progress
-from generation.select import Selection, make_tasks, select, write_manifests
+from generation.select import Selection, select, write_manifests
 from generation.suite import Run, checkpoints, is_finished, play_matrix, train
 from generation.teammates import learned
 from generation.teammates.instances import published_thetas
@@ -52,17 +52,6 @@ def build_suite(
         console.print(_in_words(selection, config.train))
     for path in write_manifests(suite, selections):
         console.print(f"wrote {path}")
-
-
-def suite_tasks(profile: Profile, suite: Path) -> list:
-    """The training tasks of every layout of a profile, one for each learned teammate that the filter chose."""
-    config = profile.teammates
-    selections = [
-        select(suite, name, algorithm, config.train, config.heldout)
-        for name in _names(profile.layouts)
-        for algorithm in ALGORITHMS
-    ]
-    return make_tasks(suite, selections, "train")
 
 
 def _names(layouts: Sequence[str]) -> list[str]:

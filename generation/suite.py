@@ -29,7 +29,7 @@ from generation import cross_play
 from generation.env import Environment
 from generation.figures import plot_training
 from generation.learners.brdiv import BRDiv
-from generation.learners.checkpoint import WEIGHTS, load_policy, save_policy
+from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
 from generation.learners.comedi import CoMeDi
 from generation.learners.fcp import FCP
 from generation.learners.lbrdiv import LBRDiv
@@ -38,6 +38,7 @@ from generation.learners.ppo import PPOConfig
 from generation.snapshot import load_state, read_card, save_state
 from icrl4aht_data.benchmark import ALGORITHMS, unknown
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import write_json
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.release import file_hash
 
@@ -72,6 +73,11 @@ class Run:
     def __post_init__(self) -> None:
         if self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, ALGORITHMS)
+        if self.config.updates < CHECKPOINTS:
+            raise OptionError(
+                f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "
+                f"{CHECKPOINTS}, one for each checkpoint"
+            )
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -259,16 +265,16 @@ class _Training:
         plot_training(
             self.folder / _METRICS, self.folder / "curves.png", f"{self.run.algorithm}, {self.run.layout.name}"
         )
-        (self.folder / _RESUME).unlink(missing_ok=True)
         files = {
             str(path.relative_to(self.folder)): file_hash(path)
-            for path in sorted(self.folder.rglob("*"))
-            if path.is_file() and path.name not in (_POPULATION, _METRICS, "curves.png")
+            for name in (WEIGHTS, CARD)
+            for path in sorted(self.folder.rglob(name))
         }
         content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
         partial = self.folder / f"{_POPULATION}.partial"
-        partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_json(partial, content)
         partial.replace(self.folder / _POPULATION)
+        (self.folder / _RESUME).unlink(missing_ok=True)
 
 
 def _stack(params: list[Any]) -> Any:

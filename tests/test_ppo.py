@@ -17,8 +17,10 @@ import numpy as np
 import pytest
 
 from generation.env import Environment
+from generation.learners.ego import Learner, LearnerState
 from generation.learners.network import Widths
-from generation.learners.ppo import Batch, Learner, LearnerState, PPOConfig, Rollout, generalised_advantage
+from generation.learners.ppo import Batch, PPOConfig, Sequences, generalised_advantage, sequences
+from generation.learners.rollout import Choice, Rollout, policy_player, roll_out
 from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
@@ -42,6 +44,10 @@ CONFIG = PPOConfig(
 UpdateFunction = Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str, jax.Array]]]
 
 
+PARAMS = {"turn": np.uint32(0)}
+"""Of the stand-in teammate: how far it turns from where it would go."""
+
+
 class Diary(NamedTuple):
     """What the stand-in teammate remembers."""
 
@@ -55,13 +61,13 @@ def begin(params, key) -> Diary:
 
 def acts(params, memory: Diary, view, key):
     """A step in a direction that tells its memory and what it sees."""
-    action = (memory.offset + memory.steps + view.sum(dtype=jnp.uint32)) % 4
+    action = (memory.offset + memory.steps + view.sum(dtype=jnp.uint32) + params["turn"]) % 4
     return action.astype(jnp.int32), memory._replace(steps=memory.steps + 1)
 
 
 @pytest.fixture(scope="module")
 def learner() -> Learner:
-    return Learner(Environment(CLOSET, max_steps=EPISODE), Policy({}, begin, acts, "observation"), CONFIG)
+    return Learner(Environment(CLOSET, max_steps=EPISODE), Policy(PARAMS, begin, acts, "observation"), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -126,8 +132,18 @@ def trained(update, untrained) -> Played:
 
 def joined(rollouts: list[Rollout]) -> Rollout:
     """Successive roll-outs as one."""
-    arrays: Any = [np.concatenate(parts) for parts in zip(*rollouts, strict=True)]
-    return Rollout(*arrays)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *rollouts)
+
+
+def egos(rollout: Rollout) -> Choice:
+    """What the ego chose."""
+    return rollout.choices[EGO]
+
+
+def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
+    """What the roll-out from this state is to the ego's learning."""
+    places, hidden = np.arange(CONFIG.environments), state.seats.memories[EGO]
+    return sequences(rollout, EGO, places, hidden, jnp.zeros(places.size), jnp.float32(0))
 
 
 def same_bytes(one: Any, other: Any) -> bool:
@@ -181,19 +197,20 @@ def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.nd
     advantage; the value is the target less the derivative of the value loss by the target.
     """
     rng = np.random.default_rng(9)
-    advantage, target = rng.normal(size=(2, *rollout.value.shape)).astype(np.float32)
+    advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
     normalised = (advantage - advantage.mean()) / advantage.std()
-    rollout = rollout._replace(reset=reset)
+    own = egos_sequences(state, rollout)._replace(reset=jnp.asarray(reset))
 
     def losses(log_prob, target):
-        batch = Batch(rollout._replace(log_prob=log_prob), state.seats.hidden[None], jnp.asarray(advantage), target)
-        return learner._loss(state.params, jax.tree.map(jnp.asarray, batch))[1]
+        batch = Batch(own._replace(log_prob=log_prob), jnp.asarray(advantage), target)
+        return learner.ppo.loss(state.params, jax.tree.map(jnp.asarray, batch))[1]
 
     by_log_prob = jax.jit(jax.grad(lambda p, t: losses(p, t)["policy_loss"]), compiler_options=FAST)
     by_target = jax.jit(jax.grad(lambda t, p: losses(p, t)["value_loss"]), compiler_options=FAST)
-    ratio = np.asarray(by_log_prob(rollout.log_prob, target)) * target.size / normalised
-    value = target - np.asarray(by_target(target, rollout.log_prob)) * target.size
-    return np.log(np.maximum(ratio, 1e-6)) + rollout.log_prob, value
+    log_prob = egos(rollout).log_prob
+    ratio = np.asarray(by_log_prob(log_prob, target)) * target.size / normalised
+    value = target - np.asarray(by_target(target, log_prob)) * target.size
+    return np.log(np.maximum(ratio, 1e-6)) + log_prob, value
 
 
 def test_the_loss_replays_the_rollout_across_an_episode_end(learner, played):
@@ -201,13 +218,13 @@ def test_the_loss_replays_the_rollout_across_an_episode_end(learner, played):
     state, rollout = played.before[1], played.rollouts[1]
     np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)
     np.testing.assert_array_equal(rollout.done.nonzero()[0], [3] * 4)
-    assert np.abs(state.seats.hidden).min() > 0
+    assert np.abs(state.seats.memories[EGO]).min() > 0
     log_prob, value = replay(learner, state, rollout, rollout.reset)
-    np.testing.assert_allclose(log_prob, rollout.log_prob, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(value, rollout.value, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(log_prob, egos(rollout).log_prob, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(value, egos(rollout).value, rtol=0, atol=1e-4)
     # The same from dones that are not shifted: wrong from the step of the end on.
     _, value = replay(learner, state, rollout, rollout.done)
-    wrong = np.abs(value - rollout.value).max(axis=1)
+    wrong = np.abs(value - egos(rollout).value).max(axis=1)
     assert wrong[:3].max() < 1e-4 < 1e-2 < wrong[3:].min()
 
 
@@ -216,22 +233,22 @@ def test_loss_against_plain_numpy(learner, played):
     rollout = played.rollouts[1]
     rng = np.random.default_rng(6)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)
-    hidden = played.before[1].seats.hidden
-    advantage, target = rng.normal(size=(2, *rollout.value.shape)).astype(np.float32)
-    batch = jax.tree.map(jnp.asarray, Batch(rollout, hidden[None], advantage, target))
-    total, parts = jax.jit(learner._loss, compiler_options=FAST)(params, batch)
+    hidden = played.before[1].seats.memories[EGO]
+    advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
+    batch = jax.tree.map(jnp.asarray, Batch(egos_sequences(played.before[1], rollout), advantage, target))
+    total, parts = jax.jit(learner.ppo.loss, compiler_options=FAST)(params, batch)
 
     obs = observe(CLOSET, rollout.record, EGO)
     output: Any = jax.jit(learner.network.apply, compiler_options=FAST)(params, hidden, obs, rollout.reset)
     logits, value = np.asarray(output[1], np.float64), np.asarray(output[2], np.float64)
     log_probs = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
     chosen = np.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
-    ratio = np.exp(chosen - rollout.log_prob)
-    change = value - rollout.value
+    ratio = np.exp(chosen - egos(rollout).log_prob)
+    change = value - egos(rollout).value
     assert (np.abs(ratio - 1) > CONFIG.clip).any() and (np.abs(change) > CONFIG.clip).any()
     normalised = (advantage - advantage.mean()) / advantage.std()
     policy = -np.minimum(ratio * normalised, np.clip(ratio, 0.8, 1.2) * normalised).mean()
-    near = rollout.value + np.clip(change, -0.2, 0.2)
+    near = egos(rollout).value + np.clip(change, -0.2, 0.2)
     value_loss = 0.5 * np.maximum((value - target) ** 2, (near - target) ** 2).mean()
     entropy = -(np.exp(log_probs) * log_probs).sum(axis=-1).mean()
     expected = {"policy_loss": policy, "value_loss": value_loss, "entropy": entropy}
@@ -248,11 +265,11 @@ def test_update_reports_the_loss_of_the_shaped_advantages(learner, played):
         assert abs(metrics["policy_loss"]) < 1e-5
         if number + 1 < len(played.rollouts):
             weight = max(0.0, 1 - number * 32 / 960)
-            following = played.rollouts[number + 1].value[0]  # of the same policy
-            reward = rollout.reward + weight * rollout.shaped
-            advantage = plain_advantage(reward, rollout.value, rollout.done, following, 0.99, 0.95)
+            following = egos(played.rollouts[number + 1]).value[0]  # of the same policy
+            reward = rollout.reward + weight * rollout.shaped[..., EGO]
+            advantage = plain_advantage(reward, egos(rollout).value, rollout.done, following, 0.99, 0.95)
             np.testing.assert_allclose(metrics["value_loss"], 0.5 * (advantage**2).mean(), rtol=1e-4)
-            shaped += 0 < weight < 1 and rollout.shaped.any()
+            shaped += 0 < weight < 1 and rollout.shaped[..., EGO].any()
     assert shaped, "no shaped reward while its weight was between 0 and 1"
 
 
@@ -265,7 +282,7 @@ def test_update_is_a_pure_function(update, played):
     assert same_bytes(once, again)
     other_state, other_rollout, _ = update(state._replace(key=jax.random.key(77)))
     assert not np.array_equal(other_rollout.actions[..., EGO], once[1].actions[..., EGO])
-    assert not same_bytes(other_state.seats.hidden, once[0].seats.hidden)
+    assert not same_bytes(other_state.seats.memories[EGO], once[0].seats.memories[EGO])
 
 
 def test_learning_is_a_pure_function_too(update, learning, trained):
@@ -312,16 +329,18 @@ def test_metrics_hold_the_sum_of_rewards_of_ended_episodes(played):
         assert metrics["episodes"] == 4 * len(ended)
         assert metrics["return"] == (sums[ended].mean() if ended else 0)
         np.testing.assert_allclose(metrics["reward_per_step"], played.rollouts[number].reward.mean(), rtol=1e-6)
-        np.testing.assert_allclose(metrics["shaped_per_step"], played.rollouts[number].shaped.mean(), rtol=1e-6)
+        np.testing.assert_allclose(metrics["shaped_per_step"], played.rollouts[number].shaped[..., EGO].mean(), rtol=1e-6)
 
 
 def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
     """The stand-in teammate only walks, so every shaped reward is the ego's; all are placements."""
     whole = joined(played.rollouts)
-    assert set(np.unique(whole.shaped)) == {0, 3}
+    assert whole.shaped.shape == (*whole.done.shape, 2)
+    assert set(np.unique(whole.shaped[..., EGO])) == {0, 3}
     acted = whole.actions[..., EGO] == INTERACT
-    assert acted[whole.shaped > 0].all()
+    assert acted[whole.shaped[..., EGO] > 0].all()
     assert (whole.actions[..., TEAMMATE] != INTERACT).all()
+    assert not whole.shaped[..., TEAMMATE].any()
 
 
 def expected_teammate_actions(learner: Learner, state: LearnerState, whole: Rollout) -> np.ndarray:
@@ -348,11 +367,21 @@ def test_a_teammate_that_sees_the_state_is_given_the_record(learner, played):
         return view.sum(dtype=jnp.int32) % 4, memory
 
     state, rollout = played.before[2], played.rollouts[2]
-    other = replace(learner, teammate=Policy({}, begin, reads, "state"))
-    turn = jax.jit(other.take_turn, compiler_options=FAST)
-    _, actions, _ = turn(state.seats, rollout.actions[0, :, EGO], state.seats.hidden, jax.random.key(0))
-    np.testing.assert_array_equal(actions[:, TEAMMATE], rollout.record[0].sum(axis=-1, dtype=np.int32) % 4)
-    np.testing.assert_array_equal(actions[:, EGO], rollout.actions[0, :, EGO])
+    mate = policy_player(learner.env, Policy({}, begin, reads, "state"), {}, TEAMMATE, CONFIG.environments)
+    players = learner.players(state.params, {})[EGO], mate
+    turn = jax.jit(lambda seats, key: roll_out(learner.env, players, seats, 1, key), compiler_options=FAST)
+    _, turned = turn(state.seats, jax.random.key(0))
+    np.testing.assert_array_equal(turned.record[0], rollout.record[0])
+    np.testing.assert_array_equal(turned.actions[0, :, TEAMMATE], rollout.record[0].sum(axis=-1, dtype=np.int32) % 4)
+    np.testing.assert_array_equal(turned.actions[0, :, EGO], egos(turned).action[0])
+
+
+def test_the_teammates_parameters_travel_in_the_state(update, frozen, played):
+    """So that one compiled update serves every teammate of a family."""
+    state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
+    first = played.rollouts[0].actions[0, :, TEAMMATE]
+    np.testing.assert_array_equal(rollout.actions[0, :, TEAMMATE], (first + 1) % 4)
+    assert int(state.teammate["turn"]) == 1
 
 
 # Schedules.
@@ -364,17 +393,17 @@ def test_shaping_weight_goes_linearly_to_zero(played):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
-def test_learning_rate_schedule(learner):
+def test_learning_rate_schedule():
     """Read from the optimizer: under a constant gradient g, Adam moves by rate * g / (g + eps)."""
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     warm = steps // 10
     gradient = jnp.float32(1e-3)
 
     def one(state, _):
-        change, state = learner.optimizer.update(gradient, state)
+        change, state = CONFIG.optimizer.update(gradient, state)
         return state, change
 
-    changes = jax.lax.scan(one, learner.optimizer.init(gradient), length=steps + 1)[1]
+    changes = jax.lax.scan(one, CONFIG.optimizer.init(gradient), length=steps + 1)[1]
     rates = -np.asarray(changes, np.float64) * (1e-3 + 1e-5) / 1e-3
     t = np.arange(steps + 1)
     expected = np.where(t < warm, t / warm, 0.5 * (1 + np.cos(np.pi * (t - warm) / (steps - warm))))
@@ -385,16 +414,16 @@ def test_learning_rate_schedule(learner):
     assert rates[-1] == 0
 
 
-def test_gradients_are_clipped_by_their_global_norm(learner):
+def test_gradients_are_clipped_by_their_global_norm():
     """Adam forgets the scale of its gradients but not their proportions: after one too large the next, at the bound,
     moves as much as if both had been at the bound."""
     bound = CONFIG.max_grad_norm
     directions = {"a": jnp.float32(0.6), "b": jnp.float32(-0.8)}
 
     def second(first: float) -> list[float]:
-        state = learner.optimizer.init(directions)
+        state = CONFIG.optimizer.init(directions)
         for size in (first, bound):
-            change, state = learner.optimizer.update(jax.tree.map(lambda x, s=size: x * s, directions), state)
+            change, state = CONFIG.optimizer.update(jax.tree.map(lambda x, s=size: x * s, directions), state)
         return [float(x) for x in jax.tree.leaves(change)]
 
     np.testing.assert_allclose(second(100.0), second(bound), rtol=1e-5)

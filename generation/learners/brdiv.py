@@ -17,7 +17,13 @@ from generation.learners.population import Seating, shared
 
 
 def pairs_seating(members: int, environments: int) -> Seating:
-    """The tables of confederates and best responses; terms: K * K of the confederates, then K * K of the responses."""
+    """The tables of confederates and best responses; terms: K * K of the confederates, then K * K of the responses.
+
+    Raises:
+        ValueError: if a confederate has fewer tables for cross-play than there are other best responses.
+    """
+    if environments // 2 < members - 1:
+        raise ValueError(f"environments = {environments}: {members} members need at least {2 * members - 2}")
     table = np.tile(np.arange(environments), members)
     conf = shared(members, environments)
     with_own = table < environments - environments // 2 if members > 1 else np.ones(table.size, bool)

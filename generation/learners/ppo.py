@@ -192,11 +192,11 @@ def generalised_advantage(
 
 
 def episode_metrics(rollout: Rollout) -> dict[str, Array]:
-    """What a roll-out says of its episodes; `return` is 0 where none ended."""
+    """What a roll-out says of its episodes and of the ego's shaped rewards; `return` is 0 where none ended."""
     ended = jnp.sum(rollout.done)
     return {
         "episodes": ended,
         "return": jnp.sum(jnp.where(rollout.done, rollout.returns, 0.0)) / jnp.maximum(ended, 1),
         "reward_per_step": jnp.mean(rollout.reward),
-        "shaped_per_step": jnp.mean(rollout.shaped),
+        "shaped_per_step": jnp.mean(rollout.shaped[..., EGO]),
     }
