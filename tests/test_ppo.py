@@ -329,7 +329,8 @@ def test_metrics_hold_the_sum_of_rewards_of_ended_episodes(played):
         assert metrics["episodes"] == 4 * len(ended)
         assert metrics["return"] == (sums[ended].mean() if ended else 0)
         np.testing.assert_allclose(metrics["reward_per_step"], played.rollouts[number].reward.mean(), rtol=1e-6)
-        np.testing.assert_allclose(metrics["shaped_per_step"], played.rollouts[number].shaped[..., EGO].mean(), rtol=1e-6)
+        shaped = played.rollouts[number].shaped[..., EGO].mean()
+        np.testing.assert_allclose(metrics["shaped_per_step"], shaped, rtol=1e-6)
 
 
 def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
