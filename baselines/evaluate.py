@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -224,8 +226,8 @@ def evaluate(
     for task in tasks:
         if task.task_id not in results:
             groups[task.layout_name, task.teammate_kind].append(task)
-    for members in groups.values():
-        for result in _run_group(make_ego, members, protocol, seeds, suite, settings):
+    for members, game in compiled_games(list(groups.values()), make_ego, protocol, seeds, suite):
+        for result in _run_group(members, game, protocol, len(seeds), settings):
             results[result.task_id] = result
             _store(out, result)
         done(len(members))
@@ -243,23 +245,70 @@ def _check_teammate(task: Task, suite: Path | None) -> None:
         raise type(error)(f"task {task.task_id}: {error}") from error
 
 
-def _run_group(
-    make_ego,
-    tasks: list[Task],
-    protocol: Protocol,
-    seeds: Sequence[int],
-    suite: Path | None,
-    settings: dict[str, Any],
-) -> list[Result]:
+def compiled_games(
+    groups: Sequence[list[Task]], make_ego, protocol: Protocol, seeds: Sequence[int], suite: Path | None
+) -> Iterator[tuple[list[Task], Game]]:
+    """Every group with its compiled game. Those after the first are compiled ahead on threads, unless the ego runs
+    outside JAX: its `reset` must come right before its game."""
+
+    def ready(group: list[Task]) -> Game:
+        return set_up(make_ego, group, protocol, seeds, suite)
+
+    if not groups:
+        return
+    first = ready(groups[0])
+    if isinstance(first.rollout.ego, HostPolicy):
+        yield groups[0], first
+        yield from ((group, ready(group)) for group in groups[1:])
+        return
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+        try:
+            others = [pool.submit(ready, group) for group in groups[1:]]
+            yield groups[0], first
+            yield from ((group, game.result()) for group, game in zip(groups[1:], others, strict=True))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _run_group(tasks: list[Task], game: Game, protocol: Protocol, seeds: int, settings: dict[str, Any]) -> list[Result]:
     returns = []
-    for played in play_tasks(make_ego, tasks, protocol, seeds, suite):
+    for played in play(game, protocol.episodes):
         ego = played.actions[..., EGO]
         low, high = int(ego.min()), int(ego.max())
         if low < 0 or high >= len(ACTIONS):
             raise OptionError(f"the ego returned actions {low}..{high} on {tasks[0].layout.name}, expected 0..5")
         returns.append(np.asarray(played.reward, np.float64).sum(axis=-1))
-    per_task = np.stack(returns, axis=-1).reshape(len(tasks), len(seeds), -1)
+    per_task = np.stack(returns, axis=-1).reshape(len(tasks), seeds, -1)
     return [Result(task.task_id, settings, rows.tolist()) for task, rows in zip(tasks, per_task, strict=True)]
+
+
+class Game(NamedTuple):
+    """Tasks of one layout and family, ready to play."""
+
+    rollout: Rollout
+    tables: Tables  # before the first episode
+    episode: Callable[..., tuple[Tables, Played]]  # compiled
+
+
+def set_up(
+    make_ego: Callable[[Layout], Policy | HostPolicy],
+    tasks: Sequence[Task],
+    protocol: Protocol,
+    seeds: Sequence[int] = (0,),
+    suite: Path | None = None,
+) -> Game:
+    """Compile the game of tasks that share a layout and a teammate family."""
+    layout = tasks[0].layout
+    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks for _ in seeds]
+    rollout = Rollout(layout, make_ego(layout), mates, protocol)
+    keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
+    outside = isinstance(rollout.ego, HostPolicy)
+    tables = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
+    _check_ego(rollout, tables)
+    episode = jax.jit(rollout.episode)
+    if outside:
+        return Game(rollout, tables, episode)
+    return Game(rollout, tables, episode.lower(rollout.ego.params, rollout.teammate_params, tables).compile())
 
 
 def play_tasks(
@@ -274,18 +323,18 @@ def play_tasks(
     Yields:
         `Played` with B = tasks x seeds, seeds varying fastest.
     """
-    layout = tasks[0].layout
-    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks for _ in seeds]
-    rollout = Rollout(layout, make_ego(layout), mates, protocol)
-    tables = rollout.start(jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds]))
-    _check_ego(rollout, tables)
-    play = jax.jit(rollout.episode)
+    yield from play(set_up(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
+
+
+def play(game: Game, episodes: int) -> Iterator[Played]:
+    """Episode after episode."""
+    rollout, tables, episode = game
     params = rollout.teammate_params
-    for _ in range(protocol.episodes):
+    for _ in range(episodes):
         try:
-            tables, played = jax.block_until_ready(play(rollout.ego.params, params, tables))
+            tables, played = jax.block_until_ready(episode(rollout.ego.params, params, tables))
         except jax.errors.JaxRuntimeError as error:  # what an agent outside JAX raised comes wrapped
-            raise OptionError(f"the ego failed on {layout.name}: {error}") from error
+            raise OptionError(f"the ego failed on {rollout.layout.name}: {error}") from error
         yield played
 
 
