@@ -115,6 +115,7 @@ def rows(run: Run) -> list[dict[str, Any]]:
                     "published_mean": theirs[0],
                     "published_std": theirs[1],
                     "gain": run.gain(cell),
+                    "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
                     "normalised": normalised(float(means.mean()), headroom.get(cell)),
                 }
             )
@@ -177,6 +178,8 @@ def _cell_text(row: dict[str, Any] | None) -> str:
     if row["published_mean"] is not None:
         text += f"<br>published {row['published_mean']:.1f} ± {row['published_std']:.1f}"
     text += f"<br>gain {row['gain']:+.1f}"
+    if row["headroom"] is False:
+        text += "<br>no headroom"
     if row["normalised"] is not None:
         text += f"<br>normalised {row['normalised']:.2f}"
     return text

@@ -212,6 +212,7 @@ def test_report_shows_the_published_numbers_beside(together):
     run = as_run(evaluate("random", random, SIMPLE, PUBLISHED))
     text = markdown([run])
     assert "published 35.2 ± 0.4" in text
+    assert "<br>no headroom |" in text
     mean = np.mean([together[task.task_id] for task in SIMPLE])
     assert f"| H4 | {mean:.1f} ± " in text
     lines = csv_text([run]).splitlines()
