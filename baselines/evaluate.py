@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,12 +25,14 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from baselines.agents import HostPolicy, Percept
 from generation.env import Environment, EnvState
-from generation.teammates.base import Noise, Policy
+from generation.teammates.base import Noise, Policy, stacked
 from generation.teammates.registry import build, check_theta
 from icrl4aht_data.benchmark import ACTIONS, EGO, KEPT_STEPS, TEAMMATE, track_of, unknown
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.files import file_in_place_of, json_hash
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.tasks import Task
+from icrl4aht_data.threads import usable_cores
 
 _FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 
@@ -104,7 +105,7 @@ class Rollout:
     @property
     def teammate_params(self) -> Any:
         """Of all tasks, stacked on a leading axis."""
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(mate.params for mate in self.teammates))
+        return stacked(mate.params for mate in self.teammates)
 
     def start(self, keys: jax.Array) -> Tables:
         """Task keys (B,) -> tables before the first episode; nothing precedes a task's first step."""
@@ -175,11 +176,7 @@ class Result:
     returns: list[list[float]]  # team return of each episode, by seed
 
     def to_json(self) -> dict[str, Any]:
-        return {"settings_hash": settings_hash(self.settings), **asdict(self)}
-
-
-def settings_hash(settings: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+        return {"settings_hash": json_hash(self.settings), **asdict(self)}
 
 
 def evaluate(
@@ -261,7 +258,7 @@ def compiled_games(
         yield groups[0], first
         yield from ((group, ready(group)) for group in groups[1:])
         return
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=min(4, usable_cores())) as pool:
         try:
             others = [pool.submit(ready, group) for group in groups[1:]]
             yield groups[0], first
@@ -299,8 +296,8 @@ def set_up(
 ) -> Game:
     """Compile the game of tasks that share a layout and a teammate family."""
     layout = tasks[0].layout
-    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks for _ in seeds]
-    rollout = Rollout(layout, make_ego(layout), mates, protocol)
+    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks]
+    rollout = Rollout(layout, make_ego(layout), [mate for mate in mates for _ in seeds], protocol)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)
     tables = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
@@ -377,7 +374,7 @@ def read_result(path: Path) -> Result:
         result = Result(**content)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise OptionError(f"{path}: not a result: {error!r}; remove it and evaluate again") from error
-    if digest != settings_hash(result.settings):
+    if digest != json_hash(result.settings):
         raise OptionError(f"{path}: its settings do not match their hash; remove it and evaluate again")
     return result
 
@@ -387,6 +384,5 @@ def _store(out: Path | None, result: Result) -> None:
         return
     path = _path(out, result.task_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with file_in_place_of(path) as partial:
+        partial.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")

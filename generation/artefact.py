@@ -27,10 +27,10 @@ import numpy as np
 from generation import record
 from generation.learners.ppo import PPOConfig
 from generation.profiles import Profile
-from generation.snapshot import sync_file
+from generation.snapshot import keep_lines, sync_file
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.files import parse_json, read_text, write_json
-from icrl4aht_data.release import file_hash
+from icrl4aht_data.release import file_hash, hashes_hold
 from icrl4aht_data.tasks import Task
 
 METADATA, METRICS, TIMING, LEARNER = "metadata.json", "metrics.jsonl", "timing.jsonl", "learner.safetensors"
@@ -66,7 +66,7 @@ def is_finished(folder: Path, task: Task, profile: Profile) -> bool:
         metadata = parse_json(read_text(folder / METADATA))
         wanted = settings(task, profile)
         same = {name: metadata[name] for name in wanted} == wanted and set(metadata["files"]) == _HASHED
-        return same and all(file_hash(folder / name) == digest for name, digest in metadata["files"].items())
+        return same and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
@@ -111,7 +111,7 @@ class Writer:
         if not first:
             for name, (shape, dtype) in record.shapes(task.layout, config).items():
                 np.lib.format.open_memmap(self._array(name), "w+", dtype, shape)
-        _cut(partial / METRICS, first)
+        keep_lines(partial / METRICS, first)
         self._metrics = (partial / METRICS).open("a", encoding="utf-8")
         self._timing = (partial / TIMING).open("a", encoding="utf-8")
         self._histories = self._mapped()
@@ -185,9 +185,3 @@ def _metrics(metrics: dict[str, Any]) -> dict[str, float]:
     if not values.get("episodes", 1):
         values.pop("return", None)  # no episode ended, so there is no mean of any
     return values
-
-
-def _cut(path: Path, lines: int) -> None:
-    """Leave a text file's first lines alone."""
-    kept = path.read_bytes().splitlines(keepends=True)[:lines] if path.exists() else []
-    path.write_bytes(b"".join(kept))

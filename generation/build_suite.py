@@ -9,16 +9,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from generation.cross_play import EPISODES
 from generation.diversity import actions_on_common_states, between_families, hamming
 from generation.figures import plot_matrix
 from generation.profiles import Profile
 from generation.progress import progress
 from generation.select import Selection, select, write_manifests
-from generation.suite import Run, checkpoints, is_finished, play_matrix, train
+from generation.suite import Run, checkpoints, is_finished, is_trained, play_matrix, train
 from generation.teammates import learned
 from generation.teammates.instances import published_thetas
 from generation.teammates.registry import build
-from icrl4aht_data.benchmark import ALGORITHMS, HEURISTIC_KINDS, TRACKS, track_of, unknown
+from icrl4aht_data.benchmark import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 
@@ -65,7 +66,7 @@ def _place(layout: str) -> int:
 
 
 def _complete(suite: Path, layout: str) -> bool:
-    return all((suite / layout / algorithm / "population.json").is_file() for algorithm in ALGORITHMS)
+    return all(is_trained(suite, layout, algorithm) for algorithm in ALGORITHMS)
 
 
 def _train(run: Run, folder: Path, console: Console) -> None:
@@ -117,13 +118,8 @@ def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool
     returns = play_matrix(suite, layout, algorithm, greedy)
     members = [f"m{k}" for k in range(len(returns))]
     own = np.eye(len(returns), dtype=bool)
-    table = Table(title=f"{algorithm} on {layout.name}: mean return of 20 episodes of 400 steps")
-    table.add_column("seat 0 \\ seat 1")
-    for member in members:
-        table.add_column(member, justify="right")
-    for member, row in zip(members, returns, strict=True):
-        table.add_row(member, *(f"{value:.1f}" for value in row))
-    console.print(table)
+    title = f"{algorithm} on {layout.name}: mean return of {EPISODES} episodes of {EPISODE_STEPS} steps"
+    console.print(_table(title, "seat 0 \\ seat 1", members, returns, ".1f"))
     across = returns[~own].mean() if len(returns) > 1 else float("nan")
     console.print(
         f"self-play {returns[own].mean():.1f}, cross-play {across:.1f}, gap {returns[own].mean() - across:.1f}"
@@ -144,14 +140,19 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
         families[short] = range(len(policies), len(policies) + len(thetas))
         policies += [build(layout, {"family": kind, "theta": theta}) for theta in thetas]
     distances = between_families(hamming(actions_on_common_states(layout, policies)), families)
-    table = Table(title=f"{layout.name}: mean Hamming distance of families")
-    table.add_column("")
-    for family in families:
-        table.add_column(family, justify="right")
-    for family, row in zip(families, distances, strict=True):
-        table.add_row(family, *(f"{value:.2f}" for value in row))
-    console.print(table)
-    path = suite / layout.name / "distances.png"
     labels = list(families)
+    console.print(_table(f"{layout.name}: mean Hamming distance of families", "", labels, distances, ".2f"))
+    path = suite / layout.name / "distances.png"
     plot_matrix(distances, labels, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
     console.print(f"wrote {path} ({track_of(layout.name)} track)")
+
+
+def _table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:
+    """A square matrix, rows and columns by the same names."""
+    table = Table(title=title)
+    table.add_column(corner)
+    for name in names:
+        table.add_column(name, justify="right")
+    for name, row in zip(names, values, strict=True):
+        table.add_row(name, *(f"{value:{form}}" for value in row))
+    return table

@@ -13,7 +13,7 @@ import numpy as np
 
 from generation.env import Environment
 from generation.learners.rollout import policy_player, random_player, roll_out, take_seats
-from generation.teammates.base import Policy
+from generation.teammates.base import Policy, stacked
 from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
@@ -58,8 +58,7 @@ def _families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
     for number, policy in enumerate(policies):
         groups[policy.init, policy.act, policy.sees].append(number)
     for numbers in groups.values():
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(policies[n].params for n in numbers))
-        yield numbers, policies[numbers[0]]._replace(params=stacked)
+        yield numbers, policies[numbers[0]]._replace(params=stacked(policies[n].params for n in numbers))
 
 
 def _play(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from icrl4aht_data.files import file_in_place_of
+
 
 def plot_training(metrics: Path, path: Path, title: str) -> None:
     """Returns over environment steps from a JSON-lines log: self-play, and cross-play where there is any."""
@@ -51,6 +53,5 @@ def plot_matrix(
 
 
 def _save(figure: Figure, path: Path) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    figure.savefig(partial, dpi=110, format=path.suffix.removeprefix("."))
-    partial.replace(path)
+    with file_in_place_of(path) as partial:
+        figure.savefig(partial, dpi=110, format=path.suffix.removeprefix("."))

@@ -19,7 +19,7 @@ from generation.options import Options
 from generation.profiles import Profile
 from generation.progress import Board
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.files import read_text
+from icrl4aht_data.files import file_in_place_of, read_text
 from icrl4aht_data.tasks import Task
 
 FAILED = "failed.jsonl"
@@ -157,9 +157,8 @@ class FailureLog:
             if not after:
                 self.path.unlink(missing_ok=True)
             elif after != before:
-                partial = self.path.with_name(f".{self.path.name}.partial")
-                partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")
-                partial.replace(self.path)
+                with file_in_place_of(self.path) as partial:
+                    partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")
 
 
 def _executor(options: Options) -> Execute:

@@ -64,6 +64,12 @@ def load_state(path: Path, like: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
+def keep_lines(path: Path, lines: int) -> None:
+    """Leave a text file's first lines alone; make an empty one where there is none."""
+    kept = path.read_bytes().splitlines(keepends=True)[:lines] if path.exists() else []
+    path.write_bytes(b"".join(kept))
+
+
 def sync_file(path: Path) -> None:
     """Have the system write a file, or a folder's list of names, to the disk now."""
     descriptor = os.open(path, os.O_RDONLY)

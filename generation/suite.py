@@ -10,7 +10,6 @@ stopped run goes on to the same bytes.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from filelock import FileLock, Timeout
 
@@ -35,12 +33,13 @@ from generation.learners.fcp import FCP
 from generation.learners.lbrdiv import LBRDiv
 from generation.learners.population import Population, PopulationState
 from generation.learners.ppo import PPOConfig
-from generation.snapshot import load_state, read_card, save_state
+from generation.snapshot import keep_lines, load_state, read_card, save_state
+from generation.teammates.base import stacked
 from icrl4aht_data.benchmark import ALGORITHMS, unknown
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import write_json
+from icrl4aht_data.files import file_in_place_of, json_hash, write_json
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.release import file_hash
+from icrl4aht_data.release import file_hash, hashes_hold
 
 CHECKPOINTS = 5
 """Evenly spaced over a policy's training (paper, App. B.1)."""
@@ -92,7 +91,7 @@ class Run:
 
     @property
     def settings_hash(self) -> str:
-        return hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()[:16]
+        return json_hash(self.settings)
 
     @cached_property
     def stages(self) -> list[Population]:
@@ -119,7 +118,7 @@ def is_finished(folder: Path, run: Run) -> bool:
     try:
         content = json.loads((folder / _POPULATION).read_text(encoding="utf-8"))
         same = content["settings_hash"] == run.settings_hash
-        return same and all(file_hash(folder / name) == digest for name, digest in content["files"].items())
+        return same and hashes_hold(folder, content["files"])
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -160,7 +159,7 @@ class _Training:
             )
         notes = read_card(path)
         if notes is None:
-            self._log_until(0)
+            keep_lines(self.folder / _METRICS, 0)
             return 0, None
         if notes["settings_hash"] != self.run.settings_hash:
             raise OptionError(
@@ -168,17 +167,11 @@ class _Training:
             )
         stage = int(notes["stage"])
         state = load_state(path, jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
-        self._log_until(stage * self.run.config.updates + int(state.update))
+        keep_lines(self.folder / _METRICS, stage * self.run.config.updates + int(state.update))
         return stage, state
 
     def _key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
-
-    def _log_until(self, update: int) -> None:
-        """Cut the log back to the updates before this one."""
-        path = self.folder / _METRICS
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-        path.write_text("".join(lines[:update]), encoding="utf-8")
 
     def _train_stage(self, stage: int, resumed: PopulationState | None) -> None:
         population, updates = self.run.stages[stage], self.run.config.updates
@@ -224,7 +217,7 @@ class _Training:
         """Put the former member with which the new one plays best in the frozen one's place (paper, App. B.1,
         "Partner Selection")."""
         network = self.run.stages[stage].network
-        former = _stack([load_policy(self.folder / f"m{m}" / f"c{CHECKPOINTS - 1}")[1] for m in range(stage)])
+        former = stacked([load_policy(self.folder / f"m{m}" / f"c{CHECKPOINTS - 1}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
         returns = cross_play.matrix(self.run.layout, network, new, former, seed=number)[0]
         returns = returns + cross_play.matrix(self.run.layout, network, former, new, seed=number)[:, 0]
@@ -271,14 +264,9 @@ class _Training:
             for path in sorted(self.folder.rglob(name))
         }
         content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
-        partial = self.folder / f"{_POPULATION}.partial"
-        write_json(partial, content)
-        partial.replace(self.folder / _POPULATION)
+        with file_in_place_of(self.folder / _POPULATION) as partial:
+            write_json(partial, content)
         (self.folder / _RESUME).unlink(missing_ok=True)
-
-
-def _stack(params: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *params)
 
 
 @dataclass(frozen=True)
@@ -289,6 +277,11 @@ class Checkpoint:
     card: dict[str, Any]
 
 
+def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
+    """Whether a suite has this population, finished."""
+    return (suite / layout / algorithm / _POPULATION).is_file()
+
+
 def checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Checkpoint]:
     """A population's checkpoints, by member and checkpoint.
 
@@ -296,7 +289,7 @@ def checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Checkpoint
         OptionError: if the population was not finished.
     """
     folder = suite / layout / algorithm
-    if not (folder / _POPULATION).is_file():
+    if not is_trained(suite, layout, algorithm):
         raise OptionError(f"{folder}: no finished population; run `python -m generation teammates --layout {layout}`")
     found = [path.parent for path in folder.glob(f"m*/c*/{WEIGHTS}")]
     for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
@@ -312,9 +305,9 @@ def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = Fals
     """
     last = [point for point in checkpoints(suite, layout.name, algorithm) if point.path.endswith(f"c{CHECKPOINTS - 1}")]
     loaded = [load_policy(suite / point.path) for point in last]
-    members = _stack([params for _, params, _ in loaded])
+    members = stacked([params for _, params, _ in loaded])
     folder = suite / layout.name / algorithm / "responses"
     left = members
     if folder.is_dir():
-        left = _stack([load_policy(folder / f"m{point.card['member']}")[1] for point in last])
+        left = stacked([load_policy(folder / f"m{point.card['member']}")[1] for point in last])
     return cross_play.matrix(layout, loaded[0][0], left, members, greedy=greedy)

@@ -85,12 +85,13 @@ def _one_version(datasets: Sequence[Dataset]) -> str:
 
 def _new_task(dataset: Dataset, task: Task, provenance: dict[str, Any]) -> NewTask:
     ids = dataset.index.query(task_id=task.task_id)
+    return NewTask(task, provenance, len(ids), lambda: stored_histories(dataset.select(ids)))
 
-    def load() -> Iterator[NewHistory]:
-        for history in dataset.select(ids):
-            yield NewHistory(history.entry.env_idx, _Stored(history))
 
-    return NewTask(task, provenance, len(ids), load)
+def stored_histories(dataset: Dataset) -> Iterator[NewHistory]:
+    """The histories of a selection, in order, for another release."""
+    for history in dataset:
+        yield NewHistory(history.entry.env_idx, _Stored(history))
 
 
 class _Stored(Mapping[str, np.ndarray]):

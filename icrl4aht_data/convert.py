@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, KEPT_STEPS, PUBLISHED_ACTIONS
+from icrl4aht_data.combine import stored_histories
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
-from icrl4aht_data.files import parse_json, read_text, write_json
+from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
 from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import FIELDS, PROVENANCE, TASKS, Entry, Kind
+from icrl4aht_data.schema import PROVENANCE, TASKS, Kind
 from icrl4aht_data.store import HELD
 from icrl4aht_data.tasks import Task, read_tasks, write_tasks
 
@@ -89,9 +90,8 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
     done = iter(range(1, len(dataset) + 1))
 
     def load(ids: list[int]) -> Iterator[NewHistory]:
-        for history_id in ids:
-            history = dataset.history(history_id)
-            yield NewHistory(history.entry.env_idx, {name: history.read(name) for name in _stored(history.entry)})
+        for history in stored_histories(dataset.select(ids)):
+            yield history
             advance(next(done), len(dataset))
 
     tasks = [
@@ -106,10 +106,6 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
         card=read_text(dataset.root / "README.md"),
         kept_steps=dataset.info["environment"]["kept_steps"],
     )
-
-
-def _stored(entry: Entry) -> list[str]:
-    return [name for name in HELD if entry.has_expert_actions or not FIELDS[name].optional]
 
 
 def _read_json(path: Path) -> Any:
@@ -145,9 +141,9 @@ def to_published(
         with h5py.File(partial / HISTORIES_H5, "w") as file, (partial / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = file.create_group(f"/{number}")
-                for name in ("obs", *_stored(history.entry)):
-                    if states or FIELDS[name].row != "state":
-                        _write_published(group, name, history.read(name), chunk)
+                for field in history.entry.stored_fields("full"):
+                    if states or field.row != "state":
+                        _write_published(group, field.name, history.read(field.name), chunk)
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
@@ -289,8 +285,7 @@ def to_parquet(dataset: Dataset, path: Path) -> Path:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise OptionError("Parquet needs pyarrow: pip install icrl4aht-data[hf]") from error
-    partial = path.with_name(f".{path.name}.partial")
     with_rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries])
-    pq.write_table(with_rows, partial)
-    partial.replace(path)
+    with file_in_place_of(path) as partial:
+        pq.write_table(with_rows, partial)
     return path

@@ -9,6 +9,7 @@ import numpy as np
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import file_in_place_of
 
 
 def plot_learning_curves(dataset: Dataset, path: Path) -> None:
@@ -58,6 +59,5 @@ def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]])
         axes.set_ylabel("return of the kept steps")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
-    partial = path.with_name(f".{path.name}.partial")
-    figure.savefig(partial, dpi=120, format=path.suffix.removeprefix("."))
-    partial.replace(path)
+    with file_in_place_of(path) as partial:
+        figure.savefig(partial, dpi=120, format=path.suffix.removeprefix("."))

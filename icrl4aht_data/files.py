@@ -1,8 +1,11 @@
-"""Text and JSON files of a release: whatever is wrong with one becomes an error that names it."""
+"""Text and JSON files: whatever is wrong with one becomes an error that names it; written whole or not at all."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,3 +43,19 @@ def parse_json(text: str) -> Any:
 def write_json(path: Path, content: Any) -> None:
     """Indented, for people."""
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def json_hash(content: Any) -> str:
+    """Of settings: the first 16 hexadecimal digits of SHA-256 of their JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@contextmanager
+def file_in_place_of(path: Path) -> Iterator[Path]:
+    """A name beside `path` to write to. At the end the file takes its place at once; after an error nothing changes."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

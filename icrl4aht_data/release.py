@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import write_json
+from icrl4aht_data.files import file_in_place_of, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
@@ -302,12 +302,20 @@ def write_manifest(root: Path) -> None:
     """MANIFEST.sha256 over every other file of the folder, in the format of sha256sum."""
     files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != MANIFEST)
     lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
-    partial = root / f"{MANIFEST}.partial"
-    partial.write_text("".join(lines), encoding="utf-8")
-    partial.replace(root / MANIFEST)
+    with file_in_place_of(root / MANIFEST) as partial:
+        partial.write_text("".join(lines), encoding="utf-8")
 
 
 def file_hash(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
+    """Whether every file (path in the folder -> SHA-256) is as it was.
+
+    Raises:
+        OSError: if one cannot be read.
+    """
+    return all(file_hash(folder / name) == digest for name, digest in files.items())

@@ -45,13 +45,13 @@ class Sampler(Generic[B]):
         *,
         batch_size: int,
         length: int,
-        seed: int,
-        teammate_actions: bool,
-        weights: Weights,
-        episodes: Episodes | None,
-        curriculum: Curriculum | None,
-        process_index: int,
-        process_count: int,
+        seed: int = 0,
+        teammate_actions: bool = False,
+        weights: Weights = "uniform",
+        episodes: Episodes | None = None,
+        curriculum: Curriculum | None = None,
+        process_index: int = 0,
+        process_count: int = 1,
     ) -> None:
         self.batch_size, self.length = whole("batch_size", batch_size, 1), whole("length", length, 1)
         self.seed = whole("seed", seed, 0)

@@ -13,14 +13,16 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from icrl4aht_data.benchmark import unknown
-from icrl4aht_data.draws import Curriculum, Episodes, Weights, below, pick, words
+from icrl4aht_data.draws import below, pick, words
 from icrl4aht_data.errors import LabelsMissingError, OptionError
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.sampler import Group, Sampler
 from icrl4aht_data.store import Source
 
 if TYPE_CHECKING:
-    from icrl4aht_data.dataset import Dataset
+    from typing import Unpack
+
+    from icrl4aht_data.dataset import Dataset, SamplerOptions
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
@@ -86,33 +88,6 @@ class ADSampler(Sampler[ADBatch]):
     Raises:
         OptionError: for impossible options, or a selection of unequal observations.
     """
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        *,
-        batch_size: int,
-        length: int,
-        seed: int = 0,
-        teammate_actions: bool = False,
-        weights: Weights = "uniform",
-        episodes: Episodes | None = None,
-        curriculum: Curriculum | None = None,
-        process_index: int = 0,
-        process_count: int = 1,
-    ) -> None:
-        super().__init__(
-            dataset,
-            batch_size=batch_size,
-            length=length,
-            seed=seed,
-            teammate_actions=teammate_actions,
-            weights=weights,
-            episodes=episodes,
-            curriculum=curriculum,
-            process_index=process_index,
-            process_count=process_count,
-        )
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Which windows batch i holds: history ids and starts, int64 (B,) each."""
@@ -215,27 +190,10 @@ class DPTSampler(Sampler[DPTBatch]):
         *,
         batch_size: int,
         context: int,
-        seed: int = 0,
         order: ContextOrder = "contiguous",
-        teammate_actions: bool = False,
-        weights: Weights = "uniform",
-        episodes: Episodes | None = None,
-        curriculum: Curriculum | None = None,
-        process_index: int = 0,
-        process_count: int = 1,
+        **options: Unpack[SamplerOptions],
     ) -> None:
-        super().__init__(
-            dataset,
-            batch_size=batch_size,
-            length=context,
-            seed=seed,
-            teammate_actions=teammate_actions,
-            weights=weights,
-            episodes=episodes,
-            curriculum=curriculum,
-            process_index=process_index,
-            process_count=process_count,
-        )
+        super().__init__(dataset, batch_size=batch_size, length=context, **options)
         if order not in CONTEXT_ORDERS:
             raise unknown("order", order, CONTEXT_ORDERS)
         unlabelled = dataset.ids[~dataset.column("has_expert_actions")]

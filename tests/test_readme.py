@@ -6,6 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -27,6 +28,13 @@ def commands(start: str) -> list[list[str]]:
     return [shlex.split(line, comments=True)[len(start.split()) :] for line in lines]
 
 
+def understand(group: click.Group, arguments: list[str]) -> None:
+    """The group has the command, and it takes the arguments."""
+    name, command, rest = group.resolve_command(group.make_context("x", ["x"], resilient_parsing=True), arguments)
+    assert command is not None
+    command.make_context(name, rest)
+
+
 @pytest.mark.parametrize("snippet", blocks("python"))
 def test_python_snippets(snippet):
     exec(compile(snippet, "README.md", "exec"), {})
@@ -42,21 +50,13 @@ def test_reader_commands(arguments, tmp_path, monkeypatch):
 @pytest.mark.parametrize("arguments", commands("python -m generation"), ids=" ".join)
 def test_generation_commands_are_understood(arguments):
     """Too long to run here; test_generate runs them on a tiny profile."""
-    name, command, rest = generation_cli.resolve_command(
-        generation_cli.make_context("g", ["x"], resilient_parsing=True), arguments
-    )
-    assert command is not None
-    command.make_context(name, rest)
+    understand(generation_cli, arguments)
 
 
 @pytest.mark.parametrize("arguments", commands("python -m baselines"), ids=" ".join)
 def test_evaluation_commands_are_understood(arguments):
     """Too long to run here; test_evaluate runs them on one task."""
-    name, command, rest = baselines_cli.resolve_command(
-        baselines_cli.make_context("b", ["x"], resilient_parsing=True), arguments
-    )
-    assert command is not None
-    command.make_context(name, rest)
+    understand(baselines_cli, arguments)
 
 
 def test_make_targets_exist():

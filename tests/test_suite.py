@@ -29,6 +29,7 @@ from generation.learners.rollout import policy_player, random_player, roll_out, 
 from generation.select import Selection, make_tasks, select, write_manifests
 from generation.suite import Checkpoint, Run, checkpoints, is_finished, play_matrix, train
 from generation.teammates import learned
+from generation.teammates.base import stacked
 from icrl4aht_data.benchmark import ALGORITHMS, EGO, TEAMMATE
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -162,7 +163,7 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
     folder = population(trained, "fcp")
     for checkpoint in (0, 4):
         loaded = [load_policy(folder / f"m{m}" / f"c{checkpoint}") for m in range(2)]
-        members = suite._stack([params for _, params, _ in loaded])
+        members = stacked([params for _, params, _ in loaded])
         for name, greedy in (("return", False), ("greedy_return", True)):
             returns = cross_play.together(LAYOUT, loaded[0][0], members, members, greedy=greedy)
             assert [card[name] for _, _, card in loaded] == returns.tolist()
@@ -187,8 +188,7 @@ def test_the_play_matrix_seats_best_responses_opposite_members(trained):
     folder = population(trained, "brdiv")
     network, _, _ = load_policy(folder / "m0/c4")
     members, responses = (
-        suite._stack([load_policy(folder / where.format(m))[1] for m in range(2)])
-        for where in ("m{}/c4", "responses/m{}")
+        stacked([load_policy(folder / where.format(m))[1] for m in range(2)]) for where in ("m{}/c4", "responses/m{}")
     )
     expected = cross_play.matrix(LAYOUT, network, responses, members)
     assert expected.shape == (2, 2)

@@ -1,7 +1,8 @@
 """BRDiv: confederates that only their own best response can play with (Rahman et al. 2023; paper, App. B.1).
 
 Policies 0..K-1 are the confederates, in the teammate's seat; K..2K-1 their best responses, in the ego's. Confederate i
-has half of its tables with its own best response, and the others with the rest in turn.
+has three quarters of its tables with its own best response, and the others with the rest in turn: returns are means
+of their terms, so this share only says which of them are known well.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from generation.learners.population import Seating, shared
+from generation.learners.population import Seating
 
 
 def pairs_seating(members: int, environments: int) -> Seating:
@@ -22,11 +23,11 @@ def pairs_seating(members: int, environments: int) -> Seating:
     Raises:
         ValueError: if a confederate has fewer tables for cross-play than there are other best responses.
     """
-    if environments // 2 < members - 1:
-        raise ValueError(f"environments = {environments}: {members} members need at least {2 * members - 2}")
+    if environments // 4 < members - 1:
+        raise ValueError(f"environments = {environments}: {members} members need at least {4 * members - 4}")
     table = np.tile(np.arange(environments), members)
-    conf = shared(members, environments)
-    with_own = table < environments - environments // 2 if members > 1 else np.ones(table.size, bool)
+    conf = np.repeat(np.arange(members), environments)
+    with_own = table < environments - environments // 4 if members > 1 else np.ones(table.size, bool)
     shift = np.where(with_own, 0, 1 + table % max(members - 1, 1))
     response = (conf + shift) % members
     pair = conf * members + response

@@ -52,8 +52,7 @@ class Learner:
         """An untrained ego at fresh tables."""
         weights, tables, running = jax.random.split(key, 3)
         n = self.config.environments
-        obs = jnp.zeros((1, 1, 5, 5, self.env.layout.channels), jnp.uint8)
-        params = self.network.init(weights, self.network.initial_hidden(1), obs, jnp.ones((1, 1), bool))
+        params = self.network.untrained(weights, self.env.layout.channels)
         seats = take_seats(self.env, self.players(params, self.teammate.params), jax.random.split(tables, n))
         return LearnerState(
             params, self.config.optimizer.init(params), seats, self.teammate.params, running, jnp.int32(0)

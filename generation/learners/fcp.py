@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from generation.learners.population import Seating, shared
+from generation.learners.population import Seating
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class FCP:
     members: int
 
     def seating(self, environments: int) -> Seating:
-        member = shared(self.members, environments)
+        member = np.repeat(np.arange(self.members), environments)
         both = np.stack([member, member])
         return Seating(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 

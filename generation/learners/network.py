@@ -155,6 +155,11 @@ class ActorCritic(nn.Module):
         value = _dense(1, 1.0, "critic")(critic)
         return hidden, logits, value[..., 0]
 
+    def untrained(self, key: Array, channels: int) -> Any:
+        """Fresh parameters for observations 5 x 5 x channels."""
+        obs = jnp.zeros((1, 1, WINDOW, WINDOW, channels), jnp.uint8)
+        return self.init(key, self.initial_hidden(1), obs, jnp.ones((1, 1), bool))
+
     def initial_hidden(self, batch: int) -> Float[Array, "N H"]:
         return jnp.zeros((batch, self.widths.gru), jnp.float32)
 

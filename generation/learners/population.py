@@ -145,23 +145,21 @@ class Population:
 
     @cached_property
     def groups(self) -> list[Group]:
-        """Raises ValueError: if a learning policy's places are no multiple of the minibatches."""
         seating, found = self.seating, []
         places = [seating.places(policy) for policy in range(seating.policies)]
         shape = [(policy < seating.learning, len(a), len(b)) for policy, (a, b) in enumerate(places)]
-        for (learns, counting, _), members in groupby(range(seating.policies), key=shape.__getitem__):
+        for (_, counting, _), members in groupby(range(seating.policies), key=shape.__getitem__):
             group = list(members)
-            if learns and counting % self.config.minibatches:
-                raise ValueError(
-                    f"{counting} sequences of a policy: not a multiple of minibatches = {self.config.minibatches}"
-                )
             found.append(Group(group[0], np.stack([np.concatenate(places[p]) for p in group]), counting))
         return found
 
     def init(self, key: Key[Array, ""]) -> PopulationState:
         """Untrained policies, each from a seed of its own, at fresh tables."""
         weights, tables, running = jax.random.split(key, 3)
-        params = jax.lax.map(self._untrained, jax.random.split(weights, self.seating.policies))
+        # Not by vmap: orthogonal initialisers deadlock under it on a CPU.
+        channels = self.env.layout.channels
+        seeds = jax.random.split(weights, self.seating.policies)
+        params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
         seats = take_seats(self.env, self._players(params), jax.random.split(tables, self.seating.tables))
         learning = jax.tree.map(lambda leaf: leaf[: self.seating.learning], params)
         return PopulationState(
@@ -183,10 +181,6 @@ class Population:
         mesh = Mesh(np.array(devices[:count]), ("policy",))
         each = PartitionSpec("policy")
         return jax.shard_map(learn, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
-
-    def _untrained(self, key: Key[Array, ""]) -> Any:
-        obs = jnp.zeros((1, 1, 5, 5, self.env.layout.channels), jnp.uint8)
-        return self.network.init(key, self.network.initial_hidden(1), obs, jnp.ones((1, 1), bool))
 
     def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
         """One roll-out, the epochs of every learning policy over its part of it, the algorithm's own step.
@@ -286,8 +280,3 @@ class Population:
 
 def _put(whole: Any, part: Any, group: Group) -> Any:
     return jax.tree.map(lambda a, b: a.at[group.first : group.first + len(group.places)].set(b), whole, part)
-
-
-def shared(members: int, environments: int) -> np.ndarray:
-    """int (N,): which member a table belongs to."""
-    return np.repeat(np.arange(members), environments)

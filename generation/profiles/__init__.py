@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from generation.learners.ppo import PPOConfig
 from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark import track_of, unknown
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import json_hash
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.tasks import Task, make_task
 
@@ -65,16 +64,12 @@ class Profile:
     @property
     def ego_hash(self) -> str:
         """Of what decides an artefact beyond its task; a change makes artefacts anew."""
-        return _hash(asdict(self.ego))
+        return json_hash(asdict(self.ego))
 
     @property
     def hash(self) -> str:
         """Of all of it."""
-        return _hash(asdict(self))
-
-
-def _hash(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+        return json_hash(asdict(self))
 
 
 def names() -> list[str]:

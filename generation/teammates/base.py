@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -32,6 +32,11 @@ class Sampling(NamedTuple):
 
     presets: tuple[str, ...]
     ranges: dict[str, tuple[float, float] | list[int]]  # (low, high), or the values to choose from
+
+
+def stacked(trees: Iterable[Any]) -> Any:
+    """Pytrees of one shape as one, on a new leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
 def as_params(theta: dict[str, float], defaults: dict[str, float]) -> dict[str, Array]:

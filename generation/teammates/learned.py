@@ -87,9 +87,7 @@ def _functions(widths: Widths, action: Action):
 
 
 def _shapes(network: ActorCritic, layout: Layout) -> dict[str, Any]:
-    obs = jnp.zeros((1, 1, 5, 5, layout.channels), jnp.uint8)
-    args = (jax.random.key(0), network.initial_hidden(1), obs, jnp.ones((1, 1), bool))
-    tree: Any = jax.eval_shape(network.init, *args)
+    tree = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     return jax.tree.map(lambda leaf: leaf.shape, tree["params"])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
 from functools import lru_cache
 from numbers import Real
 from pathlib import Path
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 
 from generation.teammates import assembly_line, learned, recipe_aware_button, territory, utility_greedy
-from generation.teammates.base import Noise, Policy
+from generation.teammates.base import Noise, Policy, as_params
 from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import TaskFormatError
@@ -110,8 +109,7 @@ def build(
         return learned.build_entry(layout, teammate, suite)
     check_theta(teammate)
     module = _module(teammate["family"])
-    init, act = _functions(module, layout, slot, noise)
-    return module.build(layout, teammate["theta"], slot, noise)._replace(init=init, act=act)
+    return _default(module, layout, slot, noise)._replace(params=as_params(teammate["theta"], module.DEFAULTS))
 
 
 def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
@@ -126,10 +124,9 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
 
 
 @lru_cache(maxsize=64)
-def _functions(module, layout: Layout, slot: int, noise: Noise) -> tuple[Callable, Callable]:
-    """The same functions for all teammates of a family, so that they share compilations."""
-    policy = module.build(layout, module.DEFAULTS, slot, noise)
-    return policy.init, policy.act
+def _default(module, layout: Layout, slot: int, noise: Noise) -> Policy:
+    """The family's default; its functions serve all teammates of the family, so that they share compilations."""
+    return module.build(layout, module.DEFAULTS, slot, noise)
 
 
 def check_theta(teammate: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from generation.teammates.base import Noise, Policy, Sampling, first_key, next_key
+from generation.teammates.base import Noise, Policy, Sampling, as_params, first_key, next_key
 from generation.teammates.paths import UNREACHABLE, Paths, Scene
 from icrl4aht_data.benchmark import STAY
 from icrl4aht_data.overcooked.layouts import Layout
@@ -122,7 +122,6 @@ def build(layout: Layout, theta: dict[str, float], slot: int = 1, noise: Noise =
         noise: see `base.Noise`.
     """
     paths = Paths(layout)
-    params = {name: jnp.float32(theta[name]) for name in DEFAULTS}
 
     def init(params, key: Key[Array, ""]) -> Memory:
         return Memory(first_key(noise, slot, key), jnp.int32(-1), jnp.int32(0))
@@ -139,7 +138,7 @@ def build(layout: Layout, theta: dict[str, float], slot: int = 1, noise: Noise =
         )
         return jnp.where(waiting, STAY, action).astype(jnp.int32), after
 
-    return Policy(params, init, act, "state")
+    return Policy(as_params(theta, DEFAULTS), init, act, "state")
 
 
 def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:

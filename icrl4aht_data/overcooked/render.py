@@ -16,6 +16,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark import EGO, TEAMMATE
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import file_in_place_of
 from icrl4aht_data.overcooked import layouts
 from icrl4aht_data.overcooked.layouts import COOKED, PLATE, WINDOW, Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, record_size, unpack
@@ -145,12 +146,8 @@ def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) ->
 
 
 def _write(path: Path, image: Image.Image, **options: Any) -> None:
-    partial = path.with_name(f"{path.name}.partial")
-    try:
+    with file_in_place_of(path) as partial:
         image.save(partial, **options)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:
