@@ -35,7 +35,7 @@ from icrl4aht_data.benchmark import EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.dataset import Dataset, History
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import HISTORIES, KINDS, TASKS
-from icrl4aht_data.tasks import read_tasks
+from icrl4aht_data.tasks import Task, read_tasks
 
 _PAPER_CHUNK = 4096
 _PAPER_DTYPES = {
@@ -55,7 +55,7 @@ class _EnoughError(Exception):
 
 def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
     """The timing of a collection of the profile's last task after so many updates."""
-    task = profile.tasks()[-1]
+    task = _task(profile)
 
     def report(update: int, metrics: dict[str, float]) -> None:
         if update + 1 == updates:
@@ -99,7 +99,7 @@ def memory(updates: int) -> dict[str, Any]:
 def learn_only(updates: int) -> float:
     """Peak MiB of a process that only learns."""
     profile = _wide()
-    learner = make_learner(profile.tasks()[-1], profile)
+    learner = make_learner(_task(profile), profile)
     state, update = jax.jit(learner.init)(jax.random.key(0)), jax.jit(learner.update, donate_argnums=0)
     for _ in range(updates):
         state, *_ = jax.block_until_ready(update(state))
@@ -110,6 +110,11 @@ def learn_and_record(updates: int) -> float:
     """Peak MiB of a process that collects; the histories are synced and the state saved at every update."""
     collect_some(_wide(), updates, save_seconds=0)
     return _peak()
+
+
+def _task(profile: Profile) -> Task:
+    """A task beside a teammate that needs no training."""
+    return replace(profile, presets=("default",)).heuristic_tasks()[-1]
 
 
 def _wide() -> Profile:

@@ -14,8 +14,8 @@ from generation.diversity import actions_on_common_states, between_families, ham
 from generation.figures import plot_matrix
 from generation.profiles import Profile
 from generation.progress import progress
-from generation.select import Selection, select, write_manifests
-from generation.suite import Run, checkpoints, is_finished, is_trained, play_matrix, train
+from generation.select import Selection, layout_number, select, write_manifests
+from generation.suite import PopulationBusyError, Run, checkpoints, is_trained, play_matrix, train
 from generation.teammates import learned
 from generation.teammates.instances import published_thetas
 from generation.teammates.registry import build
@@ -31,23 +31,27 @@ def build_suite(
     seed: int,
     console: Console,
 ) -> None:
-    """Train what is unfinished, then write manifests of tasks for every layout that has all its populations."""
+    """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
+
+    Populations that another process trains are left to it until nothing else is to do, then waited for.
+    """
     names = _names(layouts or profile.layouts)
     for name in algorithms:
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
+    config = profile.teammates
+    todo = []
     for name in names:
         for algorithm in algorithms or ALGORITHMS:
-            config = profile.teammates
-            own_seed = seed + 1000 * _place(name) + 100 * ALGORITHMS.index(algorithm)
-            run = Run(get_layout(name), algorithm, config.members, config.ppo, own_seed)
-            _train(run, suite / name / algorithm, console)
-    finished = [name for name in _names([*profile.layouts, *names]) if _complete(suite, name)]
-    config = profile.teammates
+            own_seed = seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm)
+            todo.append(Run(get_layout(name), algorithm, config.members, config.ppo, own_seed))
+    for wait in (False, True):
+        todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
     selections = [
         select(suite, name, algorithm, config.train, config.heldout, seed)
-        for name in finished
+        for name in _names([*profile.layouts, *names])
         for algorithm in ALGORITHMS
+        if is_trained(suite, name, algorithm)
     ]
     for selection in selections:
         console.print(_in_words(selection, config.train))
@@ -59,21 +63,13 @@ def _names(layouts: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(get_layout(name).name for name in layouts))
 
 
-def _place(layout: str) -> int:
-    """The layout's number among all, so that every population of a suite has a seed of its own."""
-    every = [name for splits in TRACKS.values() for names in splits.values() for name in names]
-    return list(dict.fromkeys(every)).index(layout)
-
-
 def _complete(suite: Path, layout: str) -> bool:
     return all(is_trained(suite, layout, algorithm) for algorithm in ALGORITHMS)
 
 
-def _train(run: Run, folder: Path, console: Console) -> None:
+def _train(run: Run, folder: Path, wait: bool, console: Console) -> bool:
+    """Whether the population is finished now; False if another process is at it."""
     label = f"{run.algorithm} on {run.layout.name}"
-    if is_finished(folder, run):
-        console.print(f"{label}: finished before")
-        return
     last: dict[str, float] = {}
     with progress(console) as bars:
         bar = bars.add_task(label, total=run.updates, note="compiling")
@@ -83,11 +79,18 @@ def _train(run: Run, folder: Path, console: Console) -> None:
             note = f"{metrics['steps_per_second']:,.0f} steps/s, self-play {last.get('self_play', 0.0):.1f}"
             bars.update(bar, completed=update, note=note)
 
-        train(run, folder, report)
+        try:
+            if not train(run, folder, report, wait=wait):
+                console.print(f"{label}: finished before")
+                return True
+        except PopulationBusyError:
+            console.print(f"{label}: another process is training it")
+            return False
     console.print(
         f"{label}: {last['step']:,} steps a member at {last['steps_per_second']:,.0f} steps/s (all tables), "
         f"last self-play return {last.get('self_play', 0.0):.1f} (400 steps)"
     )
+    return True
 
 
 def _in_words(selection: Selection, wanted: int) -> str:

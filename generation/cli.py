@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -28,6 +29,7 @@ def cli() -> None:
 @_profile
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for artefacts and releases.")
 @click.option("--kind", type=click.Choice(KINDS), multiple=True, default=("lite",), show_default=True)
+@click.option("--suite", type=click.Path(path_type=Path), help="Folder of the learned teammates.  [default: OUT/suite]")
 @click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
 @click.option("--executor", type=click.Choice(EXECUTORS), default="local", show_default=True)
 @click.option(
@@ -40,6 +42,7 @@ def generate(
     profile_name: str,
     out: Path,
     kind: tuple[Kind, ...],
+    suite: Path | None,
     bundle: bool,
     executor: Executor,
     address: str | None,
@@ -47,10 +50,10 @@ def generate(
     retries: int,
     fail_fast: bool,
 ) -> None:
-    """Train an ego for every task of a profile, record it, and pack the releases OUT/lite or OUT/full.
+    """Train the teammates and an ego for every task of a profile, record it, and pack OUT/lite or OUT/full.
 
-    Finished tasks are kept, and an unfinished one goes on from its last saved update, so after a stop or a kill the
-    same command goes on where it was. Tasks that fail are listed in OUT/failed.jsonl; the others are finished, nothing
+    What is finished is kept, and what is not goes on from its last saved update: after a stop or a kill the same
+    command goes on where it was. Tasks that fail are listed in OUT/failed.jsonl; the others are finished, nothing
     is packed, and the exit code is 1.
     """
     from generation.build import build_releases
@@ -62,7 +65,7 @@ def generate(
         raise click.UsageError("--address and --workers need --executor ray")
     ask_for_determinism()
     options = Options(executor, address, workers, retries, fail_fast)
-    releases = dict(zip(kind, build_releases(profile_name, out, kind, console, options), strict=True))
+    releases = dict(zip(kind, build_releases(profile_name, out, kind, console, options, suite), strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
@@ -110,17 +113,14 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 @click.option("--layout", default="demo_wide", show_default=True, help="Short or environment name.")
 def speed(profile_name: str, layout: str) -> None:
     """Measure the learner: steps/s, and the share of environment, forward pass and update. Prints one JSON line."""
-    from generation.collect import make_learner
+    from generation.plan import task_learner
     from generation.profiles import load_profile
     from generation.speed import learner_speed
-    from generation.teammates.registry import heuristic_teammate
-    from icrl4aht_data.benchmark import track_of
     from icrl4aht_data.overcooked.layouts import get_layout
-    from icrl4aht_data.tasks import make_task
 
     name = get_layout(layout).name
-    task = make_task(track_of(name), "train", name, heuristic_teammate("utility_greedy", "default", 0), 0)
-    measured = learner_speed(make_learner(task, load_profile(profile_name)))
+    profile = load_profile(profile_name)
+    measured = learner_speed(task_learner(replace(profile, layouts=(name,)), profile.ego))
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
 
 

@@ -50,9 +50,9 @@ class TaskBusyError(OptionError):
     """Another process is at this task."""
 
 
-def make_learner(task: Task, profile: Profile) -> Learner:
-    """The ego of a task, untrained."""
-    mate = build(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE)
+def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
+    """The ego of a task, untrained. `suite` is the folder of learned teammates."""
+    mate = build(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     return Learner(Environment(task.layout), mate, profile.ego)
 
 
@@ -62,12 +62,14 @@ def run_task(
     folder: Path,
     report: Report = lambda update, metrics: None,
     *,
+    suite: Path | None = None,
     wait: bool = False,
     save_seconds: float = SAVE_SECONDS,
 ) -> bool:
     """Train the ego of a task and record its histories into `folder`, from the last saved update if there is one.
 
     Args:
+        suite: the folder of learned teammates, where the task's is one.
         wait: for another process that is at this task, rather than leaving it to that.
         save_seconds: least time between two saves of the learner's state.
 
@@ -82,7 +84,7 @@ def run_task(
         with FileLock(lock_file(folder), timeout=-1 if wait else 0):
             if is_finished(folder, task, profile):
                 return False
-            _run(task, profile, folder, report, save_seconds)
+            _run(task, profile, folder, report, suite, save_seconds)
             return True
     except Timeout as error:
         raise TaskBusyError(
@@ -90,16 +92,18 @@ def run_task(
         ) from error
 
 
-def _run(task: Task, profile: Profile, folder: Path, report: Report, save_seconds: float) -> None:
+def _run(task: Task, profile: Profile, folder: Path, report: Report, suite: Path | None, save_seconds: float) -> None:
     partial = partial_folder(folder)
     if not is_finished(partial, task, profile):  # else it was killed just before it got its name
-        _learn(task, profile, partial, report, save_seconds)
+        _learn(task, profile, partial, report, suite, save_seconds)
         finish(partial, task, profile)
     publish(partial, folder)
 
 
-def _learn(task: Task, profile: Profile, partial: Path, report: Report, save_seconds: float) -> None:
-    learner, card = make_learner(task, profile), resumable_settings(task, profile)
+def _learn(
+    task: Task, profile: Profile, partial: Path, report: Report, suite: Path | None, save_seconds: float
+) -> None:
+    learner, card = make_learner(task, profile, suite), resumable_settings(task, profile)
     state, first = _state(learner, task, partial, card)
     update = compiled_update(learner)
     writer = Writer(partial, task, profile.ego, first)

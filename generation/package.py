@@ -15,9 +15,10 @@ from generation.collect import TEAMMATE_NOISE
 from generation.curate import best_streams, filter_report, plot_filter, relabel
 from generation.learners.checkpoint import load_policy
 from generation.profiles import Profile
+from generation.select import THRESHOLD
 from icrl4aht_data.benchmark import KEPT_STEPS, TEAMMATE
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.release import NewHistory, NewTask, folder_in_place_of, write_release
+from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, folder_in_place_of, write_release
 from icrl4aht_data.schema import Kind, episode_ends
 from icrl4aht_data.statistics import STREAMS_RECORDED
 from icrl4aht_data.tasks import Task
@@ -28,12 +29,13 @@ def package(
     target: Path,
     tasks: Sequence[Task],
     profile: Profile,
+    suite: Path,
     kind: Kind,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
-    """Write a release of these tasks' artefacts; see `write_release`."""
-    new = [_new_task(artefacts / task.task_id, task, profile) for task in tasks]
-    return write_release(target, kind, new, data_version=profile.data_version, card=_card(profile, tasks), done=done)
+    """Write a release of these tasks' artefacts, with the checkpoints of learned teammates; see `write_release`."""
+    new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
+    return write_release(target, kind, new, data_version=profile.data_version, card=_card(profile, new), done=done)
 
 
 def bundle_release(release: Path) -> Path:
@@ -43,7 +45,7 @@ def bundle_release(release: Path) -> Path:
     return MINI
 
 
-def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
+def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTask:
     metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")
     streams = best_streams(rewards, profile.keep)
@@ -63,7 +65,8 @@ def _new_task(folder: Path, task: Task, profile: Profile) -> NewTask:
         "filter": filter_report(rewards, streams),
         "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
     }
-    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams))
+    files = checkpoint_files(suite, task)
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams), files)
 
 
 def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHistory]:
@@ -78,8 +81,10 @@ def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHis
         yield NewHistory(int(stream), recorded | {"dones": dones, "expert_actions": expert})
 
 
-def _card(profile: Profile, tasks: Sequence[Task]) -> str:
+def _card(profile: Profile, new: Sequence[NewTask]) -> str:
+    tasks = [task.task for task in new]
     layouts = ", ".join(dict.fromkeys(task.layout.name for task in tasks))
+    learned = any(task.teammate["kind"] == "rl" for task in tasks)
     return f"""# ICRL4AHT learning histories, profile `{profile.name}`
 
 Learning histories of ego agents (recurrent PPO, from scratch) in OvercookedV2, each beside one fixed teammate.
@@ -88,13 +93,49 @@ Learning histories of ego agents (recurrent PPO, from scratch) in OvercookedV2, 
 * Tasks: {len(tasks)}; of each, the best {profile.keep} of {profile.ego.environments} streams by end + improvement.
 * Each history: {profile.ego.episodes} episodes, the first 100 of 400 steps of each; T = {profile.ego.episodes * 100:,}.
 * Expert actions: the final ego's greedy action, its recurrent state carried through the episode.
+* Teammates: {_teammates(profile) if learned else "presets of the heuristic H4 (`utility_greedy`)"}.
+
+## Learning curves
+
+Mean return of the kept steps, over the kept streams, in the first and in the last tenth of the episodes.
+
+{_curves(new)}
 
 ## What it is not
 
-* The teammates are presets of the heuristic H4 (`utility_greedy`), not the learned ones of the paper's training split,
-  and the presets act alike. H4 is also a family of the benchmark's test side: do not report teammate generalisation
-  from a model trained on this release.
+{_LEARNED.format(steps=profile.teammates.ppo.total_steps) if learned else _PRESETS}
 * On coord_simple and test_simple the ego's room shares nothing with the teammate's: the ego cannot raise the return (on
   coord_simple it can lower it, by pressing the button). A flat, high curve there is the teammate's work.
 * Streams of one task come from one learner: they are not independent runs.
+* The filter keeps the streams that ended best; the mean over all streams is lower (`meta/provenance.json` has both).
 """
+
+
+_PRESETS = """\
+* The teammates are presets of a heuristic, not the learned ones of the paper's training split, and the presets act
+  alike. H4 is also a family of the benchmark's test side: do not report teammate generalisation from a model trained
+  on this release."""
+
+_LEARNED = """\
+* The paper's scale: its teammates learn for 30,000,000 steps and are 80 a layout, its egos learn from 1024 streams.
+  These learned for {steps:,} steps with a narrower network, and are weaker; the egos beside them too."""
+
+
+def _teammates(profile: Profile) -> str:
+    config = profile.teammates
+    return (
+        f"checkpoints of {', '.join(profile.algorithms)} populations of {config.members} ({config.ppo.total_steps:,} "
+        f"steps a member), drawn from those whose greedy return of 400 steps exceeds {THRESHOLD:g}; they act greedily, "
+        f"and `teammates/` has their weights"
+    )
+
+
+def _curves(new: Sequence[NewTask]) -> str:
+    lines = ["| layout | teammate | first | last |", "| --- | --- | ---: | ---: |"]
+    for task in new:
+        kept = task.provenance["filter"]["after"]
+        teammate = f"{task.task.teammate_kind} {task.task.teammate['theta_id']}"
+        lines.append(
+            f"| {task.task.layout.name} | {teammate} | {kept['return_start']:.1f} | {kept['return_end']:.1f} |"
+        )
+    return "\n".join(lines)

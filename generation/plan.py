@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from rich import filesize
 
 from generation import record
-from generation.collect import make_learner
+from generation.env import Environment
+from generation.learners.ego import Learner
+from generation.learners.fcp import FCP
+from generation.learners.population import Population
 from generation.learners.ppo import PPOConfig
 from generation.profiles import Profile
+from generation.suite import Run
+from generation.teammates import learned
+from generation.teammates.registry import build
 from icrl4aht_data.benchmark import KEPT_STEPS
 from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import KINDS, TASKS, Kind
 from icrl4aht_data.tasks import Task, read_tasks
@@ -28,11 +35,24 @@ _WORTH_MEASURING = 20.0
 """Seconds: a whole update that should take less is measured itself, not only a share of it."""
 
 
+class Speed(NamedTuple):
+    """Of a learner on this machine."""
+
+    steps_per_second: float  # of all its environments
+    compile_seconds: float
+
+    def seconds(self, steps: int) -> float:
+        return steps / self.steps_per_second + self.compile_seconds
+
+
 @dataclass(frozen=True)
 class Cost:
-    """Of a whole profile. Hours are of learning and recording; N devices take the tasks in turn."""
+    """Of a whole profile. Hours are of learning and recording; N devices take the populations, then the tasks, in
+    turn."""
 
     profile: str
+    populations: int
+    teammate_steps: int
     tasks: int
     environment_steps: int
     recorded_transitions: int
@@ -41,9 +61,11 @@ class Cost:
     lite_bytes: int
     full_bytes: int
     device: str
+    teammate_steps_per_second: float | None
     steps_per_second: float
     compile_seconds: float  # of each task
-    hours_on_one: float
+    teammate_hours_on_one: float
+    hours_on_one: float  # of everything
     devices: int
     hours_on_devices: float
 
@@ -53,6 +75,9 @@ class Cost:
     def in_words(self) -> Iterator[tuple[str, str]]:
         """(what, how much) in the order to be printed."""
         yield "profile", self.profile
+        if self.teammate_steps_per_second:
+            yield "populations of teammates", f"{self.populations:,}"
+            yield "environment steps of them", f"{self.teammate_steps:,}"
         yield "tasks", f"{self.tasks:,}"
         yield "environment steps", f"{self.environment_steps:,}"
         yield "recorded transitions", f"{self.recorded_transitions:,}"
@@ -62,67 +87,111 @@ class Cost:
         yield "disk, release full", filesize.decimal(self.full_bytes)
         yield "measured here", f"{self.steps_per_second:,.0f} steps/s on {self.device}"
         yield "compiling a task", f"{self.compile_seconds:.0f} s"
+        if self.teammate_steps_per_second:
+            yield "measured, teammates", f"{self.teammate_steps_per_second:,.0f} steps/s"
+            yield "hours, teammates", f"{self.teammate_hours_on_one:,.1f}"
         yield "hours on one such device", f"{self.hours_on_one:,.1f}"
         yield f"hours on {self.devices} of them", f"{self.hours_on_devices:,.1f}"
 
 
 def cost(profile: Profile, devices: int) -> Cost:
-    """Reckoned from the profile, a calibration run of its first task, and a history of the bundled release.
+    """Reckoned from the profile, short calibration runs, and a history of the bundled release.
 
     Args:
-        devices: the N of `hours_on_devices`; each does one task at a time.
+        devices: the N of `hours_on_devices`; each does one population or task at a time.
     """
-    tasks, ego = profile.tasks(), profile.ego
-    speed, compiling = calibrate(tasks[0], profile)
-    seconds = ego.updates * ego.steps_per_update / speed + compiling
-    kept = len(tasks) * profile.keep * ego.episodes * KEPT_STEPS
+    ego, count = profile.ego, profile.tasks_of_a_layout
+    tasks = count * len(profile.layouts)
+    learning = calibrate(ego, partial(task_learner, profile))
+    task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
+    populations = [steps for layout in profile.layouts for steps in population_steps(profile, layout)]
+    playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
+    population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
+    in_turn = _in_turn(population_seconds, devices) + _in_turn([task_seconds] * tasks, devices)
+    kept = tasks * profile.keep * ego.episodes * KEPT_STEPS
     device = jax.devices()[0]
     return Cost(
         profile=profile.name,
-        tasks=len(tasks),
-        environment_steps=len(tasks) * ego.updates * ego.steps_per_update,
-        recorded_transitions=len(tasks) * ego.environments * ego.episodes * KEPT_STEPS,
+        populations=len(populations),
+        teammate_steps=sum(populations),
+        tasks=tasks,
+        environment_steps=tasks * ego.updates * ego.steps_per_update,
+        recorded_transitions=tasks * ego.environments * ego.episodes * KEPT_STEPS,
         kept_transitions=kept,
-        artefact_bytes=artefact_bytes(tasks, ego),
+        artefact_bytes=count * artefact_bytes(profile.layouts, ego),
         **{f"{kind}_bytes": round(kept * bytes_per_transition(kind)) for kind in KINDS},
         device=f"{device.device_kind} ({device.platform})",
-        steps_per_second=round(speed, 1),
-        compile_seconds=round(compiling, 1),
-        hours_on_one=round(len(tasks) * seconds / 3600, 2),
+        teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
+        steps_per_second=round(learning.steps_per_second, 1),
+        compile_seconds=round(learning.compile_seconds, 1),
+        teammate_hours_on_one=round(sum(population_seconds) / 3600, 2),
+        hours_on_one=round((sum(population_seconds) + tasks * task_seconds) / 3600, 2),
         devices=devices,
-        hours_on_devices=round(-(-len(tasks) // devices) * seconds / 3600, 2),
+        hours_on_devices=round(in_turn / 3600, 2),
     )
 
 
-def calibrate(task: Task, profile: Profile) -> tuple[float, float]:
-    """Steps/s of a task's learner on this machine, and the seconds it takes to compile.
+def _in_turn(seconds: Sequence[float], devices: int) -> float:
+    """Until the last is done, if each device takes the next one when it is free."""
+    busy = [0.0] * devices
+    for each in seconds:
+        busy[busy.index(min(busy))] += each
+    return max(busy)
+
+
+def population_steps(profile: Profile, layout: str) -> list[int]:
+    """Environment steps of each population of a layout, over all its tables."""
+    config = profile.teammates
+    runs = [Run(get_layout(layout), algorithm, config.members, config.ppo, 0) for algorithm in profile.algorithms]
+    updates = config.ppo.updates * config.ppo.rollout
+    return [updates * sum(stage.seating.tables for stage in run.stages) for run in runs]
+
+
+def task_learner(profile: Profile, ego: PPOConfig) -> Learner:
+    """The ego of a task of the profile's first layout, beside a teammate of the kind that most tasks have."""
+    layout = get_layout(profile.layouts[0])
+    if profile.algorithms:
+        mate = learned.untrained(layout, profile.teammates.ppo.widths)
+    else:
+        mate = build(layout, profile.heuristic_tasks()[0].teammate)
+    return Learner(Environment(layout), mate, ego)
+
+
+def population(profile: Profile, config: PPOConfig) -> Population:
+    """A population of the profile's first layout."""
+    return Population(Environment(get_layout(profile.layouts[0])), FCP(profile.teammates.members), config)
+
+
+def calibrate(config: PPOConfig, make: Callable[[PPOConfig], Learner | Population]) -> Speed:
+    """The speed of what `make` gives for a configuration.
 
     First an update with the environments of one minibatch, which costs as much a step where the device is kept busy
     by that many; where a whole update should then be short, that is measured instead.
     """
-    ego = profile.ego
-    share = replace(ego, environments=ego.environments // ego.minibatches, minibatches=1)
-    speed, compiling = _measure(task, profile, share)
-    if share != ego and ego.steps_per_update / speed < _WORTH_MEASURING:
-        speed, compiling = _measure(task, profile, ego)
-    return speed, compiling
+    share = replace(config, environments=config.environments // config.minibatches, minibatches=1)
+    speed, steps = _measure(make(share))
+    if share != config and steps * config.minibatches / speed.steps_per_second < _WORTH_MEASURING:
+        speed, _ = _measure(make(config))
+    return speed
 
 
-def _measure(task: Task, profile: Profile, ego: PPOConfig) -> tuple[float, float]:
-    learner = make_learner(task, replace(profile, ego=ego))
+def _measure(learner: Learner | Population) -> tuple[Speed, int]:
+    """Speed, and the steps of an update."""
     began = time.perf_counter()
-    state = jax.jit(learner.init)(jax.random.key(task.seed))
+    state: Any = jax.jit(learner.init)(jax.random.key(0))
     update = jax.jit(learner.update, donate_argnums=0).lower(state).compile()
     compiling = time.perf_counter() - began
     state, *_ = jax.block_until_ready(update(state))
     began = time.perf_counter()
     jax.block_until_ready(update(state))
-    return ego.steps_per_update / (time.perf_counter() - began), compiling
+    tables = learner.seating.tables if isinstance(learner, Population) else learner.config.environments
+    steps = tables * learner.config.rollout
+    return Speed(steps / (time.perf_counter() - began), compiling), steps
 
 
-def artefact_bytes(tasks: Sequence[Task], ego: PPOConfig) -> int:
-    """What the histories of these tasks take, uncompressed."""
-    arrays = (record.shapes(task.layout, ego).values() for task in tasks)
+def artefact_bytes(layouts: Sequence[str], ego: PPOConfig) -> int:
+    """What the histories of one task on each of these layouts take, uncompressed."""
+    arrays = (record.shapes(get_layout(layout), ego).values() for layout in layouts)
     return sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for task in arrays for shape, dtype in task)
 
 

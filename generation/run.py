@@ -46,6 +46,7 @@ class Job:
 
     profile: Profile
     artefacts: Path
+    suite: Path | None  # of the learned teammates
     wait: bool  # for other collectors
 
     def folder(self, task: Task) -> Path:
@@ -53,7 +54,7 @@ class Job:
 
     def __call__(self, task: Task, report: Report = lambda update, metrics: None) -> Literal["done", "busy"]:
         try:
-            run_task(task, self.profile, self.folder(task), report, wait=self.wait)
+            run_task(task, self.profile, self.folder(task), report, suite=self.suite, wait=self.wait)
         except TaskBusyError:
             return "busy"
         return "done"
@@ -84,8 +85,18 @@ def _attempt(job: Job, task: Task, board: Board, attempts: int) -> Outcome:
     return outcome
 
 
-def collect_tasks(tasks: Sequence[Task], profile: Profile, out: Path, console: Console, options: Options) -> None:
+def collect_tasks(
+    tasks: Sequence[Task],
+    profile: Profile,
+    out: Path,
+    console: Console,
+    options: Options,
+    suite: Path | None = None,
+) -> None:
     """Make every task's artefact under out/artefacts. Tasks that another collector is at are left to it, then checked.
+
+    Args:
+        suite: the folder of the learned teammates, where the tasks have any.
 
     Raises:
         CollectionError: if an artefact is missing at the end; out/failed.jsonl says why.
@@ -102,7 +113,7 @@ def collect_tasks(tasks: Sequence[Task], profile: Profile, out: Path, console: C
     failures = FailureLog(out / FAILED)
     with Board(console, len(todo), profile.ego.updates) as board:
         for wait in (False, True):
-            job = Job(profile, artefacts, wait)
+            job = Job(profile, artefacts, suite, wait)
             busy: list[Task] = []
             with closing(execute(job, todo, board, options)) as outcomes:
                 for outcome in outcomes:

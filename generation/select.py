@@ -13,7 +13,7 @@ from generation.learners.checkpoint import WEIGHTS
 from generation.suite import Checkpoint, checkpoints
 from icrl4aht_data.benchmark import ALGORITHMS, TRACKS, track_of
 from icrl4aht_data.release import file_hash
-from icrl4aht_data.tasks import Task, make_task, write_tasks
+from icrl4aht_data.tasks import Task, make_task, read_tasks, write_tasks
 
 THRESHOLD = 20.0
 """Returns of 400 steps that a teammate must exceed (paper, App. B.1)."""
@@ -49,14 +49,34 @@ def select(suite: Path, layout: str, algorithm: str, train: int, heldout: int, s
 
 
 def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list[Task]:
-    """One task per teammate, each with a seed of its own."""
+    """One task per teammate, each with a seed of its own, whatever else is in the suite."""
     tasks = []
     for selection in selections:
+        first = 10_000 * (layout_number(selection.layout) + 1) + 1_000 * ALGORITHMS.index(selection.algorithm)
         chosen = selection.train if split == "train" else selection.heldout
         for number, point in enumerate(chosen):
             entry = _entry(suite, selection.algorithm, number, point)
-            tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed=len(tasks)))
+            seed = first + number + (split != "train") * len(selection.train)
+            tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed))
     return tasks
+
+
+def layout_number(layout: str) -> int:
+    """A layout's place among all, for seeds."""
+    every = [name for splits in TRACKS.values() for names in splits.values() for name in names]
+    return list(dict.fromkeys(every)).index(layout)
+
+
+def training_tasks(suite: Path, layouts: Sequence[str], algorithms: Sequence[str]) -> list[Task]:
+    """The tasks of a suite's training manifests with these layouts and teammates, in the layouts' order."""
+    paths = [path for track in TRACKS if (path := _manifest(suite, track, "train")).is_file()]
+    found = [task for path in paths for task in read_tasks(path)]
+    chosen = [task for task in found if task.layout.name in layouts and task.teammate_kind in algorithms]
+    return sorted(chosen, key=lambda task: layouts.index(task.layout.name))
+
+
+def _manifest(suite: Path, track: str, split: str) -> Path:
+    return suite / "manifests" / f"{track}_{split}.jsonl"
 
 
 def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[str, Any]:
@@ -71,15 +91,15 @@ def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[
 
 def write_manifests(suite: Path, selections: Sequence[Selection]) -> list[Path]:
     """SUITE/manifests/<track>_train.jsonl and _heldout.jsonl of the tracks that have teammates."""
-    folder = suite / "manifests"
-    folder.mkdir(parents=True, exist_ok=True)
     written = []
     for track in TRACKS:
         for split in ("train", "heldout"):
             own = [selection for selection in selections if track_of(selection.layout) == track]
             tasks = make_tasks(suite, own, split)
+            path = _manifest(suite, track, split)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.unlink(missing_ok=True)
             if tasks:
-                path = folder / f"{track}_{split}.jsonl"
                 write_tasks(path, tasks)
                 written.append(path)
     return written

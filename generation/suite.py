@@ -123,18 +123,34 @@ def is_finished(folder: Path, run: Run) -> bool:
         return False
 
 
-def train(run: Run, folder: Path, report: Report = lambda update, updates, metrics: None) -> None:
+class PopulationBusyError(OptionError):
+    """Another process is training this population."""
+
+
+def train(
+    run: Run, folder: Path, report: Report = lambda update, updates, metrics: None, *, wait: bool = False
+) -> bool:
     """Train a population into `folder`, from where a stopped run of the same settings ended.
 
+    Args:
+        wait: for another process that is at it, rather than leaving it to that.
+
+    Returns:
+        Whether there was anything to do; False if the population was finished before.
+
     Raises:
-        OptionError: if another process trains into this folder, or it holds a run of other settings.
+        PopulationBusyError: if another process trains into this folder.
+        OptionError: if it holds a run of other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=0):
+        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=-1 if wait else 0):
+            if is_finished(folder, run):
+                return False
             _Training(run, folder, report).run_on()
+            return True
     except Timeout as error:
-        raise OptionError(f"{folder}: another process is training this population; wait for it") from error
+        raise PopulationBusyError(f"{folder}: another process is training this population; wait for it") from error
 
 
 class _Training:

@@ -11,8 +11,8 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset, History, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import parse_json, read_text
-from icrl4aht_data.release import NewHistory, NewTask, file_hash, write_release
-from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, file_hash, write_release
+from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES
 from icrl4aht_data.tasks import Task, read_tasks
 
 
@@ -85,7 +85,8 @@ def _one_version(datasets: Sequence[Dataset]) -> str:
 
 def _new_task(dataset: Dataset, task: Task, provenance: dict[str, Any]) -> NewTask:
     ids = dataset.index.query(task_id=task.task_id)
-    return NewTask(task, provenance, len(ids), lambda: stored_histories(dataset.select(ids)))
+    files = checkpoint_files(dataset.root / TEAMMATES, task)
+    return NewTask(task, provenance, len(ids), lambda: stored_histories(dataset.select(ids)), files)
 
 
 def stored_histories(dataset: Dataset) -> Iterator[NewHistory]:

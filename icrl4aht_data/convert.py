@@ -24,8 +24,8 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatErro
 from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
-from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import PROVENANCE, TASKS, Kind
+from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, write_release
+from icrl4aht_data.schema import PROVENANCE, TASKS, TEAMMATES, Kind
 from icrl4aht_data.store import HELD
 from icrl4aht_data.tasks import Task, read_tasks, write_tasks
 
@@ -95,7 +95,13 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
             advance(next(done), len(dataset))
 
     tasks = [
-        NewTask(given[name], provenance.get(name, {}), len(ids), lambda ids=ids: load(ids))
+        NewTask(
+            given[name],
+            provenance.get(name, {}),
+            len(ids),
+            lambda ids=ids: load(ids),
+            checkpoint_files(dataset.root / TEAMMATES, given[name]),
+        )
         for name, ids in by_task.items()
     ]
     return write_release(

@@ -8,7 +8,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from icrl4aht_data.schema import (
     MANIFEST,
     PROVENANCE,
     TASKS,
+    TEAMMATES,
     Entry,
     Kind,
     curve_ends,
@@ -67,12 +68,27 @@ class NewTask:
         provenance: how; any JSON.
         streams: the number of histories that `load` gives.
         load: called once, when its shard is written, so that few histories are in memory at a time.
+        files: others that go into the release, path there -> file; see `checkpoint_files`.
     """
 
     task: Task
     provenance: dict[str, Any]
     streams: int
     load: Callable[[], Iterable[NewHistory]]
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+
+def checkpoint_files(folder: Path, task: Task) -> dict[str, Path]:
+    """The files of a task's learned teammate by their path in a release; none for a heuristic, or where there are none.
+
+    Args:
+        folder: what the task's checkpoint path starts from: a suite, or TEAMMATES of a release.
+    """
+    if task.teammate["kind"] != "rl":
+        return {}
+    checkpoint = task.teammate["theta"]["checkpoint"]
+    found = sorted((folder / checkpoint).glob("policy.*"))
+    return {f"{TEAMMATES}/{checkpoint}/{path.name}": path for path in found}
 
 
 def write_release(
@@ -184,6 +200,9 @@ def _fill(
             pass
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
+    for name, source in chain.from_iterable(new.files.items() for new in tasks):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, root / name)
     write_tasks(root / TASKS, [new.task for new in tasks])
     provenance = {new.task.task_id: new.provenance for new in tasks}
     write_json(root / PROVENANCE, provenance)

@@ -19,13 +19,14 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import columns, faults, start
-from icrl4aht_data.release import describe, file_hash
+from icrl4aht_data.release import checkpoint_files, describe, file_hash
 from icrl4aht_data.schema import (
     HISTORIES,
     INFO,
     MANIFEST,
     PROVENANCE,
     TASKS,
+    TEAMMATES,
     Entry,
     curve_ends,
     episode_ends,
@@ -96,6 +97,7 @@ def verify_release(
         report.add("meta", str(error))
         return report
     _check_index(index, tasks, report)
+    _check_teammates(root, tasks, report)
     _check_shards(index, report, advance)
     return report
 
@@ -139,6 +141,16 @@ def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
         missing = {f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count)} - shards
         for name in sorted(missing):
             report.add(name, f"the name of {shard} promises this shard, the index has no history in it")
+
+
+def _check_teammates(root: Path, tasks: list[Task], report: Report) -> None:
+    """Whether the weights of learned teammates are those that the tasks name. A release need not have them."""
+    for task in tasks:
+        for name, path in checkpoint_files(root / TEAMMATES, task).items():
+            found = file_hash(path)
+            expected = task.teammate["theta"]["sha256"]
+            if path.suffix == ".safetensors" and found != expected:
+                report.add(name, f"sha256 {found}, expected {expected} as task {task.task_id!r} says")
 
 
 def _statistics(index: Index, tasks: list[Task]) -> Any:

@@ -31,14 +31,14 @@ def report(update, metrics):
     time.sleep(0.05)
 
 profile = load_profile(sys.argv[1])
-run_task(*profile.tasks(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
+run_task(*profile.heuristic_tasks(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
 """
 
 
 @pytest.fixture
 def task(built):
     profile = load_profile(str(built / "tiny.toml"))
-    return profile.tasks()[0], profile
+    return profile.heuristic_tasks()[0], profile
 
 
 def run_task(task: tuple[Task, Profile], *arguments, **options) -> bool:

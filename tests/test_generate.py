@@ -6,22 +6,31 @@ import json
 import re
 import shutil
 from io import StringIO
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from tiny import TINY, artefact
+from tiny import LEARNED, TINY, artefact
 
 from generation import artefact as artefacts
-from generation import build, collect, run
+from generation import build, collect, run, select, suite
 from generation.artefact import METADATA
 from generation.cli import cli
 from generation.learners.checkpoint import load_policy
 from generation.profiles import load_profile
+from generation.run import CollectionError
+from generation.teammates.registry import recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark import TEAMMATE
+from icrl4aht_data.combine import combine_releases
+from icrl4aht_data.convert import to_release
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.release import write_manifest
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
@@ -79,7 +88,7 @@ def test_a_finished_task_is_not_done_again(built, monkeypatch):
 
 def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
-    (task,) = profile.tasks()
+    (task,) = profile.heuristic_tasks()
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
     assert artefacts.is_finished(folder, task, profile)
@@ -95,7 +104,7 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
 
 def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
     profile = load_profile(str(built / "tiny.toml"))
-    (task,) = profile.tasks()
+    (task,) = profile.heuristic_tasks()
     folder = built / "b" / task.task_id
 
     def stop(update, metrics):
@@ -144,7 +153,7 @@ def test_nothing_but_lines_where_output_is_no_terminal(built):
 
 def test_two_collectors_never_do_one_task_together(built):
     profile = load_profile(str(built / "tiny.toml"))
-    (task,) = profile.tasks()
+    (task,) = profile.heuristic_tasks()
     folder = built / "c" / task.task_id
 
     def meanwhile(update, metrics):
@@ -171,6 +180,88 @@ def test_the_teammate_can_be_rebuilt(built):
     spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
     assert (spec["slot"], spec["noise"]) == (1, "seeded")
     assert build_teammate(LAYOUTS["demo_wide"], spec, spec["slot"], spec["noise"]).sees == "state"
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> Path:
+    """A rebuild beside learned teammates, of which none is too bad to be one. Read only."""
+    out = tmp_path_factory.mktemp("learned")
+    (out / "learned.toml").write_text(LEARNED)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(select, "THRESHOLD", -np.inf)
+        build.build_releases(str(out / "learned.toml"), out, ["lite", "full"], Console(file=StringIO()))
+    return out
+
+
+def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned):
+    """The whole recorded episode: what the rebuilt teammate does on its observations is what it did."""
+    dataset = load_icrl4aht(learned / "lite")
+    assert [task.teammate_kind for task in dataset.entries[::3]] == ["fcp", "brdiv"]
+    assert {entry.teammate_family for entry in dataset.entries} == {"rl"}
+    layout = get_layout("demo_wide")
+    for history in (dataset[0], dataset[3]):
+        mate = recover_teammate(dataset, history.entry.history_id)
+        act = jax.jit(mate.act)
+        obs = observe(layout, history.state[:100], TEAMMATE)
+        memory, played = mate.init(mate.params, jax.random.key(0)), []
+        for view in np.asarray(obs):
+            action, memory = act(mate.params, memory, view, jax.random.key(0))
+            played.append(int(action))
+        assert played == history.teammate_actions[:100].tolist()
+
+
+def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_path):
+    root = tmp_path / "lite"
+    shutil.copytree(learned / "lite", root)
+    assert verify_release(root, deep=True).ok
+    assert verify_release(learned / "full", deep=True).ok
+    weights = next(root.glob("teammates/**/policy.safetensors"))
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    write_manifest(root)
+    (finding,) = verify_release(root).findings
+    assert finding.file == str(weights.relative_to(root))
+    assert "as task 'teammate_train_demo_cook_wide_" in finding.problem
+
+
+def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
+    dataset = load_icrl4aht(learned / "lite")
+    half = to_release(dataset.filter(teammate_kind="brdiv"), tmp_path / "half", "full")
+    other = to_release(dataset.filter(teammate_kind="fcp"), tmp_path / "other", "full")
+    both = combine_releases(tmp_path / "both", [half, other])
+    for root, count in ((half, 1), (both, 2)):
+        assert len(list(root.glob("teammates/**/policy.safetensors"))) == count
+        assert verify_release(root, deep=True).ok
+        recover_teammate(load_icrl4aht(root), 0)
+
+
+def test_the_card_says_who_the_teammates_are(learned):
+    card = (learned / "lite" / "README.md").read_text()
+    assert "checkpoints of fcp, brdiv populations of 2 (4,000 steps a member)" in card
+    assert "| demo_wide | brdiv 0 |" in card
+    assert "H4" not in card
+
+
+def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
+    def never(*arguments):
+        raise AssertionError("something was done again")
+
+    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
+    monkeypatch.setattr(suite._Training, "run_on", never)
+    monkeypatch.setattr(run, "run_task", never)
+    output = StringIO()
+    build.build_releases(str(learned / "learned.toml"), learned, ["lite"], Console(file=output))
+    assert output.getvalue().count("finished before") == 4
+
+
+def test_teammates_that_are_all_too_bad(learned, tmp_path):
+    shutil.copytree(learned / "suite", tmp_path / "suite")
+    with pytest.raises(
+        CollectionError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
+    ):
+        build.build_releases(str(learned / "learned.toml"), tmp_path, ["lite"], Console(file=StringIO()))
+    assert not (tmp_path / "lite").exists()
 
 
 def test_unknown_profile_is_one_line(tmp_path):

@@ -171,12 +171,6 @@ def test_critics_are_told_the_partner_where_partners_vary():
     assert population(FCP(1), partners=2).network.partners == 2
 
 
-def test_sequences_must_divide_among_the_minibatches():
-    config = PPOConfig(environments=8, minibatches=8)
-    with pytest.raises(ValueError, match="10 sequences of a policy: not a multiple of minibatches = 8"):
-        _ = population(CoMeDi(), config).groups
-
-
 # What counts how much.
 
 

@@ -19,7 +19,7 @@ import pytest
 from generation.env import Environment
 from generation.learners.ego import Learner, LearnerState
 from generation.learners.network import Widths
-from generation.learners.ppo import Batch, PPOConfig, Sequences, generalised_advantage, sequences
+from generation.learners.ppo import PPO, Batch, PPOConfig, Sequences, generalised_advantage, sequences
 from generation.learners.rollout import Choice, Rollout, policy_player, roll_out
 from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import EGO, INTERACT, STAY, TEAMMATE
@@ -306,6 +306,22 @@ def test_minibatches_are_shuffled_by_the_key(update, learning):
     one, other = (update(learning._replace(params=params, key=jax.random.key(k))) for k in (5, 6))
     assert same_bytes(one[1], other[1])
     assert not same_bytes(one[0].params, other[0].params)
+
+
+def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
+    """Of four sequences for three minibatches; which one, the key says."""
+    ppo = PPO(CLOSET, learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
+    learn = jax.jit(ppo.learn, compiler_options=FAST)
+    given = egos_sequences(played.before[1], played.rollouts[1])
+
+    def learned_from(sequence: int, seed: int) -> bool:
+        spoilt = given._replace(reward=given.reward.at[:, sequence].set(np.nan))
+        params, _, _ = learn(learning.params, learning.optimizer, spoilt, jax.random.key(seed))
+        return any(np.isnan(leaf).any() for leaf in jax.tree.leaves(params))
+
+    left_out = [[n for n in range(4) if not learned_from(n, seed)] for seed in range(6)]
+    assert all(len(sequences) == 1 for sequences in left_out)
+    assert len({sequence for (sequence,) in left_out}) > 1
 
 
 # Episodes.

@@ -13,7 +13,7 @@ import pytest
 from generation.learners.network import Widths
 from generation.profiles import FOLDER, load_profile, names
 from generation.teammates.registry import heuristic_teammate
-from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.benchmark import ALGORITHMS, TRACKS
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.tasks import make_task, read_tasks, task_id, write_tasks
@@ -90,16 +90,17 @@ def test_shipped_profiles_load(name):
     assert profile.name == name
     assert profile.ego.updates > 0
     assert 0 < profile.keep <= profile.ego.environments
-    tasks = profile.tasks()
-    assert len(tasks) == len(profile.layouts) * len(profile.presets) > 0
+    assert profile.tasks_of_a_layout == len(profile.presets) + len(profile.algorithms) * profile.teammates.train > 0
+    tasks = profile.heuristic_tasks()
+    assert len(tasks) == len(profile.layouts) * len(profile.presets)
     for task in tasks:
         assert task.layout.name in TRACKS[task.track]["train"]
         assert task.split == "train"
 
 
-@pytest.mark.parametrize("name", names())
-def test_every_task_has_a_seed_and_an_id_of_its_own(name):
-    tasks = load_profile(name).tasks()
+def test_every_task_has_a_seed_and_an_id_of_its_own(changed):
+    tasks = load_profile(changed("keep = 8", "keep = 8")).heuristic_tasks()
+    assert len(tasks) == 4
     assert len({task.seed for task in tasks}) == len(tasks)
     assert len({task.task_id for task in tasks}) == len(tasks)
     assert len({(task.layout_name, json.dumps(task.teammate["theta"])) for task in tasks}) == len(tasks)
@@ -114,6 +115,7 @@ def test_paper_profile_has_the_papers_numbers():
     assert (ego.entropy, ego.value, ego.shaping_horizon) == (0.01, 0.5, 60_000_000)
     assert ego.widths == Widths((128, 128, 8), (16, 32, 32), 128, 128, 128)
     assert profile.keep == 128
+    assert (profile.algorithms, profile.presets, profile.tasks_of_a_layout) == (ALGORITHMS, (), 80)
     assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
 
 
@@ -145,7 +147,8 @@ def test_a_profile_by_its_path(changed):
     assert profile.layouts == ("coord_simple", "cramped_up")
     assert profile.ego.widths == Widths((4,), (4,), 8, 8, 8)
     assert (profile.ego.updates, profile.ego.episodes, profile.ego.epochs) == (100, 10, 4)
-    made = [(task.layout.name, task.track, task.teammate["theta"]["inertia"], task.seed) for task in profile.tasks()]
+    tasks = profile.heuristic_tasks()
+    made = [(task.layout.name, task.track, task.teammate["theta"]["inertia"], task.seed) for task in tasks]
     assert made == [
         ("coord_simple", "teammate", 0.3, 0),
         ("coord_simple", "teammate", 0.7, 1),
@@ -165,7 +168,12 @@ def test_a_profile_by_its_path(changed):
         ("presets =", "preset =", r"unknown key 'tasks.preset'; .*Did you mean 'tasks.presets'\?"),
         ("keep = 8", "", r"missing key 'keep'"),
         ('[release]\ndata_version = "0.2.0"\nkeep = 8', "", r"missing key 'release'"),
-        ('presets = ["default", "high_inertia"]', "", r"missing key 'presets'"),
+        (
+            'presets = ["default", "high_inertia"]',
+            "",
+            r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
+        ),
+        ('presets = ["default", "high_inertia"]', 'algorithms = ["fpc"]', r"unknown algorithm 'fpc'; .*mean 'fcp'\?"),
         ('"coord_simple"', '"coord_simpel"', r"unknown layout 'coord_simpel'; .*Did you mean 'coord_simple'\?"),
         ('"default"', '"defualt"', r"unknown preset of utility_greedy 'defualt'; .*Did you mean 'default'\?"),
         ("keep = 8", "keep = 0", r"release\.keep = 0: expected 1\.\.8"),
@@ -183,7 +191,7 @@ def test_a_profile_by_its_path(changed):
         (
             '["coord_simple", "cramped_room_up"]',
             "[]",
-            r"tasks\.layouts and tasks\.presets: expected at least one of each",
+            r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
         ),
         ("total_steps = 32000", "total_steps = 13500", r"ego\.total_steps gives 4 episodes .*expected at least 5"),
         ("keep = 8", "keep 8", r"not TOML: "),
@@ -234,9 +242,8 @@ def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
         make_task("layout", "train", "asymm_right", teammate, 0)
 
 
-@pytest.mark.parametrize("name", names())
-def test_task_files_round_trip(tmp_path, name):
-    tasks = load_profile(name).tasks()
+def test_task_files_round_trip(tmp_path):
+    tasks = load_profile("smoke").heuristic_tasks()
     path = tmp_path / "tasks.jsonl"
     write_tasks(path, tasks)
     assert read_tasks(path) == tasks
@@ -246,7 +253,7 @@ def test_task_files_round_trip(tmp_path, name):
 
 
 def _lines() -> list[str]:
-    return [json.dumps(asdict(task)) for task in load_profile("smoke").tasks()]
+    return [json.dumps(asdict(task)) for task in load_profile("smoke").heuristic_tasks()]
 
 
 def _with(line: str, **fields) -> str:

@@ -31,7 +31,7 @@ from icrl4aht_data import verify_release
 @pytest.fixture
 def tasks(built):
     profile = load_profile(str(built / "pair.toml"))
-    return profile.tasks(), profile
+    return profile.heuristic_tasks(), profile
 
 
 def failures(out: Path) -> list[dict]:
@@ -50,7 +50,7 @@ def failing(monkeypatch, *errors: Exception | None) -> list[int]:
     """Replace the runner by one whose n-th call raises the n-th error; returns the seeds it was called with."""
     calls: list[int] = []
 
-    def run_task(task, profile, folder, report, *, wait):
+    def run_task(task, profile, folder, report, *, suite, wait):
         calls.append(task.seed)
         error = errors[len(calls) - 1] if len(calls) <= len(errors) else None
         if error is not None:
@@ -112,10 +112,10 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     folder = tmp_path / "artefacts" / task.task_id
     folder.parent.mkdir()
     with FileLock(lock_file(folder)):
-        assert run.Job(profile, folder.parent, wait=False)(task) == "busy"
+        assert run.Job(profile, folder.parent, None, wait=False)(task) == "busy"
         shutil.copytree(pair / "artefacts" / task.task_id, folder)
     before = (folder / "metadata.json").stat().st_mtime_ns
-    assert run.Job(profile, folder.parent, wait=True)(task) == "done"
+    assert run.Job(profile, folder.parent, None, wait=True)(task) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 

@@ -26,7 +26,7 @@ from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_poli
 from generation.learners.network import ActorCritic, Widths
 from generation.learners.ppo import PPOConfig
 from generation.learners.rollout import policy_player, random_player, roll_out, take_seats
-from generation.select import Selection, make_tasks, select, write_manifests
+from generation.select import Selection, layout_number, make_tasks, select, write_manifests
 from generation.suite import Checkpoint, Run, checkpoints, is_finished, play_matrix, train
 from generation.teammates import learned
 from generation.teammates.base import stacked
@@ -413,7 +413,10 @@ def test_manifests_read_back(candidates, tmp_path):
     for path, split, count in zip(written, ("train", "heldout"), (20, 5), strict=True):
         tasks = read_tasks(path)
         assert tasks == make_tasks(root, selections, split)
-        assert [task.seed for task in tasks] == list(range(4 * count))
+        first = 20 if split == "heldout" else 0
+        place = layout_number(LAYOUT.name) + 1
+        numbers = [10_000 * place + 1_000 * a + first + n for a in range(4) for n in range(count)]
+        assert [task.seed for task in tasks] == numbers
         assert {task.split for task in tasks} == {split}
         assert [task.teammate_kind for task in tasks] == [a for a in ALGORITHMS for _ in range(count)]
         chosen = [point for own in selections for point in (own.train if split == "train" else own.heldout)]

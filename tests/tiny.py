@@ -31,6 +31,24 @@ presets = ["default"]
 PAIR = TINY.replace('presets = ["default"]', 'presets = ["default", "high_inertia"]')
 """The same task, and one with another teammate."""
 
+LEARNED = TINY.replace('presets = ["default"]', 'algorithms = ["fcp", "brdiv"]').replace(
+    "[release]",
+    """
+[teammates]
+members = 2
+train = 1
+heldout = 1
+total_steps = 4_000
+environments = 8
+rollout = 100
+minibatches = 2
+shaping_horizon = 2_000
+widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
+
+[release]""",
+)
+"""Two tasks beside learned teammates."""
+
 
 def artefact(out: Path, number: int = 0) -> Path:
     """The folder of a finished task, in order of task ids."""

@@ -31,7 +31,7 @@ class PPOConfig:
     environments: int = 1024
     rollout: int = 256  # steps of each environment between updates
     epochs: int = 4
-    minibatches: int = 64  # each of sequences / minibatches whole sequences
+    minibatches: int = 64  # each of sequences // minibatches whole sequences
     learning_rate: float = 2.5e-4
     warmup: float = 0.1  # share of the updates
     discount: float = 0.99
@@ -123,13 +123,17 @@ class PPO:
     def learn(
         self, params: Any, optimizer: optax.OptState, played: Sequences, key: Key[Array, ""]
     ) -> tuple[Any, optax.OptState, dict[str, Array]]:
-        """The epochs over one roll-out: parameters, optimiser state, mean losses."""
+        """The epochs over one roll-out: parameters, optimiser state, mean losses.
+
+        Minibatches are of one size; an epoch leaves out the sequences that fill none, others each time.
+        """
         config = self.config
+        count = played.done.shape[1] - played.done.shape[1] % config.minibatches
         advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)
         batch = Batch(played, advantage, advantage + played.value)
 
         def epoch(carry, key):
-            order = jax.random.permutation(key, played.done.shape[1])
+            order = jax.random.permutation(key, played.done.shape[1])[:count]
 
             def minibatch(carry, chosen):
                 params, optimizer = carry

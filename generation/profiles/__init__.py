@@ -10,7 +10,7 @@ from typing import Any
 from generation.learners.network import Widths
 from generation.learners.ppo import PPOConfig
 from generation.teammates.registry import heuristic_teammate
-from icrl4aht_data.benchmark import track_of, unknown
+from icrl4aht_data.benchmark import ALGORITHMS, track_of, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import json_hash
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -51,15 +51,21 @@ class Profile:
     data_version: str  # of the release, SemVer
     keep: int  # streams of each task that the release keeps, best first
     layouts: tuple[str, ...]
-    presets: tuple[str, ...]  # of the teammate H4 utility_greedy
+    presets: tuple[str, ...] = ()  # teammates that are the heuristic H4 utility_greedy
+    algorithms: tuple[str, ...] = ()  # teammates that learned, `teammates.train` of each
 
-    def tasks(self) -> list[Task]:
-        """One training task per layout and teammate, each with a seed of its own."""
+    def heuristic_tasks(self) -> list[Task]:
+        """One training task per layout and preset, each with a seed of its own."""
         pairs = [(layout, number, preset) for layout in self.layouts for number, preset in enumerate(self.presets)]
         return [
             make_task(track_of(layout), "train", layout, heuristic_teammate("utility_greedy", preset, number), seed)
             for seed, (layout, number, preset) in enumerate(pairs)
         ]
+
+    @property
+    def tasks_of_a_layout(self) -> int:
+        """How many training tasks a layout has, if its populations have teammates enough."""
+        return len(self.presets) + len(self.algorithms) * self.teammates.train
 
     @property
     def ego_hash(self) -> str:
@@ -90,7 +96,7 @@ def load_profile(name: str) -> Profile:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         _only(content, "", {"ego", "teammates", "release", "tasks"})
         _only(content["release"], "release.", {"keep", "data_version"})
-        _only(content["tasks"], "tasks.", {"layouts", "presets"})
+        _only(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
         tasks = content["tasks"]
         profile = Profile(
             name=path.stem,
@@ -99,17 +105,23 @@ def load_profile(name: str) -> Profile:
             data_version=_typed("release.data_version", content["release"]["data_version"], str),
             keep=_typed("release.keep", content["release"]["keep"], int),
             layouts=tuple(get_layout(layout).name for layout in _names("tasks.layouts", tasks["layouts"])),
-            presets=_names("tasks.presets", tasks["presets"]),
+            presets=_names("tasks.presets", tasks.get("presets", [])),
+            algorithms=_names("tasks.algorithms", tasks.get("algorithms", [])),
         )
-        profile.tasks()
+        profile.heuristic_tasks()
     except tomllib.TOMLDecodeError as error:
         raise OptionError(f"{path}: not TOML: {error}") from error
     except KeyError as error:
         raise OptionError(f"{path}: missing key {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise OptionError(f"{path}: {error}") from error
-    if not profile.tasks():
-        raise OptionError(f"{path}: tasks.layouts and tasks.presets: expected at least one of each")
+    for name in profile.algorithms:
+        if name not in ALGORITHMS:
+            raise OptionError(f"{path}: {unknown('algorithm', name, ALGORITHMS)}")
+    if not (profile.layouts and profile.tasks_of_a_layout):
+        raise OptionError(
+            f"{path}: expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms"
+        )
     if not 0 < profile.keep <= profile.ego.environments:
         raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
     if profile.ego.episodes < 5:

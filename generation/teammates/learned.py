@@ -44,6 +44,13 @@ def build(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
     return Policy({"params": jax.tree.map(jnp.asarray, weights)}, init, act, "observation")
 
 
+def untrained(layout: Layout, widths: Widths) -> Policy:
+    """A checkpoint that has learned nothing, for measuring."""
+    init, act = _functions(widths, "greedy")
+    params = ActorCritic(widths, critic=False).untrained(jax.random.key(0), layout.channels)
+    return Policy(params, init, act, "observation")
+
+
 def build_entry(layout: Layout, teammate: dict[str, Any], suite: Path | None, action: Action = "greedy") -> Policy:
     """The policy of a task's teammate entry of kind "rl".
 

@@ -18,6 +18,7 @@ from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import TaskFormatError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.schema import TEAMMATES
 
 _FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
 
@@ -96,7 +97,7 @@ def build(
         teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.tasks.Task`.
         slot: 0 or 1, the agent it plays.
         noise: of heuristics, see `base.Noise`.
-        suite: the folder that checkpoints are in: a suite's, or a release's.
+        suite: the folder that checkpoints are in: a suite, or TEAMMATES of a release.
 
     Raises:
         UnknownNameError: for a family that does not exist.
@@ -120,7 +121,7 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
     """
     entry = dataset.recover_teammate(history_id)
     layout = get_layout(dataset.index.entry(history_id).layout)
-    return build(layout, entry, entry.get("slot", TEAMMATE), entry.get("noise", "seeded"), dataset.root)
+    return build(layout, entry, entry.get("slot", TEAMMATE), entry.get("noise", "seeded"), dataset.root / TEAMMATES)
 
 
 @lru_cache(maxsize=64)
