@@ -96,12 +96,12 @@ def test_confederates_sit_in_seat_1_and_best_responses_in_seat_0(algorithm, memb
 
 
 @pytest.mark.parametrize(("members", "environments"), [(2, 8), (3, 8), (4, 24), (10, 256)])
-def test_every_pair_plays_half_of_all_tables_self_play(members, environments):
+def test_every_pair_plays_three_quarters_of_all_tables_self_play(members, environments):
     responses, confederates = BRDiv(members).seating(environments).policy
     pairs = np.zeros((members, members), int)
     np.add.at(pairs, (confederates, responses - members), 1)
     assert (pairs > 0).all()
-    np.testing.assert_array_equal(pairs.diagonal(), environments - environments // 2)
+    np.testing.assert_array_equal(pairs.diagonal(), environments * 3 // 4)
     others = pairs[~np.eye(members, dtype=bool)]
     assert others.max() - others.min() <= 1
     np.testing.assert_array_equal(pairs.sum(axis=1), environments)
