@@ -548,6 +548,22 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5)
 
 
+def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
+    whole, before = lbrdiv.population, lbrdiv.before
+    lowered = np.asarray(whole._place_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
+    assert 0 < lowered.sum() < lowered.size
+    shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
+
+    @compiled
+    def learned(shaped):
+        rollout = lbrdiv.rollout._replace(shaped=shaped)
+        return whole._learn(before, whole._players(before.params), lbrdiv.seats, rollout, jax.random.key(1))[0]
+
+    params = learned(shaped)
+    assert same_bytes(params, learned(np.where(lowered, 0.0, shaped)))
+    assert not same_bytes(params, learned(np.where(lowered, shaped, 0.0)))
+
+
 def test_the_multipliers_follow_the_returns_of_the_tables(lbrdiv):
     seating, returns = lbrdiv.population.seating, np.asarray(lbrdiv.rollout.returns)[-1]
     table = np.full((4, 4), np.nan)

@@ -230,7 +230,8 @@ class Population:
             if group.first >= self.seating.learning:
                 continue
             last, _ = player.act(seats.memories[number], seats.env, key)
-            played = sequences(rollout, number, player.places, state.seats.memories[number], last.value, shaping)
+            raised = shaping * (weight[player.places] >= 0)  # shaping shows the way up, and nothing else
+            played = sequences(rollout, number, player.places, state.seats.memories[number], last.value, raised)
             played = played._replace(
                 partner=jnp.asarray(self.seating.opposite[player.places])[None], weight=weight[player.places][None]
             )

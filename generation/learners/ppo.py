@@ -94,7 +94,8 @@ class Sequences(NamedTuple):
 def sequences(
     rollout: Rollout, player: int, places: np.ndarray, hidden: Array, last_value: Array, shaping: Array
 ) -> Sequences:
-    """What one player's roll-out is to its learning; all partners 0, all weights 1."""
+    """What one player's roll-out is to its learning; all partners 0, all weights 1. `shaping` is the weight of shaped
+    rewards, one or (M,)."""
     seat, table = np.divmod(places, rollout.done.shape[1])
     choice = rollout.choices[player]
     return Sequences(
