@@ -128,15 +128,16 @@ def test_comedi_has_a_quarter_each_of_self_play_cross_play_mixed_play_and_its_st
     np.testing.assert_array_equal(mixed[:, ::2], 0)
     np.testing.assert_array_equal(mixed[:, 1::2].sum(axis=0), 1)
     np.testing.assert_array_equal(terms[2], -1)
-    np.testing.assert_array_equal(from_mixed, 0)
-    np.testing.assert_array_equal(terms[3], 2)
+    np.testing.assert_array_equal(from_mixed, mixed)
+    np.testing.assert_array_equal(terms[3][:, ::2], 2)
+    np.testing.assert_array_equal(terms[3][:, 1::2], np.where(mixed[:, 1::2] == 0, 3, -1))
     tables = np.arange(environments)
     np.testing.assert_array_equal(seating.starts_from, np.where(tables < 3 * quarter, -1, tables - quarter))
     assert (seating.learning, seating.policies) == (1, 2)
     np.testing.assert_array_equal(seating.self_play, (seating.policy == 0).all(axis=0))
-    assert seating.places(0)[0].size == 5 * quarter
+    assert seating.places(0)[0].size == 2 * quarter + quarter + quarter * 3 // 2
     assert seating.places(1)[0].size == 0
-    assert seating.places(0)[1].size + seating.places(1)[1].size == 3 * quarter
+    assert seating.places(0)[1].size + seating.places(1)[1].size == 2 * quarter + quarter + quarter // 2
 
 
 def test_comedi_mixes_the_frozen_member_into_both_seats():
@@ -186,7 +187,8 @@ def by_hand(algorithm: Any, memory: Any) -> np.ndarray:
         elif isinstance(algorithm, CoMeDi):
             quarter = table // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: beta / 8}[quarter]
+            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # half of J_MP over 4 places, half over 2
+            both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, table] = [both * (left == 0), both * (right == 0)]
         else:
             i, j = int(right), int(left) - k
