@@ -32,8 +32,7 @@ from icrl4aht_data.convert import to_published, to_release
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.sampling import ADSampler
-from icrl4aht_data.schema import FIELDS
-from icrl4aht_data.store import HELD
+from icrl4aht_data.schema import held_fields
 from icrl4aht_data.tasks import read_tasks
 
 TARGETS = {  # (how held, observations) -> least ratio to the published and to the fair reader
@@ -73,8 +72,8 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
         for number in range(histories):
             history, episodes = source[number % len(source)], number // len(source)
             arrays = {
-                name: np.roll(history.read(name), episodes * (kept if FIELDS[name].axis == "T" else 1), axis=0)
-                for name in HELD
+                field.name: np.roll(history.read(field.name), episodes * (kept if field.axis == "T" else 1), axis=0)
+                for field in held_fields("lite")
             }
             yield NewHistory(number, arrays)
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from icrl4aht_data.benchmark import KEPT_STEPS
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.schema import KINDS
+from icrl4aht_data.schema import ALL_KINDS, OBSERVATIONS
 
 _root = click.argument("root", required=False, type=click.Path(path_type=Path))
 _json = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
@@ -102,6 +102,7 @@ def show(
         facts = {
             "root": str(dataset.root),
             **describe(info["kind"], info["data_version"], kept_steps, dataset.entries),
+            **({"lacks": lacks} if (lacks := _lacks(dataset)) else {}),
             "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
         }
     else:
@@ -109,8 +110,9 @@ def show(
         facts = {
             **dataset[0].entry.to_json(),
             "environment": dataset.recover_environment(history_id),
-            "teammate": dataset.recover_teammate(history_id),
         }
+        if dataset.knows_tasks:
+            facts["teammate"] = dataset.recover_teammate(history_id)
     if plot is not None:
         from icrl4aht_data.figures import plot_learning_curves
 
@@ -123,6 +125,17 @@ def show(
         click.echo(repr(dataset))
     for name, value in facts.items():
         click.echo(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
+
+
+def _lacks(dataset: Dataset) -> list[str]:
+    """What a full or lite release would have, in words."""
+    without = len(dataset) - int(dataset.column("has_teammate_actions").sum())
+    lacks = {
+        "state records: nothing can be replayed or drawn, obs='state' is refused": not dataset.has_states,
+        "tasks: teammates are known by family and kind only": not dataset.knows_tasks,
+        f"teammate actions of {without} histories": without > 0,
+    }
+    return [what for what, missing in lacks.items() if missing]
 
 
 @cli.command()
@@ -151,28 +164,40 @@ def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
                 f"{report.transitions:,} transitions"
             )
             verdict = "whole" if report.ok else f"{len(report.findings)} problems"
-            click.echo(f"{report.root}: {verdict}; checked {looked}{' and their physics' if deep else ''}")
+            physics = " and their physics" if deep and not report.notes else ""
+            click.echo("\n".join([f"{report.root}: {verdict}; checked {looked}{physics}", *report.notes]))
     sys.exit(0 if report.ok else 1)
 
 
 @cli.command()
 @click.argument("source", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("target", type=click.Path(path_type=Path))
-@click.option("--to", "form", required=True, type=click.Choice(["full", "lite", "published", "parquet"]))
+@click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]))
 @click.option(
     "--tasks", type=click.Path(path_type=Path), help="Tasks of published files; their tasks.jsonl by default."
 )
 @click.option(
-    "--kept-steps", type=int, default=KEPT_STEPS, show_default=True, help="Steps an episode of published files."
+    "--kept-steps",
+    type=click.IntRange(min=1),
+    default=KEPT_STEPS,
+    show_default=True,
+    help="Steps an episode of published files.",
 )
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @_filters
 def convert(
-    source: Path, target: Path, form: str, tasks: Path | None, kept_steps: int, quiet: bool, **filters: tuple[str, ...]
+    source: Path,
+    target: Path,
+    form: str | None,
+    tasks: Path | None,
+    kept_steps: int,
+    quiet: bool,
+    **filters: tuple[str, ...],
 ) -> None:
     """Convert SOURCE, a release or a folder with the published code's histories.h5, into TARGET.
 
-    full and lite are releases, published is the published code's two files, parquet is the index as one file.
+    full, lite and observations are releases, published is the published code's two files, parquet is the index as one
+    file. Published files become lite by default, or observations where they have no state records.
     """
     from icrl4aht_data import convert as forms
 
@@ -184,16 +209,19 @@ def convert(
             bars.update(bar, completed=done, total=total)
 
         if (source / forms.HISTORIES_H5).exists():
-            if form not in KINDS or any(filters.values()):
-                raise click.UsageError("published files convert to full or lite, and whole")
-            forms.from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
-        elif form in KINDS:
+            if (form is not None and form not in ALL_KINDS) or any(filters.values()):
+                raise click.UsageError("published files convert to full, lite or observations, and whole")
+            form = forms.from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
+        elif form is None:
+            raise click.UsageError("say what to make of a release: --to full, lite, observations, published or parquet")
+        elif form in ALL_KINDS:
             forms.to_release(_load(source, filters), target, form, advance=advance)
         elif form == "published":
             forms.to_published(_load(source, filters), target, advance=advance)
         else:
             forms.to_parquet(_load(source, filters), target)
-    click.echo(f"{target}: {form}")
+    lacking = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
+    click.echo(f"{target}: {form}{lacking}")
 
 
 @cli.command()

@@ -31,7 +31,7 @@ _DTYPES = {"int": np.int64, "bool": np.bool_, "float": np.float64, "int | None":
 _NUMBERS = {field.name: _DTYPES[str(field.type)] for field in fields(Entry) if str(field.type) in _DTYPES}
 _STRINGS = tuple(field.name for field in fields(Entry) if str(field.type) == "str")
 _DERIVED = ("history_id", "obs_shape")  # the row, and the layout's: checked, not stored
-_RULED = ("track", "split", "layout", "teammate_family", "obs_shape", "action_dim", "has_teammate_actions", "shard")
+_RULED = ("track", "split", "layout", "teammate_family", "obs_shape", "action_dim", "shard")
 
 Block = dict[str, tuple[list[Any] | np.ndarray, np.ndarray]]
 """column -> values, and which of them each line has"""
@@ -323,8 +323,8 @@ def check_entry(entry: Entry, number: int) -> None:
     expected = LAYOUTS[entry.layout].obs_shape
     if entry.obs_shape != expected:
         raise IndexFormatError(f"obs_shape {list(entry.obs_shape)}, expected {list(expected)} for {entry.layout}")
-    if entry.action_dim != len(ACTIONS) or not entry.has_teammate_actions:
-        raise IndexFormatError(f"expected action_dim {len(ACTIONS)} and has_teammate_actions true")
+    if entry.action_dim != len(ACTIONS):
+        raise IndexFormatError(f"expected action_dim {len(ACTIONS)}, found {entry.action_dim}")
     folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
     if not re.fullmatch(rf"{folder}-\d{{5}}-of-\d{{5}}\.h5", entry.shard):
         raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")

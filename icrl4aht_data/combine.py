@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.dataset import Dataset, History, load_icrl4aht
+from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, file_hash, write_release
-from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES
-from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
+from icrl4aht_data.tasks import Task, named_task, read_tasks
 
 
 def combine_releases(
@@ -45,7 +45,7 @@ def combine_releases(
     new = []
     for dataset in datasets:
         provenance = parse_json(read_text(dataset.root / PROVENANCE))
-        for task in read_tasks(dataset.root / TASKS):
+        for task in release_tasks(dataset):
             if task.task_id in owners:
                 raise OptionError(f"{dataset.root}: task {task.task_id} is also in {owners[task.task_id]}")
             owners[task.task_id] = dataset.root
@@ -86,26 +86,35 @@ def _one_version(datasets: Sequence[Dataset]) -> str:
 def _new_task(dataset: Dataset, task: Task, provenance: dict[str, Any]) -> NewTask:
     ids = dataset.index.query(task_id=task.task_id)
     files = checkpoint_files(dataset.root / TEAMMATES, task)
-    return NewTask(task, provenance, len(ids), lambda: stored_histories(dataset.select(ids)), files)
+    return NewTask(
+        task, provenance, len(ids), lambda: stored_histories(dataset.select(ids), dataset.info["kind"]), files
+    )
 
 
-def stored_histories(dataset: Dataset) -> Iterator[NewHistory]:
-    """The histories of a selection, in order, for another release."""
+def release_tasks(dataset: Dataset) -> list[Task]:
+    """The tasks of a selection's release; of a release whose tasks were not given, those of the selection, by name."""
+    if dataset.knows_tasks:
+        return read_tasks(dataset.root / TASKS)
+    return list({entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}.values())
+
+
+def stored_histories(dataset: Dataset, kind: Kind) -> Iterator[NewHistory]:
+    """The histories of a selection, in order, for another release of that kind."""
     for history in dataset:
-        yield NewHistory(history.entry.env_idx, _Stored(history))
+        names = [field.name for field in held_fields(kind) if history.entry.has(field)]
+        yield NewHistory(history.entry.env_idx, Deferred(names, history.read))
 
 
-class _Stored(Mapping[str, np.ndarray]):
+class Deferred(Mapping[str, np.ndarray]):
     """A history's arrays, each read when it is asked for, so that a shard's worth of them need not fit in memory."""
 
-    def __init__(self, history: History) -> None:
-        self._history = history
-        self._names = [field.name for field in history.entry.stored_fields("lite")]
+    def __init__(self, names: Sequence[str], read: Callable[[str], np.ndarray]) -> None:
+        self._names, self._read = names, read
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._names:
             raise KeyError(name)
-        return self._history.read(name)
+        return self._read(name)
 
     def __contains__(self, name: object) -> bool:
         return name in self._names

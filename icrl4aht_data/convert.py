@@ -3,8 +3,8 @@
 The published code keeps all histories in `histories.h5`, a group each, observations as float32 in gzip-6 chunks of 4096
 steps, action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3). What we
 write beside that, its readers pass over: each group's `state` and `episode_end_state`, `tasks.jsonl` and
-`provenance.json`. With them the way back loses nothing; without states there is no way back, since an observation shows
-a part of the kitchen only.
+`provenance.json`. With them the way back loses nothing. Without states, which observations do not determine, it ends in
+a release of observations; without tasks, in one that knows them by name.
 """
 
 from __future__ import annotations
@@ -18,16 +18,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, KEPT_STEPS, PUBLISHED_ACTIONS
-from icrl4aht_data.combine import stored_histories
+from icrl4aht_data.combine import Deferred, release_tasks, stored_histories
 from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.draws import whole
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
 from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
 from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, write_release
-from icrl4aht_data.schema import PROVENANCE, TASKS, TEAMMATES, Kind
-from icrl4aht_data.store import HELD
-from icrl4aht_data.tasks import Task, read_tasks, write_tasks
+from icrl4aht_data.schema import (
+    ACTION_FIELDS,
+    FIELDS,
+    JSON_TYPES,
+    KINDS,
+    OBSERVATIONS,
+    PROVENANCE,
+    TASKS,
+    TEAMMATES,
+    Kind,
+    episode_ends,
+    held_fields,
+)
+from icrl4aht_data.tasks import Task, named_task, read_tasks, write_tasks
 
 if TYPE_CHECKING:
     import h5py
@@ -58,7 +70,6 @@ PUBLISHED_FIELDS = (
 
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)
 _FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
-_ACTIONS = ("actions", "teammate_actions", "expert_actions")
 
 Advance = Callable[[int, int], None]
 """Called with how many histories are done, and how many there are."""
@@ -74,15 +85,21 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
     Args:
         dataset: all of a release, or a part.
         target: the folder to make; a release that is there is replaced.
-        kind: "full" or "lite".
+        kind: "full", "lite" or "observations"; the last alone if the dataset has no states.
         advance: progress.
 
     Raises:
-        OptionError: if `target` holds something else, or is the dataset's own folder.
+        OptionError: if `target` holds something else, or is the dataset's own folder, or if states are needed that are
+            not there.
     """
+    if kind in KINDS and not dataset.has_states:
+        raise OptionError(
+            f"{dataset.root}: has observations only, and a {kind} release is made of state records, which observations "
+            f"do not determine; convert to {OBSERVATIONS}, published or parquet"
+        )
     if target.resolve() == dataset.root.resolve():
         raise OptionError(f"{target}: the release itself; give another folder")
-    given = {task.task_id: task for task in read_tasks(dataset.root / TASKS)}
+    given = {task.task_id: task for task in release_tasks(dataset)}
     provenance = _read_json(dataset.root / PROVENANCE)
     by_task: dict[str, list[int]] = {}
     for entry in dataset.entries:
@@ -90,7 +107,7 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
     done = iter(range(1, len(dataset) + 1))
 
     def load(ids: list[int]) -> Iterator[NewHistory]:
-        for history in stored_histories(dataset.select(ids)):
+        for history in stored_histories(dataset.select(ids), kind):
             yield history
             advance(next(done), len(dataset))
 
@@ -130,7 +147,8 @@ def to_published(
         dataset: all of a release, or a part.
         target: the folder to make.
         chunk: steps per chunk.
-        states: also store the state records, without which `from_published` cannot make a release.
+        states: also store the state records, if there are any: without them `from_published` makes a release of
+            observations.
         advance: progress.
 
     Raises:
@@ -143,18 +161,20 @@ def to_published(
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
+    kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
     try:
         with h5py.File(partial / HISTORIES_H5, "w") as file, (partial / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = file.create_group(f"/{number}")
-                for field in history.entry.stored_fields("full"):
-                    if states or field.row != "state":
-                        _write_published(group, field.name, history.read(field.name), chunk)
+                for field in history.entry.stored_fields(kind):
+                    _write_published(group, field.name, history.read(field.name), chunk)
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
         wanted = {entry.task_id for entry in dataset.entries}
-        write_tasks(partial / "tasks.jsonl", [t for t in read_tasks(dataset.root / TASKS) if t.task_id in wanted])
+        tasks = [task for task in read_tasks(dataset.root / TASKS) if task.task_id in wanted]
+        if tasks:
+            write_tasks(partial / "tasks.jsonl", tasks)
         provenance = _read_json(dataset.root / PROVENANCE)
         write_json(partial / "provenance.json", {name: value for name, value in provenance.items() if name in wanted})
         if target.exists():
@@ -166,7 +186,7 @@ def to_published(
 
 
 def _write_published(group: h5py.Group, name: str, array: np.ndarray, chunk: int) -> None:
-    if name in _ACTIONS:
+    if name in ACTION_FIELDS:
         array = _TO_PUBLISHED[array]
     elif name == "obs":
         array = array.astype(np.float32)
@@ -177,60 +197,103 @@ def _write_published(group: h5py.Group, name: str, array: np.ndarray, chunk: int
 def from_published(
     source: Path,
     target: Path,
-    kind: Kind,
+    kind: Kind | None = None,
     *,
     tasks: Path | None = None,
     data_version: str = "0.1.0",
     kept_steps: int = KEPT_STEPS,
     advance: Advance = _quiet,
-) -> Path:
+) -> Kind:
     """A release from a folder with the published code's two files.
 
     Args:
         source: a folder with `histories.h5` and `histories_index.jsonl`.
         target: the folder to make; a release that is there is replaced.
-        kind: "full" or "lite".
-        tasks: a JSONL file with the tasks that the index names; by default `tasks.jsonl` in `source`.
+        kind: by default "lite" if the groups have state records, "observations" if none has.
+        tasks: a JSONL file with the tasks that the index names; by default `tasks.jsonl` in `source`. A release of
+            observations may do without: it then knows of its tasks what the index says.
         data_version: SemVer of the data.
-        kept_steps: steps of every episode.
+        kept_steps: steps of every episode; an unfinished one may end a history.
         advance: progress.
 
+    Returns:
+        The kind of release that was made.
+
     Raises:
-        PublishedFormatError: if a file is missing or malformed, or a group lacks the state records; names it.
+        PublishedFormatError: if a file is missing or malformed, or a group lacks what a release of that kind is made
+            of; names file and group.
     """
     import h5py
 
+    kept_steps = whole("kept_steps", kept_steps, 1)
     lines = _read_index(source / HISTORIES_INDEX)
-    tasks = source / "tasks.jsonl" if tasks is None else tasks
-    if not tasks.is_file():
-        raise PublishedFormatError(f"{tasks}: missing; give a file with the tasks that the index names")
-    known = {task.task_id: task for task in read_tasks(tasks)}
     noted = source / "provenance.json"
     provenance = _read_json(noted) if noted.is_file() else {}
-    by_task: dict[str, list[dict]] = {}
-    for line in lines:
-        by_task.setdefault(line["task_id"], []).append(line)
-    absent = by_task.keys() - known.keys()
-    if absent:
-        raise PublishedFormatError(f"{tasks}: lacks {len(absent)} tasks of the index, such as {min(absent)!r}")
     done = iter(range(1, len(lines) + 1))
+    path = source / HISTORIES_H5
     try:
-        file = h5py.File(source / HISTORIES_H5, "r")
+        file = h5py.File(path, "r")
     except OSError as error:
-        raise PublishedFormatError(f"{source / HISTORIES_H5}: cannot be opened as HDF5: {error}") from error
+        raise PublishedFormatError(f"{path}: cannot be opened as HDF5: {error}") from error
 
-    def load(task: Task, members: list[dict]) -> Iterator[NewHistory]:
-        for line in members:
-            yield NewHistory(line["env_idx"], _read_published(file, source / HISTORIES_H5, task, line))
+    def load(members: list[_Group]) -> Iterator[NewHistory]:
+        for group in members:
+            yield NewHistory(group.line["env_idx"], Deferred(group.names, group.read))
             advance(next(done), len(lines))
 
     with file:
+        made: Kind = kind or _kind_of(file, lines)
+        groups = [_Group(file, line, made, kept_steps) for line in lines]
         new = [
-            NewTask(known[name], provenance.get(name, {}), len(members), lambda n=name, m=members: load(known[n], m))
-            for name, members in by_task.items()
+            NewTask(task, provenance.get(task.task_id, {}), len(members), lambda members=members: load(members))
+            for task, members in _tasks_of(groups, source, tasks, made)
         ]
         card = f"# Converted from {HISTORIES_H5}\n"
-        return write_release(target, kind, new, data_version=data_version, card=card, kept_steps=kept_steps)
+        if made == OBSERVATIONS:
+            card += (
+                "\nObservations only: no state records, so nothing can be replayed or drawn. The files do not name the "
+                "recipes that were cooked; those in `meta/info.json` are the layouts' usual ones.\n"
+            )
+        write_release(target, made, new, data_version=data_version, card=card, kept_steps=kept_steps)
+    return made
+
+
+def _kind_of(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
+    """Lite if every group has states, observations if none has."""
+    groups = [line["h5_group"] for line in lines if line["h5_group"] in file]
+    lacking = [group for group in groups if f"{group}/state" not in file]
+    if 0 < len(lacking) < len(groups):
+        raise PublishedFormatError(
+            f"{file.filename}, group {lacking[0]}: lacks state, which other groups have; leave them all out with "
+            f"`convert --to observations`"
+        )
+    return OBSERVATIONS if lacking else "lite"
+
+
+def _tasks_of(groups: list[_Group], source: Path, path: Path | None, kind: Kind) -> list[tuple[Task, list[_Group]]]:
+    """The tasks that the index names, in its order, with their histories."""
+    by_task: dict[str, list[_Group]] = {}
+    for group in groups:
+        by_task.setdefault(group.line["task_id"], []).append(group)
+    found = path or source / "tasks.jsonl"
+    if found.is_file():
+        known = {task.task_id: task for task in read_tasks(found)}
+    elif kind == OBSERVATIONS and path is None:
+        known = {name: named_task(members[0].line) for name, members in by_task.items()}
+    else:
+        raise PublishedFormatError(f"{found}: missing; give a file with the tasks that the index names")
+    absent = by_task.keys() - known.keys()
+    if absent:
+        raise PublishedFormatError(f"{found}: lacks {len(absent)} tasks of the index, such as {min(absent)!r}")
+    for group in groups:
+        task, line = known[group.line["task_id"]], named_task(group.line)
+        one, two = ((t.track, t.split, t.layout.name, t.teammate_family, t.teammate_kind) for t in (line, task))
+        if one != two:
+            raise PublishedFormatError(
+                f"{source / HISTORIES_INDEX}: history {group.line['history_id']} is of {one}, its task "
+                f"{task.task_id!r} of {two}; mend the index or the tasks"
+            )
+    return [(known[name], members) for name, members in by_task.items()]
 
 
 def _read_index(path: Path) -> list[dict[str, Any]]:
@@ -238,46 +301,95 @@ def _read_index(path: Path) -> list[dict[str, Any]]:
     for number, text in enumerate(read_text(path).splitlines(), start=1):
         try:
             line = parse_json(text)
+            missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
+            if missing:
+                raise PublishedFormatError(f"lacks the fields {sorted(missing)}")
+            for name in PUBLISHED_FIELDS:
+                if type(line[name]) not in JSON_TYPES[name]:
+                    raise PublishedFormatError(f"field {name!r}: found {line[name]!r}")
+            named_task(line)
         except Icrl4ahtError as error:
             raise PublishedFormatError(f"{path}, line {number}: {error}") from error
-        missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
-        if missing:
-            raise PublishedFormatError(f"{path}, line {number}: lacks the fields {sorted(missing)}")
         lines.append(line)
     if not lines:
         raise PublishedFormatError(f"{path}: no histories")
     return lines
 
 
-def _read_published(file: h5py.File, path: Path, task: Task, line: dict[str, Any]) -> dict[str, np.ndarray]:
-    """A group's arrays in our action order; its observations are checked against its states."""
-    where, layout = f"{path}, group {line['h5_group']}", get_layout(line["layout"])
-    names = [name for name in HELD if name != "expert_actions" or line["has_expert_actions"]]
-    try:
-        group: Any = file[line["h5_group"]]
-        missing = [name for name in ("obs", *names) if name not in group]
+class _Group:
+    """One history of the published file; its arrays are read, checked and put in our form when they are asked for."""
+
+    def __init__(self, file: h5py.File, line: dict[str, Any], kind: Kind, kept_steps: int) -> None:
+        """Looks which arrays are there.
+
+        Raises:
+            PublishedFormatError: if one that a release of that kind takes is missing.
+        """
+        self._file, self.line, self._kept_steps = file, line, kept_steps
+        self._layout = get_layout(line["layout"])
+        self._where = f"{file.filename}, group {line['h5_group']}"
+        group: Any = file.get(line["h5_group"])
+        if not hasattr(group, "keys"):
+            raise PublishedFormatError(f"{self._where}: missing, but the index names it")
+        self.names = [f.name for f in held_fields(kind) if kind not in f.optional or line[f"has_{f.name}"]]
+        missing = [name for name in dict.fromkeys(("obs", *self.names)) if name not in group]
         if missing:
+            remedy = "the index promises it; complete the file or mend the index"
+            if "state" in missing:
+                remedy = (
+                    f"a {kind} release is made of state records, which observations do not determine; "
+                    f"convert with `--to {OBSERVATIONS}`"
+                )
+            raise PublishedFormatError(f"{self._where}: lacks {', '.join(missing)}: {remedy}")
+
+    def read(self, name: str) -> np.ndarray:
+        """One array: (T, ...), or (E, S) for `episode_end_state`, in the field's compact dtype.
+
+        Raises:
+            PublishedFormatError: names the array, and what was expected and found.
+        """
+        field, steps = FIELDS[name], self.line["T"]
+        rows = steps if field.axis == "T" else steps // self._kept_steps
+        expected = (rows, *field.held(self._layout).shape)
+        try:
+            dataset: Any = self._file[f"{self.line['h5_group']}/{name}"]
+            if dataset.shape != expected or dataset.dtype.kind not in "biuf":
+                raise PublishedFormatError(
+                    f"{self._where}: {name}: expected numbers of shape {expected} for {steps} steps on "
+                    f"{self._layout.name}, found {dataset.dtype} of shape {dataset.shape}"
+                )
+            found = dataset[()]
+        except (KeyError, OSError, AttributeError, TypeError, ValueError) as error:
+            raise PublishedFormatError(f"{self._where}: {name}: cannot be read: {error}") from error
+        array = self._whole(name, found)
+        if name in ACTION_FIELDS:
+            return _FROM_PUBLISHED[array]
+        if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self._kept_steps))):
             raise PublishedFormatError(
-                f"{where}: lacks {', '.join(missing)}; a release is made of state records, which observations alone do "
-                f"not determine: convert from a release, or from files that `convert --to published` wrote"
+                f"{self._where}: dones: expected an end every {self._kept_steps} steps, found {array.sum()} in {steps} "
+                f"steps, the first at {np.flatnonzero(array)[:3].tolist()}; give the episodes' length with --kept-steps"
             )
-        arrays = {name: group[name][()] for name in names}
-        obs = group["obs"][()]
-    except (KeyError, OSError, ValueError) as error:
-        raise PublishedFormatError(f"{where}: {error}") from error
-    if obs.shape != (line["T"], *layout.obs_shape) or task.layout != layout:
-        raise PublishedFormatError(
-            f"{where}: expected obs of shape {(line['T'], *layout.obs_shape)} on {task.layout.name}, found {obs.shape} "
-            f"on {layout.name}"
-        )
-    if not np.array_equal(obs, paint(layout, arrays["state"], np.empty(obs.shape, np.uint8))):
-        raise PublishedFormatError(f"{where}: obs is not what state shows")
-    for name in _ACTIONS:
-        if name in arrays:
-            if arrays[name].min() < 0 or arrays[name].max() >= len(ACTIONS):
-                raise PublishedFormatError(f"{where}: {name}: expected 0..{len(ACTIONS) - 1}")
-            arrays[name] = _FROM_PUBLISHED[arrays[name]]
-    return arrays
+        if name == "state":
+            obs = self.read("obs")
+            if not np.array_equal(obs, paint(self._layout, array, np.empty_like(obs))):
+                raise PublishedFormatError(f"{self._where}: obs is not what state shows")
+        return array
+
+    def _whole(self, name: str, found: np.ndarray) -> np.ndarray:
+        """The values in the field's compact dtype, if they are whole numbers of its range."""
+        compact = np.dtype(FIELDS[name].compact)
+        low, high = (0, 1) if compact.kind == "b" else (np.iinfo(compact).min, np.iinfo(compact).max)
+        if name in ACTION_FIELDS:
+            low, high = 0, len(ACTIONS) - 1
+        with np.errstate(invalid="ignore"):  # what the cast spoils is found by comparing
+            array = found.astype(compact)
+        wrong = (array != found) | (found < low) | (found > high)
+        if wrong.any():
+            place = tuple(np.argwhere(wrong)[0].tolist())
+            raise PublishedFormatError(
+                f"{self._where}: {name}{list(place)}: expected a whole number {low}..{high}, found {found[place]}"
+            )
+        return array
 
 
 def to_parquet(dataset: Dataset, path: Path) -> Path:

@@ -14,13 +14,20 @@ from numpy.typing import DTypeLike
 
 from icrl4aht_data.benchmark import unknown
 from icrl4aht_data.draws import Curriculum, Episodes, Weights, whole
-from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, UnknownNameError
+from icrl4aht_data.errors import (
+    EmptySelectionError,
+    IndexFormatError,
+    LabelsMissingError,
+    NotStoredError,
+    OptionError,
+    UnknownNameError,
+)
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.paint import paint
-from icrl4aht_data.schema import FIELDS, PROVENANCE, TASKS, Entry, Field, episode_returns
-from icrl4aht_data.shard import ChunkCache, Shard
+from icrl4aht_data.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry, Field, episode_returns
+from icrl4aht_data.shard import Shard, Shards
 from icrl4aht_data.store import CACHES, Cache, Choice, Source, choose, decoded_size, open_source
 from icrl4aht_data.tasks import Task, read_tasks
 from icrl4aht_data.threads import usable_cores
@@ -33,7 +40,7 @@ if TYPE_CHECKING:
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
 """How observations are presented: float32 (the paper's contract), uint8 (the same integers), or the state records
-from which `icrl4aht_data.overcooked.observe` renders them."""
+from which `icrl4aht_data.overcooked.observe` renders them, where a release has any."""
 
 MINI = Path(__file__).parent / "mini"
 """The bundled mini release."""
@@ -72,6 +79,7 @@ def load_icrl4aht(
     Raises:
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
         EmptySelectionError: if nothing matches; says what exists.
+        OptionError: for obs="state" of a release of observations.
         ReleaseError: if the release cannot be read.
     """
     if obs not in OBS:
@@ -80,6 +88,8 @@ def load_icrl4aht(
         raise unknown("cache", cache, CACHES)
     options = Options(obs, cache, usable_cores() if threads is None else whole("threads", threads, 1))
     index = read_index(MINI if root is None else Path(root).expanduser())
+    if obs == "state" and index.info["kind"] not in KINDS:
+        raise OptionError(f'obs = "state": {index.root} has observations only, no state records; take float32 or uint8')
     everything = np.arange(len(index.entries))
     dataset = Dataset(index, everything, options, Shards(index))
     return dataset.filter(
@@ -118,26 +128,6 @@ class Holding(NamedTuple):
     sources: list[Source]
     layout: np.ndarray  # intp (H,), which source
     place: np.ndarray  # intp (H,), position in it
-
-
-class Shards:
-    """The release's shards, opened when first read."""
-
-    def __init__(self, index: Index) -> None:
-        self._index = index
-        self._open: dict[str, Shard] = {}
-        self._cache = ChunkCache()
-
-    def forget(self) -> None:
-        """Drop decoded chunks."""
-        self._cache.clear()
-
-    def open(self, name: str) -> Shard:
-        if name not in self._open:
-            entries = self._index.entries
-            members = [entries[row] for row in entries.shard_rows(name).tolist()]
-            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], members, self._cache)
-        return self._open[name]
 
 
 class Dataset:
@@ -180,6 +170,16 @@ class Dataset:
     def info(self) -> dict[str, Any]:
         """meta/info.json: versions, kind, environment, totals."""
         return self.index.info
+
+    @property
+    def has_states(self) -> bool:
+        """Whether the release has state records: a release of observations has none."""
+        return self.info["kind"] in KINDS
+
+    @property
+    def knows_tasks(self) -> bool:
+        """Whether the release has its tasks: a release of observations may have been made without."""
+        return self.has_states or bool(self._tasks)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -229,7 +229,7 @@ class Dataset:
         size = 0
         for layout, rows in self._by_layout():
             steps, episodes = (int(self.column(name)[rows].sum()) for name in ("T", "episodes"))
-            size += decoded_size(layout, steps, len(rows), episodes)
+            size += decoded_size(layout, self.info["kind"], steps, len(rows), episodes)
         return choose(self.options.cache, size)
 
     def _by_layout(self) -> Iterator[tuple[Layout, np.ndarray]]:
@@ -313,8 +313,16 @@ class Dataset:
 
         Returns:
             The task's teammate entry (`kind`, `family`, `theta`, ...), and how it played: `slot` and `noise`.
+
+        Raises:
+            NotStoredError: if the release was made without its tasks.
         """
         entry = self.index.entry(history_id)
+        if not self.knows_tasks:
+            raise NotStoredError(
+                f"{self.root / TASKS}: empty: this release was converted without its tasks and knows of this teammate "
+                f"only family {entry.teammate_family} and kind {entry.teammate_kind}; convert again with --tasks FILE"
+            )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
         return self._tasks[entry.task_id].teammate | self._provenance.get(entry.task_id, {}).get("teammate", {})
@@ -359,16 +367,17 @@ class History:
         """Rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
 
         Raises:
-            LabelsMissingError: if expert actions are asked of a history without them.
+            LabelsMissingError: if expert or teammate actions are asked of a history without them.
+            NotStoredError: if states are asked of a release without state records.
             ShardCorruptError: names the chunk whose checksum is wrong.
         """
         field = self._field(name)
         rows = self.entry.rows(field)
         start, stop, _ = slice(start, stop).indices(rows)
         stop = max(start, stop)
-        if name != "obs" or self._shard.kind == "full":
-            return self._shard.read(self.entry.history_id, field, start, stop)
-        return self._painted(start, stop, np.uint8)
+        if self._shard.kind in field.absent:
+            return self._painted(start, stop, np.uint8)
+        return self._shard.read(self.entry.history_id, field, start, stop)
 
     def _painted(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
         out = np.empty((stop - start, *self.entry.obs_shape), dtype)
@@ -377,12 +386,18 @@ class History:
     def _field(self, name: str) -> Field:
         if name not in FIELDS:
             raise unknown("field", name, FIELDS)
-        if name == "expert_actions" and not self.entry.has_expert_actions:
-            raise LabelsMissingError(
-                f"history {self.entry.history_id} ({self.entry.task_id}) has no expert actions: its index entry says "
-                f"has_expert_actions = false; choose histories that are labelled"
+        field = FIELDS[name]
+        if field.row == "state" and self._shard.kind in field.absent:
+            raise NotStoredError(
+                f"{self._shard.path}: no {name}: this release has observations only, which do not determine the state; "
+                f"what needs states, such as replay and drawing, needs a full or lite release"
             )
-        return FIELDS[name]
+        if not self.entry.has(field):
+            raise LabelsMissingError(
+                f"history {self.entry.history_id} ({self.entry.task_id}) has no {name.replace('_', ' ')}: its index "
+                f"entry says has_{name} = false; choose histories that have them"
+            )
+        return field
 
     @property
     def obs(self) -> LazyArray:
@@ -471,6 +486,6 @@ class LazyArray:
         return self[:].astype(dtype or self.dtype, copy=False)
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        if self._name == "obs" and self._history._shard.kind == "lite":
+        if self._name == "obs" and self._history._shard.kind in FIELDS["obs"].absent:
             return self._history._painted(start, max(start, stop), self.dtype)
         return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)

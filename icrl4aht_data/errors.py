@@ -23,7 +23,11 @@ class OptionError(Icrl4ahtError, ValueError):
 
 
 class LabelsMissingError(Icrl4ahtError):
-    """Expert actions were asked of histories that carry none."""
+    """Expert or teammate actions were asked of histories that carry none."""
+
+
+class NotStoredError(Icrl4ahtError):
+    """State records, or tasks, were asked of a release of observations that has none."""
 
 
 class ReleaseError(Icrl4ahtError):

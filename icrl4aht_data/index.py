@@ -21,7 +21,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.schema import FORMAT_VERSION, HISTORIES, INFO, KINDS, Entry
+from icrl4aht_data.schema import ALL_KINDS, FORMAT_VERSION, HISTORIES, INFO, KINDS, Entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +108,11 @@ def read_index(root: Path) -> Index:
     entries = read_columns(path)
     if len(entries) != info["histories"]:
         raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info['histories']} histories")
+    lacking = np.flatnonzero(~entries.column("has_teammate_actions"))
+    if info["kind"] in KINDS and len(lacking):
+        raise IndexFormatError(
+            f"{path}, line {lacking[0] + 1}: expected has_teammate_actions true in a {info['kind']} release"
+        )
     return Index(root, info, entries)
 
 
@@ -143,7 +148,7 @@ def read_info(root: Path) -> dict[str, Any]:
             f"{path}: format version {version}, this package reads {FORMAT_VERSION}: rebuild or fetch the release again"
         )
     wrong = [name for name, kind in _INFO_TYPES.items() if not isinstance(info.get(name), kind)]
-    if wrong or info["kind"] not in KINDS or not _is_environment(info["environment"]):
+    if wrong or info["kind"] not in ALL_KINDS or not _is_environment(info["environment"]):
         raise IndexFormatError(f"{path}: malformed: {', '.join(wrong) or 'kind or environment'} not as expected")
     return info
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.draws import whole
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import NotStoredError, OptionError
 
 if TYPE_CHECKING:
     import datasets
@@ -78,7 +78,12 @@ def hf_episodes(dataset: Dataset) -> datasets.Dataset:
 
     Columns: history_id, task_id, layout, episode (number in its history), return, and for each step actions, rewards,
     teammate_actions, expert_actions where the history has them, and state (bytes; see `overcooked.state`).
+
+    Raises:
+        NotStoredError: for a release of observations.
     """
+    if not dataset.has_states:
+        raise NotStoredError(f"{dataset.root}: has observations only, no state records; take hf_windows")
     library = _datasets()
     step = {name: library.List(library.Value("int8")) for name in ("actions", "teammate_actions", "expert_actions")}
     features = library.Features(

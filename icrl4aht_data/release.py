@@ -22,11 +22,12 @@ from icrl4aht_data.files import file_in_place_of, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
-    FIELDS,
     FORMAT_VERSION,
     HISTORIES,
     INFO,
+    KINDS,
     MANIFEST,
+    OBSERVATIONS,
     PROVENANCE,
     TASKS,
     TEAMMATES,
@@ -35,11 +36,12 @@ from icrl4aht_data.schema import (
     curve_ends,
     episode_ends,
     episode_returns,
+    held_fields,
     stream_score,
 )
 from icrl4aht_data.shard import stored_bytes, write_shard
 from icrl4aht_data.statistics import layout_statistics
-from icrl4aht_data.tasks import Task, write_tasks
+from icrl4aht_data.tasks import NamedTask, Task, write_tasks
 
 SHARD_BYTES = 256 * 2**20
 """The size that shards should have, where there is data enough."""
@@ -51,8 +53,8 @@ class NewHistory:
 
     Args:
         env_idx: stream within the learner's parallel roll-out.
-        arrays: field name -> array for every field of `schema.FIELDS` but `obs`, which is rendered from the state. May
-            read on access: a shard's histories are held until it is written.
+        arrays: field name -> array for the release's `schema.held_fields`: a full release renders `obs` from the state.
+            May read on access: a shard's histories are held until it is written.
     """
 
     env_idx: int
@@ -64,7 +66,7 @@ class NewTask:
     """One task with its histories.
 
     Args:
-        task: what was learned.
+        task: what was learned; a `NamedTask` only in a release of observations.
         provenance: how; any JSON.
         streams: the number of histories that `load` gives.
         load: called once, when its shard is written, so that few histories are in memory at a time.
@@ -107,7 +109,8 @@ def write_release(
 
     Args:
         target: the folder to make.
-        kind: "full" (observations stored) or "lite" (observations rendered from the states on reading).
+        kind: "full" (observations stored), "lite" (observations rendered from the states on reading) or "observations"
+            (no states; an unfinished episode may end a history).
         tasks: what to write; histories are numbered in this order.
         data_version: SemVer of the data.
         card: README.md of the release.
@@ -117,13 +120,19 @@ def write_release(
         done: called when a task's histories have been taken, for progress.
 
     Raises:
-        OptionError: if `target` holds something else, if there is no task or one twice, or if a history's arrays are
-            missing, of unequal length or lossy.
+        OptionError: if `target` holds something else, if there is no task or one twice, if some tasks are known by name
+            only and others are not, or if a history's arrays are missing, of unequal length or lossy.
     """
     new = list(tasks)
     ids = [task.task.task_id for task in new]
     if not new or len(set(ids)) < len(ids):
         raise OptionError(f"expected at least one task and none twice, found {ids}")
+    named = [task.task.task_id for task in new if isinstance(task.task, NamedTask)]
+    if named and (kind in KINDS or len(named) < len(ids)):
+        raise OptionError(
+            f"{len(named)} of {len(ids)} tasks, such as {named[0]!r}, are known by name only: give all tasks or, in a "
+            f"release of {OBSERVATIONS}, none"
+        )
     with folder_in_place_of(target) as partial:
         _fill(partial, kind, new, data_version, card, kept_steps, (shard_histories, shard_bytes), done)
     return target
@@ -192,7 +201,7 @@ def _fill(
         for number in range(shards):
             part = list(islice(histories, total * (number + 1) // shards - total * number // shards))
             name = f"data/{track}/{layout}/{split}-{number:05}-of-{shards:05}.h5"
-            new = [_entry(task, history, name, kept_steps) for task, history in part]
+            new = [_entry(task, history, kind, name, kept_steps) for task, history in part]
             new_entries = _placed(new, kind, len(entries))
             write_shard(root, name, kind, new_entries, (_with_obs(task, h, kind) for task, h in part))
             entries += new_entries
@@ -203,10 +212,11 @@ def _fill(
     for name, source in chain.from_iterable(new.files.items() for new in tasks):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, root / name)
-    write_tasks(root / TASKS, [new.task for new in tasks])
+    given = [new.task for new in tasks if not isinstance(new.task, NamedTask)]
+    write_tasks(root / TASKS, given)
     provenance = {new.task.task_id: new.provenance for new in tasks}
     write_json(root / PROVENANCE, provenance)
-    statistics = layout_statistics(root, entries, [new.task for new in tasks], provenance, kept_steps)
+    statistics = layout_statistics(root, entries, given, provenance, kept_steps)
     write_json(root / INFO, describe(kind, data_version, kept_steps, entries) | {"statistics": statistics})
     (root / "README.md").write_text(card, encoding="utf-8")
     write_manifest(root)
@@ -218,7 +228,7 @@ def _shards(
     """How many shards: of about the target size if all histories are as large as the first, at most `most` in each."""
     size = 1
     for task, history in first:
-        (entry,) = _placed([_entry(task, history, "", kept_steps)], kind, 0)
+        (entry,) = _placed([_entry(task, history, kind, "", kept_steps)], kind, 0)
         size = stored_bytes(kind, entry, _with_obs(task, history, kind))
     return max(1, -(-total // most), min(total, round(total * size / target)))
 
@@ -233,14 +243,16 @@ def _loaded(new: NewTask, done: Callable[[Task], None]) -> Iterator[tuple[Task, 
     done(new.task)
 
 
-def _entry(task: Task, history: NewHistory, shard: str, kept_steps: int) -> Entry:
+def _entry(task: Task, history: NewHistory, kind: Kind, shard: str, kept_steps: int) -> Entry:
     arrays = history.arrays
-    needed = {field.name for field in FIELDS.values() if not field.optional} - {"obs"}
+    needed = {field.name for field in held_fields(kind) if kind not in field.optional}
     if not needed <= arrays.keys():
         raise OptionError(f"task {task.task_id}: a history lacks the arrays {sorted(needed - arrays.keys())}")
-    if not np.array_equal(arrays["dones"], episode_ends(len(arrays["dones"]), kept_steps)):
+    dones = arrays["dones"]
+    unfinished = len(dones) % kept_steps if kind in KINDS else len(dones) < kept_steps
+    if unfinished or not np.array_equal(dones, episode_ends(len(dones), kept_steps)):
         raise OptionError(f"task {task.task_id}: a history's episodes do not all have {kept_steps} steps")
-    returns = episode_returns(arrays["rewards"], arrays["dones"])[None]
+    returns = episode_returns(arrays["rewards"], dones)[None]
     start, end = curve_ends(returns)
     return Entry(
         history_id=-1,
@@ -255,7 +267,7 @@ def _entry(task: Task, history: NewHistory, shard: str, kept_steps: int) -> Entr
         teammate_family=task.teammate_family,
         teammate_kind=task.teammate_kind,
         h5_group="",
-        has_teammate_actions=True,
+        has_teammate_actions="teammate_actions" in arrays,
         has_expert_actions="expert_actions" in arrays,
         h5_row=None,
         shard=shard,
@@ -269,22 +281,22 @@ def _entry(task: Task, history: NewHistory, shard: str, kept_steps: int) -> Entr
 
 
 def _placed(entries: list[Entry], kind: Kind, first_id: int) -> list[Entry]:
-    """Give ids and places: a group each in a full shard, rows of one group per shape in a lite one."""
+    """Give ids and places: rows of one group per shape in a lite shard, a group each in the others."""
     placed: list[Entry] = []
     groups: dict[tuple, list[int]] = defaultdict(list)
     for number, entry in enumerate(entries):
-        shape = number if kind == "full" else (entry.T, entry.episodes, entry.has_expert_actions)
+        shape = (entry.T, entry.episodes, entry.has_expert_actions) if kind == "lite" else number
         rows = groups.setdefault((shape,), [])
         group = f"/{list(groups).index((shape,))}"
         placed.append(
-            replace(entry, history_id=first_id + number, h5_group=group, h5_row=None if kind == "full" else len(rows))
+            replace(entry, history_id=first_id + number, h5_group=group, h5_row=len(rows) if kind == "lite" else None)
         )
         rows.append(number)
     return placed
 
 
 def _with_obs(task: Task, history: NewHistory, kind: Kind) -> Mapping[str, np.ndarray]:
-    if kind == "lite":
+    if kind != "full":
         return history.arrays
     return {**history.arrays, "obs": observe(task.layout, history.arrays["state"], EGO)}
 

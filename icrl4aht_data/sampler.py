@@ -15,6 +15,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.paint import paint
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.prefetch import Batches
+from icrl4aht_data.schema import FIELDS, record_field
 from icrl4aht_data.store import Source
 from icrl4aht_data.threads import in_slices
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 B = TypeVar("B", bound=tuple)
 """A batch: a named tuple of arrays, some of which may be None."""
 
-_SLAB = 8192  # steps gathered and painted at a time: the states in between stay few
+_SLAB = 8192  # steps gathered and painted at a time: the records in between stay few
 
 
 class Group(NamedTuple):
@@ -73,7 +74,9 @@ class Sampler(Generic[B]):
         self.teammate_actions = teammate_actions
         self.weights, self.episodes, self.curriculum = check_weights(weights, len(dataset)), episodes, curriculum
         self._lengths = dataset.column("T")
-        self._kept = self._lengths // dataset.column("episodes")
+        self._kept: int = dataset.info["environment"]["kept_steps"]
+        if (self._lengths // self._kept != dataset.column("episodes")).any():
+            raise OptionError(f"some history's episodes have not {self._kept} steps; run `icrl4aht-data verify`")
         self._range = episode_range(episodes, dataset.column("episodes"))
 
     def __len__(self) -> int:
@@ -157,19 +160,24 @@ class Sampler(Generic[B]):
 
     @property
     def _paints(self) -> bool:
-        return self.dataset.obs != "state"
+        """Whether observations are made of states."""
+        return self.dataset.obs != "state" and self.dataset.has_states
 
     @property
-    def _record_size(self) -> int:
-        return max(record_size(layout) for layout in self.layouts)
+    def _record(self) -> str:
+        """The field that is held of each step to show what the ego saw."""
+        return record_field(self.dataset.info["kind"]).name
+
+    def _empty_records(self, group: Group, *shape: int) -> np.ndarray:
+        return np.empty((*shape, *FIELDS[self._record].held(group.layout).shape), np.uint8)
 
     def _empty_obs(self, *shape: int) -> np.ndarray:
-        if self._paints:
+        if self.dataset.obs != "state":
             return np.empty((*shape, *self.layouts[0].obs_shape), self.dataset.obs)
-        return np.empty((*shape, self._record_size), np.uint8)
+        return np.empty((*shape, max(record_size(layout) for layout in self.layouts)), np.uint8)
 
     def _empty_layouts(self) -> np.ndarray | None:
-        return np.empty(self.local_size, np.int32) if len(self.layouts) > 1 and not self._paints else None
+        return np.empty(self.local_size, np.int32) if len(self.layouts) > 1 and self.dataset.obs == "state" else None
 
     def _slabs(self, rows: int) -> Iterator[tuple[int, int]]:
         """Parts of the rows, few enough steps each to stay in the processor's cache."""
@@ -186,20 +194,20 @@ class Sampler(Generic[B]):
 
         in_slices(some, len(slabs), self.dataset.threads)
 
-    def _present(self, group: Group, start: int, stop: int, states: np.ndarray, out: np.ndarray) -> None:
-        """Show the state records of rows start..stop of a group in `out` (B, ...), as the dataset presents them."""
+    def _present(self, group: Group, start: int, stop: int, records: np.ndarray, out: np.ndarray) -> None:
+        """Show the records of rows start..stop of a group in `out` (B, ...), as the dataset presents them."""
         if isinstance(group.rows, slice):
             if self._paints:
-                paint(group.layout, states, out[start:stop])
+                paint(group.layout, records, out[start:stop])
             else:
-                out[start:stop] = states
+                out[start:stop] = records
             return
         rows = group.rows[start:stop]
         if self._paints:
-            out[rows] = paint(group.layout, states, np.empty((len(rows), *out.shape[1:]), out.dtype))
+            out[rows] = paint(group.layout, records, np.empty((len(rows), *out.shape[1:]), out.dtype))
         else:
-            out[rows, ..., : states.shape[-1]] = states
-            out[rows, ..., states.shape[-1] :] = 0
+            out[rows, ..., : records.shape[-1]] = records
+            out[rows, ..., records.shape[-1] :] = 0
 
     def _checked(self, out: B | None) -> B:
         """`out`, if batches fit in it, or a new one."""

@@ -15,7 +15,6 @@ import numpy as np
 from icrl4aht_data.benchmark import unknown
 from icrl4aht_data.draws import below, pick, words
 from icrl4aht_data.errors import LabelsMissingError, OptionError
-from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.sampler import Group, Sampler
 from icrl4aht_data.store import Source
 
@@ -148,14 +147,14 @@ class ADSampler(Sampler[ADBatch]):
         return batch
 
     def _fill_obs(self, group: Group, place: np.ndarray, start: np.ndarray, obs: np.ndarray) -> None:
-        if not self._paints and isinstance(group.rows, slice):
-            group.source.windows("state", place, start, obs, self.dataset.threads)
+        if not self._paints and obs.dtype == np.uint8 and isinstance(group.rows, slice):
+            group.source.windows(self._record, place, start, obs, self.dataset.threads)
             return
 
         def slab(first: int, last: int) -> None:
-            states = np.empty((last - first, self.length, record_size(group.layout)), np.uint8)
-            group.source.windows("state", place[first:last], start[first:last], states)
-            self._present(group, first, last, states, obs)
+            records = self._empty_records(group, last - first, self.length)
+            group.source.windows(self._record, place[first:last], start[first:last], records)
+            self._present(group, first, last, records, obs)
 
         self._in_slabs(len(place), slab)
 
@@ -166,6 +165,9 @@ class DPTSampler(Sampler[DPTBatch]):
     The task is drawn uniformly, then the query's history and the context's independently within the task, the query
     step uniformly, and K transitions of the context's history: `contiguous` (as published) or `random` (i.i.d. and
     unordered, as in the original DPT).
+
+    A release of observations does not have what followed an episode's last step. There contexts are made of the other
+    transitions, and contiguous ones go on from an episode's last but one step with the next episode's first.
 
     Args:
         dataset: a selection whose histories all have expert actions, of layouts with observations of one shape.
@@ -202,15 +204,23 @@ class DPTSampler(Sampler[DPTBatch]):
                 f"DPT needs expert actions, but {len(unlabelled)} of {len(dataset)} histories have none "
                 f"(first: {unlabelled[0]}); select labelled ones: entry.has_expert_actions"
             )
-        if (self._kept * dataset.column("episodes") != self._lengths).any():
-            raise OptionError("some history's episodes are of unequal length; run `icrl4aht-data verify`")
-        shortest = min(int((high - low).min()) for low, high in (self._steps(0), self._steps(2**62)))
-        if order == "contiguous" and self.length > shortest:
+        parts = (map(self._transitions, self._steps(i)) for i in (0, 2**62))
+        shortest = min(int((high - low).min()) for low, high in parts)
+        if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
         self.order: ContextOrder = order
 
     def options(self) -> dict[str, Any]:
-        return super().options() | {"order": self.order}
+        excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
+        return super().options() | {"order": self.order} | excluded
+
+    def _transitions(self, steps: np.ndarray) -> np.ndarray:
+        """How many of a history's first steps are transitions whose next observation is stored."""
+        return steps if self.dataset.has_states else steps - -(-steps // self._kept)
+
+    def _step_of(self, transition: np.ndarray) -> np.ndarray:
+        """The reverse: which step a transition is, counted from the history's first."""
+        return transition if self.dataset.has_states else transition + transition // (self._kept - 1)
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -230,12 +240,13 @@ class DPTSampler(Sampler[DPTBatch]):
         task = below(drawn[0], len(begins))
         asking, showing = (self._member(word, begins[task], ends[task], weights) for word in drawn[1:3])
         step = low[asking] + below(drawn[3], (high - low)[asking])
+        low, high = self._transitions(low), self._transitions(high)
         if self.order == "random":
-            steps = low[showing][:, None] + below(drawn[4:].T, (high - low)[showing][:, None])
+            shown = low[showing][:, None] + below(drawn[4:].T, (high - low)[showing][:, None])
         else:
             first = low[showing] + below(drawn[4], (high - low)[showing] - self.length + 1)
-            steps = first[:, None] + np.arange(self.length)
-        return asking, step, showing, steps
+            shown = first[:, None] + np.arange(self.length)
+        return asking, step, showing, self._step_of(shown)
 
     def _member(self, word: np.ndarray, begin: np.ndarray, end: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
         positions = self._tasks[0]
@@ -263,7 +274,7 @@ class DPTSampler(Sampler[DPTBatch]):
             place = self.dataset.holding.place
             query, when = place[group.select(asking)], group.select(step)[:, None]
             batch.query_target[group.rows] = group.source.steps("expert_actions", query, when)[:, 0]
-            self._present(group, 0, len(query), group.source.steps("state", query, when)[:, 0], batch.query_obs)
+            self._present(group, 0, len(query), group.source.steps(self._record, query, when)[:, 0], batch.query_obs)
             self._fill_context(group, group.select(showing), group.select(steps), batch)
             if batch.layouts is not None:
                 batch.layouts[group.rows] = self.layouts.index(group.layout)
@@ -283,36 +294,41 @@ class DPTSampler(Sampler[DPTBatch]):
             for field, array in scalars:
                 if array is not None:
                     array[rows[first:last]] = self._read(group.source, field, place, when)
-            states, following = self._transitions(group, which, place, when)
-            self._present(group, first, last, states, batch.context_obs)
+            records, following = self._before_and_after(group, which, place, when)
+            self._present(group, first, last, records, batch.context_obs)
             self._present(group, first, last, following, batch.context_next_obs)
 
         self._in_slabs(len(rows), slab)
 
     def _read(self, source: Source, field: str, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        if self.order == "random":
+        if self._scattered:
             return source.steps(field, place, steps)
         out = np.empty(steps.shape, np.int8)
         source.windows(field, place, steps[:, 0], out)
         return out
 
-    def _transitions(
+    @property
+    def _scattered(self) -> bool:
+        """Whether a context's steps are not simply one after the other."""
+        return self.order == "random" or not self.dataset.has_states
+
+    def _before_and_after(
         self, group: Group, which: np.ndarray, place: np.ndarray, steps: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """State records before and after steps (n, K), uint8 (n, K, S) each.
+        """Records before and after steps (n, K), uint8 (n, K, S) or (n, K, 5, 5, C) each.
 
         The record after an episode's last kept step is the one that followed it in that episode, never the first of
         the next.
         """
         source, last = group.source, self._lengths[which][:, None] - 1
-        if self.order == "random":
-            states = source.steps("state", place, steps)
-            following = source.steps("state", place, np.minimum(steps + 1, last))
+        if self._scattered:
+            records = source.steps(self._record, place, steps)
+            following = source.steps(self._record, place, np.minimum(steps + 1, last))
         else:
-            both = np.empty((len(which), self.length + 1, record_size(group.layout)), np.uint8)
-            source.windows("state", place, steps[:, 0], both)
-            states, following = both[:, :-1], both[:, 1:].copy()
-        row, column = np.nonzero(self._read(source, "dones", place, steps))
-        episode = steps[row, column] // self._kept[which[row]]
-        following[row, column] = source.ends(place[row], episode)
-        return states, following
+            both = self._empty_records(group, len(which), self.length + 1)
+            source.windows(self._record, place, steps[:, 0], both)
+            records, following = both[:, :-1], both[:, 1:].copy()
+        if self.dataset.has_states:
+            row, column = np.nonzero(self._read(source, "dones", place, steps))
+            following[row, column] = source.ends(place[row], steps[row, column] // self._kept)
+        return records, following

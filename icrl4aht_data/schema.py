@@ -2,7 +2,7 @@
 
     meta/info.json          versions, kind, environment, totals
     meta/histories.jsonl    one line per learning history: `Entry`
-    meta/tasks.jsonl        one line per task: see `icrl4aht_data.tasks`
+    meta/tasks.jsonl        one line per task, see `icrl4aht_data.tasks`; none where observations came without tasks
     meta/provenance.json    task_id -> how its histories were made
     meta/chunks/**.npy      for each shard: offset, size, rows, crc32 of every chunk
     data/<track>/<layout>/<split>-00000-of-00001.h5
@@ -10,7 +10,8 @@
     MANIFEST.sha256         every file above, in sha256sum's format
 
 A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard leaves
-`obs` out (it is a function of the state) and stacks the histories of equal length in one group, [history, T] arrays.
+`obs` out (it is a function of the state) and stacks the histories of equal length in one group, [history, T] arrays. A
+shard of `observations` is a `full` one without state records, which the published code's files do not have.
 """
 
 from __future__ import annotations
@@ -35,8 +36,14 @@ INFO, HISTORIES, TASKS, PROVENANCE = (
 TEAMMATES = "teammates"
 """The folder of learned teammates: what a task's checkpoint path starts from."""
 
-Kind = Literal["full", "lite"]
+Kind = Literal["full", "lite", "observations"]
 KINDS: tuple[Kind, ...] = ("full", "lite")
+"""The kinds that have state records: those that are generated."""
+
+OBSERVATIONS: Kind = "observations"
+"""The kind that has none: observations do not determine the state, so nothing can be replayed or drawn."""
+
+ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
 CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")])
 """One line of a chunk table: where the stored bytes are, how many of the chunk's rows are the history's (the last chunk
@@ -57,7 +64,8 @@ class Field:
             each, of array type, so that the shuffle filter groups what lies at one place in time; h5py gives them as
             (T, S) and (T, 5, 5, C).
         chunk: rows per chunk.
-        optional: whether a history may lack it.
+        optional: the kinds of release in which a history may lack it; its index entry says so.
+        absent: the kinds of release that do not have it.
     """
 
     name: str
@@ -66,7 +74,8 @@ class Field:
     axis: Literal["T", "E"]
     row: Literal["scalar", "state", "obs"]
     chunk: int
-    optional: bool = False
+    optional: tuple[Kind, ...] = ()
+    absent: tuple[Kind, ...] = ()
 
     def element(self, layout: Layout, kind: Kind) -> np.dtype:
         """The stored element: a scalar, the S bytes of a state record, or the 5 x 5 x C of an observation."""
@@ -74,21 +83,38 @@ class Field:
             return np.dtype(self.compact if kind == "lite" else self.dtype)
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
+    def held(self, layout: Layout) -> np.dtype:
+        """The element as samplers hold it: compact, whatever the release."""
+        return self.element(layout, "lite")
+
 
 FIELDS: dict[str, Field] = {
     field.name: field
     for field in (
-        Field("state", "uint8", "uint8", "T", "state", 1000),
+        Field("state", "uint8", "uint8", "T", "state", 1000, absent=(OBSERVATIONS,)),
         Field("actions", "int32", "int8", "T", "scalar", 4000),
         Field("rewards", "float32", "int8", "T", "scalar", 4000),
         Field("dones", "bool", "bool", "T", "scalar", 4000),
-        Field("teammate_actions", "int32", "int8", "T", "scalar", 4000),
-        Field("expert_actions", "int32", "int8", "T", "scalar", 4000, optional=True),
-        Field("episode_end_state", "uint8", "uint8", "E", "state", 1000),
-        Field("obs", "uint8", "uint8", "T", "obs", 500),
+        Field("teammate_actions", "int32", "int8", "T", "scalar", 4000, optional=(OBSERVATIONS,)),
+        Field("expert_actions", "int32", "int8", "T", "scalar", 4000, optional=ALL_KINDS),
+        Field("episode_end_state", "uint8", "uint8", "E", "state", 1000, absent=(OBSERVATIONS,)),
+        Field("obs", "uint8", "uint8", "T", "obs", 500, absent=("lite",)),
     )
 }
 """Every field, in file order. `episode_end_state` is the state after each episode's last kept step."""
+
+ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions")
+
+
+def held_fields(kind: Kind) -> tuple[Field, ...]:
+    """What batches and other releases are made of: every stored field, but `obs` only where no state shows it."""
+    stored = kind if kind == OBSERVATIONS else "lite"
+    return tuple(field for field in FIELDS.values() if stored not in field.absent)
+
+
+def record_field(kind: Kind) -> Field:
+    """The field that is held of each step to show what the ego saw: the state record, or the observation itself."""
+    return FIELDS["state" if kind in KINDS else "obs"]
 
 
 @dataclass(frozen=True)
@@ -111,8 +137,8 @@ class Entry:
     has_expert_actions: bool
     h5_row: int | None  # row in the group's stacked arrays; null where the group holds this history alone
     shard: str  # path below the release's root
-    seed: int  # of the learner
-    episodes: int
+    seed: int  # of the learner; -1 where the task was not given
+    episodes: int  # that ended: as many as there are dones
     score: float  # end + (end - start), see `curve_ends` (paper, App. F.1)
     return_start: float  # mean return of the first episodes
     return_end: float  # mean return of the last episodes
@@ -120,11 +146,11 @@ class Entry:
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """The fields that this history's shard stores."""
-        return tuple(
-            field
-            for field in FIELDS.values()
-            if (field.name != "obs" or kind == "full") and (not field.optional or self.has_expert_actions)
-        )
+        return tuple(field for field in FIELDS.values() if kind not in field.absent and self.has(field))
+
+    def has(self, field: Field) -> bool:
+        """Whether the history has a field that its kind of release has; see `Field.optional`."""
+        return getattr(self, f"has_{field.name}", True)
 
     def rows(self, field: Field) -> int:
         return self.T if field.axis == "T" else self.episodes

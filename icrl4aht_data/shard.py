@@ -26,8 +26,10 @@ from icrl4aht_data.errors import (
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 
-if TYPE_CHECKING:  # libhdf5 is needed to write and to check, not to read
-    import h5py
+if TYPE_CHECKING:
+    import h5py  # libhdf5 is needed to write and to check, not to read
+
+    from icrl4aht_data.index import Index
 
 _Arrays = Mapping[str, np.ndarray]
 
@@ -46,7 +48,7 @@ def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], hi
     Args:
         root: the release folder.
         shard: path below it, as in every entry.
-        kind: "full" or "lite".
+        kind: of the release.
         entries: the histories' index entries; `h5_group` and `h5_row` say where each one goes.
         histories: for each entry, field name -> array in the field's dtype.
 
@@ -213,7 +215,7 @@ class Shard:
     Args:
         root: the release folder.
         name: path of the shard below it.
-        kind: "full" or "lite".
+        kind: of the release.
         entries: all histories of this shard, in index order.
         cache: of decoded chunks.
 
@@ -316,8 +318,8 @@ class Shard:
     def fingerprint(self, history_id: int) -> bytes:
         """What distinguishes a history's stored content: sizes and checksums of its chunks."""
         entry = self._entries[history_id]
-        first = self._first[history_id, "state"]
-        chunks = sum(entry.chunks(field) for field in entry.stored_fields(self.kind))
+        stored = entry.stored_fields(self.kind)
+        first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
         return self._table[first : first + chunks][["size", "rows", "crc32"]].tobytes()
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
@@ -433,6 +435,26 @@ class Shard:
                 if not np.array_equal(theirs, ours):
                     faults.append(f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do")
         return faults
+
+
+class Shards:
+    """The release's shards, opened when first read."""
+
+    def __init__(self, index: Index) -> None:
+        self._index = index
+        self._open: dict[str, Shard] = {}
+        self._cache = ChunkCache()
+
+    def forget(self) -> None:
+        """Drop decoded chunks."""
+        self._cache.clear()
+
+    def open(self, name: str) -> Shard:
+        if name not in self._open:
+            entries = self._index.entries
+            members = [entries[row] for row in entries.shard_rows(name).tolist()]
+            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], members, self._cache)
+        return self._open[name]
 
 
 def _read_table(root: Path, name: str) -> np.ndarray:

@@ -38,7 +38,8 @@ def layout_statistics(
     """layout -> the paper's properties, as numbers. The shards must be in `root`.
 
     original_transitions is what the learners' streams held before the filter, null where a provenance does not say;
-    history_length is the shortest and the longest; mean_final_return is over histories, `return_end` of each.
+    teammates is null where the tasks were not given; history_length is the shortest and the longest; mean_final_return
+    is over histories, `return_end` of each.
     """
     return {
         layout: _of_layout(root, [e for e in entries if e.layout == layout], tasks, provenance, kept_steps)
@@ -50,13 +51,14 @@ def _of_layout(
     root: Path, entries: list[Entry], tasks: Sequence[Task], provenance: dict[str, Any], kept_steps: int
 ) -> dict[str, Any]:
     lengths = {entry.task_id: entry.T for entry in entries}
+    steps = [entry.T for entry in entries]
     streams = [provenance.get(task_id, {}).get(STREAMS_RECORDED) for task_id in lengths]
     teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
     return {
         "original_transitions": None if None in streams else int(np.dot(streams, list(lengths.values()))),
-        "filtered_transitions": sum(entry.T for entry in entries),
-        "history_length": [min(lengths.values()), max(lengths.values())],
-        "teammates": len(teammates),
+        "filtered_transitions": sum(steps),
+        "history_length": [min(steps), max(steps)],
+        "teammates": len(teammates) or None,
         "steps_per_episode": kept_steps,
         "obs_shape": list(entries[0].obs_shape),
         "actions": len(ACTIONS),

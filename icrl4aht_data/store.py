@@ -1,13 +1,17 @@
 """Where a sampler's rows come from: `ram`, `mmap` and `stream` behind one interface, the same rows from each.
 
-ram      states and scalars decoded once into flat arrays; a window is one copy
+ram      records and scalars decoded once into flat arrays; a window is one copy
 mmap     the same arrays decoded once into the cache folder and memory-mapped, shared by processes
 stream   chunks read by their stored offsets, checked and inflated on threads when a window needs them
+
+A record is what is held of a step to show what the ego saw: its state record, or where a release has none the
+observation itself; see `schema.record_field`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -18,17 +22,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from icrl4aht_data.cache import cache_room, cached_arrays, free_memory
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.schema import FIELDS, Entry, Field
+from icrl4aht_data.schema import FIELDS, Entry, Kind, held_fields
 from icrl4aht_data.shard import Shard
 from icrl4aht_data.threads import in_slices
 
 Cache = Literal["auto", "ram", "mmap", "stream"]
 CACHES: tuple[Cache, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
-
-HELD = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state")
-"""The fields that batches are made of: every field but `obs`, which is painted from the states."""
 
 _VERSION = 1  # of the memory-mapped arrays
 
@@ -47,10 +47,10 @@ class Source(Protocol):
         """Rows starts..starts + L of each history into out (n, L, ...), C-contiguous; rows outside a history are zero.
 
         Args:
-            field: one of `HELD` with one row a step.
+            field: one of `held_fields` with one row a step.
             which: int (n,), positions.
             starts: int (n,), -1 or more.
-            out: any dtype for scalars, uint8 (n, L, S) for states.
+            out: any dtype for scalars, uint8 (n, L, S) for states, uint8 (n, L, 5, 5, C) for observations.
             threads: how many may share the work.
         """
         ...
@@ -60,7 +60,7 @@ class Source(Protocol):
         ...
 
     def ends(self, which: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-        """uint8 (m, S): the state after the last kept step of an episode (m,) of a history (m,)."""
+        """uint8 (m, S): the state after the last kept step of an episode (m,) of a history (m,). Of states only."""
         ...
 
 
@@ -81,10 +81,10 @@ def _gigabytes(size: int) -> str:
     return f"{size / 1e9:.3g} GB"
 
 
-def decoded_size(layout: Layout, steps: int, histories: int, episodes: int) -> int:
+def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
     """Bytes of the flat arrays of histories of one layout."""
-    row = sum(_element(layout, FIELDS[name]).itemsize for name in HELD if FIELDS[name].axis == "T")
-    return (steps + histories + 1) * row + episodes * record_size(layout)
+    rows = {"T": steps + histories + 1, "E": episodes}
+    return sum(rows[field.axis] * field.held(layout).itemsize for field in held_fields(kind))
 
 
 def open_source(cache: Cache, entries: Sequence[Entry], open_shard: Callable[[str], Shard], threads: int) -> Source:
@@ -116,12 +116,8 @@ def open_source(cache: Cache, entries: Sequence[Entry], open_shard: Callable[[st
             array.flush()  # type: ignore[attr-defined]
 
     steps, episodes = sum(entry.T for entry in entries), sum(entry.episodes for entry in entries)
-    size = decoded_size(layout, steps, len(entries), episodes)
+    size = decoded_size(layout, shards[0].kind, steps, len(entries), episodes)
     return Flat(entries, cached_arrays(f"histories-{digest.hexdigest()}", size, build))
-
-
-def _element(layout: Layout, field: Field) -> np.dtype:
-    return np.dtype(("u1", (record_size(layout),))) if field.row == "state" else np.dtype(field.compact)
 
 
 def _decoded(
@@ -129,20 +125,19 @@ def _decoded(
 ) -> dict[str, np.ndarray]:
     """Flat arrays by field; `make(shape, dtype, name)` allocates one, zeroed."""
     arrays = {}
-    for name in HELD:
-        field = FIELDS[name]
-        if field.optional and not any(entry.has_expert_actions for entry in entries):
+    for field in held_fields(shards[0].kind):
+        if not any(entry.has(field) for entry in entries):
             continue
         rows = sum(entry.rows(field) for entry in entries) + (len(entries) + 1 if field.axis == "T" else 0)
-        element = _element(layout, field)
-        arrays[name] = make((rows, *element.shape), element.base, name)
+        element = field.held(layout)
+        arrays[field.name] = make((rows, *element.shape), element.base, field.name)
     firsts = {axis: _first_rows(entries, axis) for axis in ("T", "E")}
 
     def decode(start: int, stop: int) -> None:
         for number in range(start, stop):
             entry, shard = entries[number], shards[number]
             for name, array in arrays.items():
-                if not (FIELDS[name].optional and not entry.has_expert_actions):
+                if entry.has(FIELDS[name]):
                     first = firsts[FIELDS[name].axis][number]
                     shard.decode_into(entry.history_id, FIELDS[name], array[first : first + entry.rows(FIELDS[name])])
 
@@ -185,11 +180,12 @@ class Flat:
 
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
-    """Rows first..first + L of array (N, S) into out (n, L, S): one block of bytes a window."""
+    """Rows first..first + L of array (N, ...) into out (n, L, ...), uint8: one block of bytes a window."""
     source, target = array.data.cast("B"), out.data.cast("B")
-    size = out.shape[1] * array.shape[1]
+    row = math.prod(array.shape[1:])
+    size = out.shape[1] * row
     place = 0
-    for begin in (first * array.shape[1]).tolist():
+    for begin in (first * row).tolist():
         target[place : place + size] = source[begin : begin + size]
         place += size
 
@@ -198,8 +194,7 @@ class Streamed:
     """Histories in their shards, read a few chunks at a time."""
 
     def __init__(self, layout: Layout, entries: Sequence[Entry], shards: Sequence[Shard]) -> None:
-        self._entries, self._shards = entries, shards
-        self._size = record_size(layout)
+        self._entries, self._shards, self._layout = entries, shards, layout
 
     @cached_property
     def _lengths(self) -> list[int]:
@@ -229,10 +224,10 @@ class Streamed:
             rows.append(
                 self._shards[position].read(history_id, FIELDS[field], low, int(wanted.max()) + 1)[wanted - low]
             )
-        return np.stack(rows) if rows else np.zeros((*steps.shape, self._size), np.uint8)
+        return np.stack(rows) if rows else np.zeros((*steps.shape, *FIELDS[field].held(self._layout).shape), np.uint8)
 
     def ends(self, which: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-        out = np.empty((len(which), self._size), np.uint8)
+        out = np.empty((len(which), *FIELDS["episode_end_state"].held(self._layout).shape), np.uint8)
         for row, (position, episode) in enumerate(zip(which.tolist(), episodes.tolist(), strict=True)):
             history_id = self._entries[position].history_id
             out[row] = self._shards[position].read(history_id, FIELDS["episode_end_state"], episode, episode + 1)[0]

@@ -10,12 +10,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from icrl4aht_data.benchmark import ALGORITHMS, HEURISTIC_KINDS, SPLITS, TEAMMATE, TRACKS, check_place, unknown
+from icrl4aht_data.benchmark import (
+    ALGORITHMS,
+    FAMILIES,
+    HEURISTIC_KINDS,
+    SPLITS,
+    TEAMMATE,
+    TRACKS,
+    check_place,
+    unknown,
+)
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -53,6 +62,37 @@ class Task:
     def teammate_family(self) -> str:
         """The index's `teammate_family`: H1..H4, or rl."""
         return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS[self.teammate_kind]
+
+
+@dataclass(frozen=True)
+class NamedTask(Task):
+    """A task of which only what an index line says is known: no parameters of its teammate, and -1 for its seed.
+
+    Args:
+        teammate: the line's teammate_kind and teammate_family.
+    """
+
+    @property
+    def teammate_kind(self) -> str:
+        return self.teammate["teammate_kind"]
+
+    @property
+    def teammate_family(self) -> str:
+        return self.teammate["teammate_family"]
+
+
+def named_task(line: Mapping[str, Any]) -> NamedTask:
+    """The task of an index line with the paper's fields.
+
+    Raises:
+        UnknownNameError: for names that the benchmark does not know.
+    """
+    layout = get_layout(line["layout"])
+    check_place(line["track"], line["split"], layout.name)
+    if line["teammate_family"] not in FAMILIES:
+        raise unknown("teammate_family", line["teammate_family"], FAMILIES)
+    teammate = {name: line[name] for name in ("teammate_kind", "teammate_family")}
+    return NamedTask(line["task_id"], line["track"], line["split"], layout.alias, -1, teammate)
 
 
 def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:

@@ -81,7 +81,7 @@ def test_published_files_with_faults(published, tmp_path):
         group: Any = file["/3"]
         group["obs"][5] += 1
         del file["/1/state"]
-    fails(r"histories\.h5, group /1: lacks state; a release is made of state records")
+    fails(r"histories\.h5, group /1: lacks state: a lite release is made of state records")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         file["/1/state"] = file["/0/state"]
     fails(r"group /1: obs is not what state shows")
@@ -91,7 +91,8 @@ def test_published_files_with_faults(published, tmp_path):
     index.write_text(index.read_text().replace('"track"', '"trick"', 1))
     fails(r"histories_index\.jsonl, line 1: lacks the fields \['track'\]")
     (tmp_path / "files" / "tasks.jsonl").unlink()
-    index.write_text((published / "histories_index.jsonl").read_text())
+    for name in ("histories.h5", "histories_index.jsonl"):
+        shutil.copy(published / name, tmp_path / "files")
     fails(r"tasks\.jsonl: missing")
 
 

@@ -75,6 +75,12 @@ def observe_both(layout: Layout, record: Array) -> Array:
     return _expand(layout, *(xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True)))
 
 
+def fixed_channels(layout: Layout) -> slice:
+    """The channels of what never changes on a cell: its kind, and the ingredient piled on it."""
+    first = _tables(layout).agent_channels
+    return slice(first, first + len(_STATIC) + layout.ingredient_types)
+
+
 def _expand(layout: Layout, agents: Array, cells: Array) -> Array:
     """uint32 (B, 25) twice -> uint8 (B, 5, 5, C): every channel is some bits of one of the two words."""
     xp = agents.__array_namespace__()
