@@ -86,7 +86,7 @@ def checkpoint_files(folder: Path, task: Task) -> dict[str, Path]:
     Args:
         folder: what the task's checkpoint path starts from: a suite, or TEAMMATES of a release.
     """
-    if task.teammate["kind"] != "rl":
+    if task.teammate.get("kind") != "rl":
         return {}
     checkpoint = task.teammate["theta"]["checkpoint"]
     found = sorted((folder / checkpoint).glob("policy.*"))
