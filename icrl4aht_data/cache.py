@@ -22,7 +22,8 @@ from filelock import FileLock
 from icrl4aht_data.errors import OptionError
 
 _DEFAULT_LIMIT = 100 * 10**9
-_FRESH_NS = 2 * 10**9  # a file changed this recently may change again within one tick of its clock
+_TICK_NS = 10**8  # a file changed this recently may change again within one tick of its clock
+_COARSE_TICK_NS = 2 * 10**9  # where the clock shows no parts of a millisecond
 _SMALL = 2**20  # hashing this is quicker than remembering
 
 Arrays = dict[str, np.ndarray]
@@ -166,6 +167,11 @@ def content_hash(path: Path) -> str:
     before = path.stat()
     if before.st_size < _SMALL:
         return _hash(path)
+    unsettled = _unsettled_ns(before)
+    if 0 < unsettled <= _TICK_NS:
+        time.sleep(unsettled / 1e9)
+        before = path.stat()
+        unsettled = _unsettled_ns(before)
     signature = [before.st_size, before.st_mtime_ns, before.st_ctime_ns, before.st_ino]
     name = hash_text(str(path.resolve()))
     note = cache_folder() / ".hashes" / f"{name}.json"
@@ -176,8 +182,7 @@ def content_hash(path: Path) -> str:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     content = _hash(path)
-    settled = time.time_ns() - max(before.st_mtime_ns, before.st_ctime_ns) > _FRESH_NS
-    if settled:
+    if unsettled <= 0:
         try:
             note.parent.mkdir(parents=True, exist_ok=True)
             partial = note.with_suffix(f".{os.getpid()}")
@@ -186,6 +191,13 @@ def content_hash(path: Path) -> str:
         except OSError:  # not remembered, then
             pass
     return content
+
+
+def _unsettled_ns(status: os.stat_result) -> int:
+    """For how long another change of the file might leave its times as they are; 0 or less if it cannot."""
+    times = (status.st_mtime_ns, status.st_ctime_ns)
+    tick = _TICK_NS if any(moment % 10**6 for moment in times) else _COARSE_TICK_NS
+    return max(times) + tick - time.time_ns()
 
 
 def _hash(path: Path) -> str:

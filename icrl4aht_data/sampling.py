@@ -119,7 +119,6 @@ class ADSampler(Sampler[ADBatch]):
     def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
         which, starts, valid = self._windows(i)
         batch = self._checked(out)
-        np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
         scalars = [
             ("actions", 0, batch.target_actions),
             ("dones", 0, batch.dones),
@@ -139,7 +138,9 @@ class ADSampler(Sampler[ADBatch]):
             self._fill_obs(group, place, start, batch.obs)
             if batch.layouts is not None:
                 batch.layouts[group.rows] = self.layouts.index(group.layout)
+        batch.attention_mask[...] = True
         if valid.min() < self.length:
+            np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
             padding = ~batch.attention_mask
             for array in (batch.obs, *(array for _, _, array in scalars)):
                 if array is not None:

@@ -11,7 +11,6 @@ observation itself; see `schema.record_field`.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +30,7 @@ CACHES: tuple[Cache, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
 
 _VERSION = 1  # of the memory-mapped arrays
+_WINDOWS = 256  # copied at a time: the copies in between stay few, and the calls too
 
 
 class Choice(NamedTuple):
@@ -167,10 +167,8 @@ class Flat:
             for row, (begin, missing) in enumerate(zip(first.tolist(), np.maximum(beyond, 0).tolist(), strict=True)):
                 kept = max(length - missing, 0)
                 out[row, :kept], out[row, kept:] = array[begin : begin + kept], 0
-        elif array.ndim == 1:
-            out[...] = sliding_window_view(array, length)[first]
         else:
-            _copy_windows(array, first, out)
+            _copy_windows(array, first, out, threads)
 
     def steps(self, field: str, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
         return self._arrays[field][self._first[which][:, None] + steps]
@@ -179,15 +177,18 @@ class Flat:
         return self._arrays["episode_end_state"][self._first_end[which] + episodes]
 
 
-def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
-    """Rows first..first + L of array (N, ...) into out (n, L, ...), uint8: one block of bytes a window."""
-    source, target = array.data.cast("B"), out.data.cast("B")
-    row = math.prod(array.shape[1:])
-    size = out.shape[1] * row
-    place = 0
-    for begin in (first * row).tolist():
-        target[place : place + size] = source[begin : begin + size]
-        place += size
+def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray, threads: int) -> None:
+    """Rows first..first + L of array (N,) or (N, S) into out (n, L) or (n, L, S), C-contiguous: a block a window."""
+    size = array[0].size
+    blocks = sliding_window_view(array.reshape(-1), out.shape[1] * size)
+    place, target = first * size, out.reshape(len(out), -1)
+
+    def part(start: int, stop: int) -> None:
+        for low in range(start, stop, _WINDOWS):
+            rows = slice(low, min(low + _WINDOWS, stop))
+            target[rows] = blocks[place[rows]]
+
+    in_slices(part, len(out), threads, least=64)
 
 
 class Streamed:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -127,13 +129,25 @@ def test_a_changed_index_is_parsed_anew(tmp_path, folder):
     assert len(kept(folder)) == 2
 
 
-def test_an_old_file_is_not_hashed_again(long, folder, monkeypatch):
-    root, entries = long
-    monkeypatch.setattr(cache, "_FRESH_NS", 0)
+def test_a_file_is_hashed_once_however_new_it_is(tmp_path, folder, monkeypatch):
+    root = tmp_path / "release"
+    entries = long_index(root)
     read_index(root)
     monkeypatch.setattr(cache, "_hash", lambda path: pytest.fail("hashed again"))
     monkeypatch.setattr(columns, "_parse", lambda path: pytest.fail("parsed again"))
     assert read_index(root).entry(2999) == entries[2999]
+
+
+@pytest.mark.parametrize(
+    ("age", "fraction", "unsettled"),
+    [(50, 1, True), (150, 1, False), (150, 0, True), (1900, 0, True), (2100, 0, False)],
+)
+def test_when_a_files_times_tell_of_every_change(monkeypatch, age, fraction, unsettled):
+    """Age in milliseconds; a clock that shows no parts of a millisecond is taken to tick every two seconds."""
+    changed = 1_700_000_000 * 10**9 + fraction
+    monkeypatch.setattr(cache.time, "time_ns", lambda: changed + age * 10**6)
+    status = SimpleNamespace(st_mtime_ns=changed, st_ctime_ns=changed - 10**9)
+    assert (cache._unsettled_ns(cast(os.stat_result, status)) > 0) == unsettled
 
 
 def test_a_damaged_cache_is_rebuilt(long, folder):
