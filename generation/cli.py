@@ -174,7 +174,7 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
 @click.option("--layout", "layouts", multiple=True, help="Again for more; all finished ones by default.")
 @_algorithms
 @_suite
-@click.option("--greedy", is_flag=True, help="Cross-play by likeliest actions, as teammates act, not by draws.")
+@click.option("--greedy", is_flag=True, help="Members act greedily, as teammates do.")
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Self-play and cross-play of each population, and Hamming distances of all teammates; tables and pictures."""
     from generation.build_suite import report_diversity

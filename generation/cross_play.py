@@ -13,7 +13,7 @@ import numpy as np
 from generation.env import Environment
 from generation.learners.network import ActorCritic, Widths
 from generation.learners.rollout import Player, network_player, roll_out, take_seats
-from icrl4aht_data.benchmark import EPISODE_STEPS
+from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
 EPISODES = 20
@@ -32,7 +32,8 @@ def matrix(
         right: of B policies for seat 1.
         seed: of the episodes and the draws.
         episodes: of each pair.
-        greedy: whether policies take their likeliest actions, as teammates do, or draw them, as in training.
+        greedy: whether the policy in seat 1 takes its likeliest actions, as teammates do. All others draw theirs, as in
+            training; two greedy players can stand in each other's way for ever.
 
     Returns:
         float64 (A, B).
@@ -65,14 +66,14 @@ def _play(
     n = len(first) * episodes
     sides = [np.repeat(np.array(side), episodes) for side in (first, second)]
 
-    def player(params: Any, seat: int) -> Player:
+    def player(params: Any, seat: int, greedy: bool) -> Player:
         policies = range(max(sides[seat]) + 1)
         places = np.stack([(sides[seat] == policy).nonzero()[0] for policy in policies]) + seat * n
         return network_player(env, network, params, places, jnp.zeros(places.shape, jnp.int32), greedy)
 
     @jax.jit
     def play(left, right, key):
-        players = [player(left, 0), player(right, 1)]
+        players = [player(left, EGO, False), player(right, TEAMMATE, greedy)]
         seats = take_seats(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
         _, rollout = roll_out(env, players, seats, EPISODE_STEPS, jax.random.fold_in(key, 1))
         return rollout.reward.sum(axis=0).reshape(len(first), episodes).mean(axis=1)

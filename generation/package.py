@@ -125,8 +125,8 @@ def _teammates(profile: Profile) -> str:
     config = profile.teammates
     return (
         f"checkpoints of {', '.join(profile.algorithms)} populations of {config.members} ({config.ppo.total_steps:,} "
-        f"steps a member), drawn from those whose greedy return of 400 steps exceeds {THRESHOLD:g}; they act greedily, "
-        f"and `teammates/` has their weights"
+        f"steps a member), drawn from those with whom their own partner's return of 400 steps exceeds "
+        f"{THRESHOLD:g}; they act greedily, and `teammates/` has their weights"
     )
 
 

@@ -32,16 +32,16 @@ class Selection:
 
 
 def select(suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0) -> Selection:
-    """Draw teammates from the checkpoints whose greedy return exceeds the threshold.
+    """Draw teammates from the checkpoints whose return as teammates exceeds the threshold.
 
-    Greedy, because that is how they will play. Drawn from the sorted list with a fixed seed. Where there are too few
-    for both, the held-out ones are at most a fifth.
+    Drawn from the sorted list with a fixed seed. Where there are too few for both, the held-out ones are at most a
+    fifth.
 
     Raises:
         OptionError: if the population was not finished.
     """
     candidates = list(checkpoints(suite, layout, algorithm))
-    good = [point for point in candidates if point.card["greedy_return"] > THRESHOLD]
+    good = [point for point in candidates if point.card["teammate_return"] > THRESHOLD]
     order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
     apart = min(heldout, max(len(good) - train, len(good) // 5))
     chosen = [good[k] for k in order]

@@ -245,7 +245,7 @@ class _Training:
         count = 1 if run.algorithm == "comedi" else run.members
         members = jax.tree.map(lambda leaf: leaf[:count], params)
         opposite = jax.tree.map(lambda leaf: leaf[count : 2 * count], params) if run.responds else members
-        returns, greedy = (
+        returns, as_teammate = (
             cross_play.together(run.layout, population.network, opposite, members, greedy=greedy)
             for greedy in (False, True)
         )
@@ -260,8 +260,9 @@ class _Training:
                 "code_version": version("icrl4aht-data"),
                 "seats": [1] if run.responds else [0, 1],
                 "return": float(returns[k]),
-                "greedy_return": float(greedy[k]),
-                "return_of": f"{cross_play.EPISODES} episodes of 400 steps with its best response or itself",
+                "teammate_return": float(as_teammate[k]),
+                "return_of": f"{cross_play.EPISODES} episodes of 400 steps with its best response or itself, both "
+                "drawing their actions; as a teammate it acts greedily, in seat 1",
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
@@ -314,7 +315,7 @@ def checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Checkpoint
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
     """Mean returns float64 (K, K) of the final policies: row the one in seat 0 (the best response, where the algorithm
-    trains them), column the member in seat 1; the diagonal is self-play.
+    trains them), column the member in seat 1; the diagonal is self-play. `greedy` members act as teammates do.
 
     Raises:
         OptionError: if the population was not finished.

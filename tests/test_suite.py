@@ -25,7 +25,7 @@ from generation.env import Environment
 from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
 from generation.learners.network import ActorCritic, Widths
 from generation.learners.ppo import PPOConfig
-from generation.learners.rollout import policy_player, random_player, roll_out, take_seats
+from generation.learners.rollout import network_player, policy_player, random_player, roll_out, take_seats
 from generation.select import Selection, layout_number, make_tasks, select, write_manifests
 from generation.suite import Checkpoint, Run, checkpoints, is_finished, play_matrix, train
 from generation.teammates import learned
@@ -154,7 +154,7 @@ def test_cards_say_what_a_checkpoint_is(trained, algorithm):
         assert card["shapes"]["params/actor/kernel"] == [8, 6]
         assert Widths.from_table(card["widths"]) == WIDTHS
         assert isinstance(card["return"], float)
-        assert isinstance(card["greedy_return"], float)
+        assert isinstance(card["teammate_return"], float)
         assert card["code_version"]
 
 
@@ -164,7 +164,7 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
     for checkpoint in (0, 4):
         loaded = [load_policy(folder / f"m{m}" / f"c{checkpoint}") for m in range(2)]
         members = stacked([params for _, params, _ in loaded])
-        for name, greedy in (("return", False), ("greedy_return", True)):
+        for name, greedy in (("return", False), ("teammate_return", True)):
             returns = cross_play.together(LAYOUT, loaded[0][0], members, members, greedy=greedy)
             assert [card[name] for _, _, card in loaded] == returns.tolist()
 
@@ -182,6 +182,20 @@ def test_the_log_has_a_line_for_each_update(trained, algorithm):
         assert ("cross_play" in line) == (ended and meets_others)
         np.testing.assert_allclose(line["shaping"], max(0, 1 - line["update"] * 800 / 2000), atol=1e-6)
     assert (population(trained, algorithm) / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_as_a_teammate_seat_1_alone_is_greedy(trained, monkeypatch):
+    network, params, _ = load_policy(population(trained, "fcp") / "m0/c4")
+    made = []
+
+    def player(env, network, params, places, partner, greedy):
+        made.append((bool((places >= places.size).all()), greedy))
+        return network_player(env, network, params, places, partner, greedy)
+
+    monkeypatch.setattr(cross_play, "network_player", player)
+    for greedy in (False, True):
+        cross_play.together(LAYOUT, network, stacked([params]), stacked([params]), episodes=2, greedy=greedy)
+    assert made == [(False, False), (True, False), (False, False), (True, True)]
 
 
 def test_the_play_matrix_seats_best_responses_opposite_members(trained):
@@ -331,11 +345,11 @@ def test_a_population_learns_the_same_shared_out_over_two_devices(trained, tmp_p
 
 
 def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
-    """A suite with these greedy returns by (member, checkpoint); every weight file differs."""
+    """A suite with these returns as teammates by (member, checkpoint); every weight file differs."""
     folder = population(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}
-        card = {"algorithm": algorithm, "seed": 7, "greedy_return": greedy, "return": -greedy}
+        card = {"algorithm": algorithm, "seed": 7, "teammate_return": greedy, "return": -greedy}
         path = folder / f"m{member}" / f"c{checkpoint}"
         save_policy(path, ActorCritic(WIDTHS), params, card)
     (folder / "population.json").write_text("{}")
@@ -369,12 +383,12 @@ def test_sorted_by_number_with_more_than_ten_members(tmp_path):
     assert [path.split("/")[2] for path in found] == ["m0", "m2", "m10", "m11"]
 
 
-def test_only_greedy_returns_above_the_threshold_are_selected(candidates):
+def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
     chosen = select(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
     assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
     everyone = chosen.train + chosen.heldout
     assert len(set(paths(everyone))) == 40
-    assert all(point.card["greedy_return"] > 20 for point in everyone)
+    assert all(point.card["teammate_return"] > 20 for point in everyone)
 
 
 def test_train_and_heldout_are_disjoint_and_of_the_wanted_numbers(candidates):
