@@ -14,7 +14,7 @@ from generation.package import package
 from generation.profiles import Profile, load_profile
 from generation.progress import progress
 from generation.run import CollectionError, collect_tasks
-from generation.select import THRESHOLD, training_tasks
+from generation.select import THRESHOLD, make_tasks
 from icrl4aht_data.index import read_info
 from icrl4aht_data.release import check_replaceable
 from icrl4aht_data.schema import Kind
@@ -32,12 +32,14 @@ def build_releases(
     console: Console,
     options: Options | None = None,
     suite: Path | None = None,
+    seed: int = 0,
 ) -> list[Path]:
     """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
 
     Args:
         out: tasks are collected under out/artefacts.
         suite: the folder of the learned teammates; by default out/suite.
+        seed: of the suite.
 
     Raises:
         CollectionError: if a task could not be collected; nothing is packed then.
@@ -45,25 +47,27 @@ def build_releases(
     profile = load_profile(profile_name)
     for kind in kinds:
         check_replaceable(out / kind)  # before the long work, not after it
-    suite = suite or out / SUITE
-    if profile.algorithms:
-        build_suite(profile, suite, profile.layouts, profile.algorithms, 0, console)
-    tasks = tasks_of(profile, suite)
+    out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
+    tasks = train_teammates(profile, suite, seed, console)
     collect_tasks(tasks, profile, out, console, options or Options(), suite)
     with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same, before or after
         releases = [_pack(out / "artefacts", out / kind, tasks, profile, suite, kind, console) for kind in kinds]
-    for release in releases:
-        print_statistics(read_info(release), console)
+        for release in releases:
+            print_statistics(read_info(release), console)
     return releases
 
 
-def tasks_of(profile: Profile, suite: Path) -> list[Task]:
-    """The training tasks of a profile: those with presets, then those with the suite's teammates.
+def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) -> list[Task]:
+    """The training tasks of a profile: those with presets, then those with learned teammates, which are trained first.
 
     Raises:
-        CollectionError: if there are none, because no teammate is good enough.
+        CollectionError: if there is no task, because no teammate is good enough.
     """
-    tasks = [*profile.heuristic_tasks(), *training_tasks(suite, profile.layouts, profile.algorithms)]
+    tasks = profile.heuristic_tasks()
+    if not profile.algorithms:
+        return tasks
+    selections = build_suite(profile, suite, profile.layouts, profile.algorithms, seed, console)
+    tasks += make_tasks(suite, selections, "train")
     if not tasks:
         raise CollectionError(
             f"{suite}: no checkpoint of {', '.join(profile.algorithms)} exceeds the return of {THRESHOLD:g} that a "

@@ -30,26 +30,29 @@ def build_suite(
     algorithms: Sequence[str],
     seed: int,
     console: Console,
-) -> None:
+) -> list[Selection]:
     """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
 
     Populations that another process trains are left to it until nothing else is to do, then waited for.
+
+    Returns:
+        What the filter left of each population that was asked for.
     """
     names = _names(layouts or profile.layouts)
     for name in algorithms:
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
+    wanted = [(name, algorithm) for name in names for algorithm in algorithms or ALGORITHMS]
     todo = []
-    for name in names:
-        for algorithm in algorithms or ALGORITHMS:
-            own_seed = seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm)
-            todo.append(Run(get_layout(name), algorithm, config.members, config.ppo, own_seed))
+    for name, algorithm in wanted:
+        own_seed = seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm)
+        todo.append(Run(get_layout(name), algorithm, config.members, config.ppo, own_seed))
     for wait in (False, True):
         todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
     selections = [
         select(suite, name, algorithm, config.train, config.heldout, seed)
-        for name in _names([*profile.layouts, *names])
+        for name in training_layouts()
         for algorithm in ALGORITHMS
         if is_trained(suite, name, algorithm)
     ]
@@ -57,6 +60,12 @@ def build_suite(
         console.print(_in_words(selection, config.train))
     for path in write_manifests(suite, selections):
         console.print(f"wrote {path}")
+    return [selection for selection in selections if (selection.layout, selection.algorithm) in wanted]
+
+
+def training_layouts() -> list[str]:
+    """The layouts of all training tasks."""
+    return list(dict.fromkeys(name for splits in TRACKS.values() for name in splits["train"]))
 
 
 def _names(layouts: Sequence[str]) -> list[str]:
@@ -109,8 +118,7 @@ def report_diversity(
     Raises:
         OptionError: if a population was not finished.
     """
-    every = dict.fromkeys(name for splits in TRACKS.values() for name in splits["train"])
-    for name in _names(layouts) or [name for name in every if _complete(suite, name)]:
+    for name in _names(layouts) or [name for name in training_layouts() if _complete(suite, name)]:
         layout = get_layout(name)
         for algorithm in algorithms or ALGORITHMS:
             _report_population(suite, layout, algorithm, greedy, console)

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from generation.options import EXECUTORS, Executor, Options, ask_for_determinism
+from generation.options import EXECUTORS, Executor, Options, ask_for_determinism, leave_memory_to_workers
 from icrl4aht_data.cli import run
 from icrl4aht_data.schema import KINDS, Kind
 
@@ -30,6 +30,7 @@ def cli() -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for artefacts and releases.")
 @click.option("--kind", type=click.Choice(KINDS), multiple=True, default=("lite",), show_default=True)
 @click.option("--suite", type=click.Path(path_type=Path), help="Folder of the learned teammates.  [default: OUT/suite]")
+@click.option("--seed", default=0, show_default=True, help="Of the learned teammates.")
 @click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
 @click.option("--executor", type=click.Choice(EXECUTORS), default="local", show_default=True)
 @click.option(
@@ -43,6 +44,7 @@ def generate(
     out: Path,
     kind: tuple[Kind, ...],
     suite: Path | None,
+    seed: int,
     bundle: bool,
     executor: Executor,
     address: str | None,
@@ -53,8 +55,8 @@ def generate(
     """Train the teammates and an ego for every task of a profile, record it, and pack OUT/lite or OUT/full.
 
     What is finished is kept, and what is not goes on from its last saved update: after a stop or a kill the same
-    command goes on where it was. Tasks that fail are listed in OUT/failed.jsonl; the others are finished, nothing
-    is packed, and the exit code is 1.
+    command goes on where it was. Teammates are trained by this process, tasks by the executor. Tasks that fail are
+    listed in OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1.
     """
     from generation.build import build_releases
     from generation.package import bundle_release
@@ -64,8 +66,10 @@ def generate(
     if executor == "local" and (address or workers):
         raise click.UsageError("--address and --workers need --executor ray")
     ask_for_determinism()
+    if executor == "ray":
+        leave_memory_to_workers()
     options = Options(executor, address, workers, retries, fail_fast)
-    releases = dict(zip(kind, build_releases(profile_name, out, kind, console, options, suite), strict=True))
+    releases = dict(zip(kind, build_releases(profile_name, out, kind, console, options, suite, seed), strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
@@ -174,7 +178,7 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
 @click.option("--layout", "layouts", multiple=True, help="Again for more; all finished ones by default.")
 @_algorithms
 @_suite
-@click.option("--greedy", is_flag=True, help="Members act greedily, as teammates do.")
+@click.option("--greedy", is_flag=True, help="In seat 1 act greedily, as teammates do.")
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Self-play and cross-play of each population, and Hamming distances of all teammates; tables and pictures."""
     from generation.build_suite import report_diversity

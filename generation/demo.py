@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from generation.build import SUITE, build_releases, tasks_of
-from generation.collect import make_learner
+from generation.build import build_releases
+from generation.plan import task_learner
 from generation.profiles import load_profile
 from generation.speed import learner_speed
 from icrl4aht_data.benchmark import KEPT_STEPS
@@ -58,8 +58,7 @@ def run_demo(out: Path, profile_name: str, console: Console) -> None:
 
     say(6, "measuring the learner")
     profile = load_profile(profile_name)
-    learner = make_learner(tasks_of(profile, out / SUITE)[-1], profile, out / SUITE)
-    console.print(json.dumps(learner_speed(learner)), highlight=False)
+    console.print(json.dumps(learner_speed(task_learner(profile, profile.ego))), highlight=False)
     console.print(f"[bold]done[/bold] in {time.perf_counter() - started:.0f} s; the release is {root}")
 
 

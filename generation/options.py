@@ -37,3 +37,8 @@ def ask_for_determinism() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_gpu_deterministic_ops" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
+
+
+def leave_memory_to_workers() -> None:
+    """Have JAX take GPU memory as it needs it, not most of it at once; before JAX is first used."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

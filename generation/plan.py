@@ -47,8 +47,8 @@ class Speed(NamedTuple):
 
 @dataclass(frozen=True)
 class Cost:
-    """Of a whole profile. Hours are of learning and recording; N devices take the populations, then the tasks, in
-    turn."""
+    """Of a whole profile. Hours are of learning and recording; N devices take the tasks in turn, after one process has
+    trained the populations, one after the other."""
 
     profile: str
     populations: int
@@ -98,7 +98,7 @@ def cost(profile: Profile, devices: int) -> Cost:
     """Reckoned from the profile, short calibration runs, and a history of the bundled release.
 
     Args:
-        devices: the N of `hours_on_devices`; each does one population or task at a time.
+        devices: the N of `hours_on_devices`; each does one task at a time.
     """
     ego, count = profile.ego, profile.tasks_of_a_layout
     tasks = count * len(profile.layouts)
@@ -107,7 +107,7 @@ def cost(profile: Profile, devices: int) -> Cost:
     populations = [steps for layout in profile.layouts for steps in population_steps(profile, layout)]
     playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
     population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
-    in_turn = _in_turn(population_seconds, devices) + _in_turn([task_seconds] * tasks, devices)
+    in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
     kept = tasks * profile.keep * ego.episodes * KEPT_STEPS
     device = jax.devices()[0]
     return Cost(
@@ -129,14 +129,6 @@ def cost(profile: Profile, devices: int) -> Cost:
         devices=devices,
         hours_on_devices=round(in_turn / 3600, 2),
     )
-
-
-def _in_turn(seconds: Sequence[float], devices: int) -> float:
-    """Until the last is done, if each device takes the next one when it is free."""
-    busy = [0.0] * devices
-    for each in seconds:
-        busy[busy.index(min(busy))] += each
-    return max(busy)
 
 
 def population_steps(profile: Profile, layout: str) -> list[int]:

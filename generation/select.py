@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
 from generation.learners.checkpoint import WEIGHTS
 from generation.suite import Checkpoint, checkpoints
 from icrl4aht_data.benchmark import ALGORITHMS, TRACKS, track_of
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import file_in_place_of
 from icrl4aht_data.release import file_hash
-from icrl4aht_data.tasks import Task, make_task, read_tasks, write_tasks
+from icrl4aht_data.tasks import Task, make_task, write_tasks
 
 THRESHOLD = 20.0
 """Returns of 400 steps that a teammate must exceed (paper, App. B.1)."""
@@ -41,11 +44,21 @@ def select(suite: Path, layout: str, algorithm: str, train: int, heldout: int, s
         OptionError: if the population was not finished.
     """
     candidates = list(checkpoints(suite, layout, algorithm))
-    good = [point for point in candidates if point.card["teammate_return"] > THRESHOLD]
+    good = [point for point in candidates if _return_as_teammate(suite, point) > THRESHOLD]
     order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
     apart = min(heldout, max(len(good) - train, len(good) // 5))
     chosen = [good[k] for k in order]
     return Selection(layout, algorithm, len(candidates), len(good), chosen[apart : apart + train], chosen[:apart])
+
+
+def _return_as_teammate(suite: Path, point: Checkpoint) -> float:
+    try:
+        return point.card["teammate_return"]
+    except KeyError as error:
+        raise OptionError(
+            f"{suite / point.path}: its card lacks 'teammate_return', it was made by an earlier version: train the "
+            f"suite anew, in another folder"
+        ) from error
 
 
 def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list[Task]:
@@ -67,18 +80,6 @@ def layout_number(layout: str) -> int:
     return list(dict.fromkeys(every)).index(layout)
 
 
-def training_tasks(suite: Path, layouts: Sequence[str], algorithms: Sequence[str]) -> list[Task]:
-    """The tasks of a suite's training manifests with these layouts and teammates, in the layouts' order."""
-    paths = [path for track in TRACKS if (path := _manifest(suite, track, "train")).is_file()]
-    found = [task for path in paths for task in read_tasks(path)]
-    chosen = [task for task in found if task.layout.name in layouts and task.teammate_kind in algorithms]
-    return sorted(chosen, key=lambda task: layouts.index(task.layout.name))
-
-
-def _manifest(suite: Path, track: str, split: str) -> Path:
-    return suite / "manifests" / f"{track}_{split}.jsonl"
-
-
 def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[str, Any]:
     return {
         "kind": "rl",
@@ -91,15 +92,18 @@ def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[
 
 def write_manifests(suite: Path, selections: Sequence[Selection]) -> list[Path]:
     """SUITE/manifests/<track>_train.jsonl and _heldout.jsonl of the tracks that have teammates."""
+    folder = suite / "manifests"
+    folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for track in TRACKS:
-        for split in ("train", "heldout"):
+    with FileLock(folder.with_name(f".{folder.name}.lock")):  # several processes may train one suite
+        for track in TRACKS:
             own = [selection for selection in selections if track_of(selection.layout) == track]
-            tasks = make_tasks(suite, own, split)
-            path = _manifest(suite, track, split)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)
-            if tasks:
-                write_tasks(path, tasks)
+            for split in ("train", "heldout"):
+                path, tasks = folder / f"{track}_{split}.jsonl", make_tasks(suite, own, split)
+                if not tasks:
+                    path.unlink(missing_ok=True)
+                    continue
+                with file_in_place_of(path) as partial:
+                    write_tasks(partial, tasks)
                 written.append(path)
     return written

@@ -2,7 +2,7 @@
 
     SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
     SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, where the algorithm trains them
-    SUITE/<layout>/<algorithm>/metrics.jsonl, curves.png, population.json
+    SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, curves.png, population.json
 
 `population.json` comes last and names every file by its hash. Before it there is `resume.safetensors`, from which a
 stopped run goes on to the same bytes.
@@ -11,6 +11,7 @@ stopped run goes on to the same bytes.
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -24,6 +25,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from generation import cross_play
+from generation.artefact import TIMING
 from generation.env import Environment
 from generation.figures import plot_training
 from generation.learners.brdiv import BRDiv
@@ -77,6 +79,11 @@ class Run:
                 f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "
                 f"{CHECKPOINTS}, one for each checkpoint"
             )
+        try:
+            for stage in self.stages:
+                _ = stage.seating
+        except ValueError as error:
+            raise OptionError(f"teammates, {self.algorithm} with {self.members} members: {error}") from error
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -170,21 +177,45 @@ class _Training:
         path = self.folder / _RESUME
         if (self.folder / _POPULATION).exists():
             raise OptionError(
-                f"{self.folder}: holds a finished population of other settings, or with changed files; remove it, or "
-                f"give another --suite"
+                f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
             )
         notes = read_card(path)
         if notes is None:
-            keep_lines(self.folder / _METRICS, 0)
+            self._begin_anew()
             return 0, None
-        if notes["settings_hash"] != self.run.settings_hash:
+        if {name: notes.get(name) for name in self._notes(0)} != self._notes(int(notes["stage"])):
             raise OptionError(
-                f"{self.folder}: holds an unfinished run of other settings; remove it, or give another --suite"
+                f"{self.folder}: holds an unfinished run of other settings, another JAX or another kind of device; "
+                f"remove it, or give another --suite"
             )
         stage = int(notes["stage"])
         state = load_state(path, jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
         keep_lines(self.folder / _METRICS, stage * self.run.config.updates + int(state.update))
         return stage, state
+
+    def _begin_anew(self) -> None:
+        """Remove what a run left that was killed before its first save."""
+        for folder in (*self.folder.glob("m[0-9]*"), self.folder / "responses"):
+            shutil.rmtree(folder, ignore_errors=True)
+        for name in (_METRICS, TIMING):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _notes(self, stage: int) -> dict[str, str]:
+        """What must be the same for a run to go on to the same bits."""
+        software = {"jax": jax.__version__, "platform": jax.default_backend()}
+        return {"settings_hash": self.run.settings_hash, "stage": str(stage), **software}
+
+    def _difference(self) -> str:
+        """In what a finished population is not this run's."""
+        try:
+            found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
+            other = {name: found.get(name) for name, value in self._settings().items() if found.get(name) != value}
+        except (OSError, ValueError, KeyError, AttributeError):
+            other = {}
+        return f"of other settings: {other}" if other else "with changed files"
+
+    def _settings(self) -> dict[str, Any]:
+        return json.loads(json.dumps(self.run.settings))
 
     def _key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
@@ -196,36 +227,36 @@ class _Training:
         marks = {-(-updates * (c + 1) // CHECKPOINTS): c for c in range(CHECKPOINTS)}
         started, before = time.perf_counter(), int(state.update)
         saved = started
-        with (self.folder / _METRICS).open("a", encoding="utf-8") as log:
+        metrics_file, timing_file = (self.folder / name for name in (_METRICS, TIMING))
+        with metrics_file.open("a", encoding="utf-8") as log, timing_file.open("a", encoding="utf-8") as clock:
             for number in range(before, updates):
                 if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
                     state = state._replace(params=self._meet_the_nearest(state.params, stage, number))
                 state, metrics = update(state)
                 seconds = time.perf_counter() - started
-                line = self._line(stage, number, metrics, (number + 1 - before) / seconds)
+                line = self._line(stage, number, metrics)
+                steps = population.seating.tables * self.run.config.rollout
+                speed = {"steps_per_second": round((number + 1 - before) / seconds * steps, 1)}
                 log.write(json.dumps(line) + "\n")
-                self.report(stage * updates + number + 1, self.run.updates, line)
+                clock.write(json.dumps({"stage": stage, "update": number} | speed) + "\n")
+                self.report(stage * updates + number + 1, self.run.updates, line | speed)
                 if number + 1 in marks:
                     self._save_checkpoints(stage, marks[number + 1], number + 1, state.params)
                 if time.perf_counter() - saved > _SAVE_SECONDS:
                     log.flush()
-                    notes = {"settings_hash": self.run.settings_hash, "stage": str(stage)}
-                    save_state(self.folder / _RESUME, state, notes)
+                    save_state(self.folder / _RESUME, state, self._notes(stage))
                     saved = time.perf_counter()
 
-    def _line(self, stage: int, number: int, metrics: dict[str, Any], updates_per_second: float) -> dict[str, float]:
-        config, population = self.run.config, self.run.stages[stage]
+    def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
         values = {name: float(value) for name, value in metrics.items()}
         if not values["episodes"]:
             del values["self_play"], values["cross_play"]
-        elif population.seating.self_play.all():
+        elif self.run.stages[stage].seating.self_play.all():
             del values["cross_play"]
-        steps = population.seating.tables * config.rollout
         return {
             "stage": stage,
             "update": number,
-            "step": (number + 1) * config.steps_per_update,
-            "steps_per_second": round(updates_per_second * steps, 1),
+            "step": (number + 1) * self.run.config.steps_per_update,
             **values,
         }
 

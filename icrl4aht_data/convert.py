@@ -3,8 +3,8 @@
 The published code keeps all histories in `histories.h5`, a group each, observations as float32 in gzip-6 chunks of 4096
 steps, action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3). What we
 write beside that, its readers pass over: each group's `state` and `episode_end_state`, `tasks.jsonl` and
-`provenance.json`. With them the way back loses nothing. Without states, which observations do not determine, it ends in
-a release of observations; without tasks, in one that knows them by name.
+`provenance.json`. With them the way back loses nothing but the checkpoints of learned teammates. Without states, which
+observations do not determine, it ends in a release of observations; without tasks, in one that knows them by name.
 """
 
 from __future__ import annotations

@@ -80,17 +80,27 @@ class NewTask:
     files: Mapping[str, Path] = field(default_factory=dict)
 
 
+def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
+    """Where the checkpoint of a learned teammate is: named by its hash in a release, by its path in a suite.
+
+    Args:
+        folder: TEAMMATES of a release, or a suite.
+        teammate: the task's entry, of kind "rl".
+    """
+    theta = teammate["theta"]
+    return folder / (theta["sha256"] if (folder / theta["sha256"]).is_dir() else theta["checkpoint"])
+
+
 def checkpoint_files(folder: Path, task: Task) -> dict[str, Path]:
     """The files of a task's learned teammate by their path in a release; none for a heuristic, or where there are none.
 
     Args:
-        folder: what the task's checkpoint path starts from: a suite, or TEAMMATES of a release.
+        folder: see `checkpoint_folder`.
     """
     if task.teammate.get("kind") != "rl":
         return {}
-    checkpoint = task.teammate["theta"]["checkpoint"]
-    found = sorted((folder / checkpoint).glob("policy.*"))
-    return {f"{TEAMMATES}/{checkpoint}/{path.name}": path for path in found}
+    found = sorted(checkpoint_folder(folder, task.teammate).glob("policy.*"))
+    return {f"{TEAMMATES}/{task.teammate['theta']['sha256']}/{path.name}": path for path in found}
 
 
 def write_release(

@@ -6,7 +6,7 @@
     meta/provenance.json    task_id -> how its histories were made
     meta/chunks/**.npy      for each shard: offset, size, rows, crc32 of every chunk
     data/<track>/<layout>/<split>-00000-of-00001.h5
-    teammates/**            checkpoints of learned teammates, where the tasks say
+    teammates/<sha256>/     checkpoints of learned teammates, named as the tasks name their weights
     MANIFEST.sha256         every file above, in sha256sum's format
 
 A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard leaves
@@ -34,7 +34,7 @@ INFO, HISTORIES, TASKS, PROVENANCE = (
 )
 
 TEAMMATES = "teammates"
-"""The folder of learned teammates: what a task's checkpoint path starts from."""
+"""The folder of learned teammates."""
 
 Kind = Literal["full", "lite", "observations"]
 KINDS: tuple[Kind, ...] = ("full", "lite")

@@ -30,7 +30,7 @@ CACHES: tuple[Cache, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
 
 _VERSION = 1  # of the memory-mapped arrays
-_WINDOWS = 256  # copied at a time: the copies in between stay few, and the calls too
+_COPIED = 2**22  # bytes at a time: the copies in between stay small, and the calls few
 
 
 class Choice(NamedTuple):
@@ -182,10 +182,11 @@ def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray, threads
     size = array[0].size
     blocks = sliding_window_view(array.reshape(-1), out.shape[1] * size)
     place, target = first * size, out.reshape(len(out), -1)
+    windows = max(1, _COPIED // (blocks.shape[1] * blocks.itemsize))
 
     def part(start: int, stop: int) -> None:
-        for low in range(start, stop, _WINDOWS):
-            rows = slice(low, min(low + _WINDOWS, stop))
+        for low in range(start, stop, windows):
+            rows = slice(low, min(low + windows, stop))
             target[rows] = blocks[place[rows]]
 
     in_slices(part, len(out), threads, least=64)

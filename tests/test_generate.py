@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -13,11 +14,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from tiny import LEARNED, TINY, artefact
+from tiny import LEARNED, TINY, artefact, start
 
 from generation import artefact as artefacts
-from generation import build, collect, run, select, suite
+from generation import build, collect, package, run, select, suite
 from generation.artefact import METADATA
+from generation.build_suite import build_suite
 from generation.cli import cli
 from generation.learners.checkpoint import load_policy
 from generation.profiles import load_profile
@@ -30,7 +32,8 @@ from icrl4aht_data.convert import to_release
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.release import write_manifest
+from icrl4aht_data.release import NewTask, write_manifest
+from icrl4aht_data.tasks import read_tasks
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
@@ -166,8 +169,6 @@ def test_two_collectors_never_do_one_task_together(built):
 
 
 def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
-    from generation import package
-
     monkeypatch.setattr(package, "MINI", tmp_path / "mini")
     for _ in range(2):
         package.bundle_release(built / "a" / "lite")
@@ -236,6 +237,68 @@ def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
         recover_teammate(load_icrl4aht(root), 0)
 
 
+def test_two_rebuilds_whose_teammates_have_the_same_place_in_their_suites(learned, tmp_path, monkeypatch):
+    """Another seed, another suite folder; together the releases hold all four teammates."""
+    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
+    arguments = ["generate", "--profile", str(learned / "learned.toml"), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli, [*arguments, "--suite", str(tmp_path / "other"), "--seed", "1"])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "other/demo_wide/fcp/population.json").is_file()
+    assert not (tmp_path / "out/suite").exists()
+    combine_releases(tmp_path / "both", [learned / "lite", tmp_path / "out/lite"])
+    assert verify_release(tmp_path / "both", deep=True).ok
+    both = load_icrl4aht(tmp_path / "both")
+    weights = {
+        np.asarray(jax.tree.leaves(recover_teammate(both, number).params)[0]).tobytes() for number in range(0, 12, 3)
+    }
+    assert len(weights) == 4
+
+
+def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
+    dataset = load_icrl4aht(learned / "lite")
+    root = to_release(dataset, tmp_path / "lite", "lite")
+    shutil.rmtree(root / "teammates")
+    write_manifest(root)
+    report = verify_release(root)
+    assert report.ok
+    assert any("2 tasks have learned teammates whose checkpoints" in note for note in report.notes)
+    with pytest.raises(OptionError, match=r"lacks checkpoint \w{64}, the teammate of history 0: .*came without it"):
+        recover_teammate(load_icrl4aht(root), 0)
+
+
+def test_a_population_that_another_process_trains_is_waited_for(learned, monkeypatch):
+    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
+    lock = learned / "suite/demo_wide/.brdiv.lock"
+    other = start(
+        "-c", f"import filelock, time\nwith filelock.FileLock({str(lock)!r}): print(flush=True); time.sleep(2)"
+    )
+    assert other.stdout is not None
+    other.stdout.readline()
+    output = StringIO()
+    profile = load_profile(str(learned / "learned.toml"))
+    selections = build_suite(profile, learned / "suite", [], ["brdiv", "fcp"], 0, Console(file=output))
+    other.communicate()
+    lines = [line for line in output.getvalue().splitlines() if " on demo_wide: " in line][:3]
+    assert [line.partition(": ")[2] for line in lines] == [
+        "another process is training it",
+        "finished before",
+        "finished before",
+    ]
+    assert {selection.algorithm for selection in selections} == {"brdiv", "fcp"}
+
+
+def test_the_card_of_both_kinds_of_teammates_and_of_one_that_is_missing(learned):
+    profile = replace(load_profile(str(learned / "learned.toml")), presets=("default",))
+    tasks = [*profile.heuristic_tasks(), *read_tasks(learned / "lite/meta/tasks.jsonl")[:1]]
+    after = {"return_start": 1.0, "return_end": 2.0}
+    card = package._card(profile, [NewTask(task, {"filter": {"after": after}}, 3, list) for task in tasks])
+    assert "H4 is also a family of the benchmark's test side" in card
+    assert "too few checkpoints passed the filter of brdiv on demo_wide (0 of 1)." in card
+    assert "learned for 4,000 steps, egos for 16,000" in card
+    paper = load_profile("paper")
+    assert "The paper's scale" not in package._card(paper, [])
+
+
 def test_the_card_says_who_the_teammates_are(learned):
     card = (learned / "lite" / "README.md").read_text()
     assert "checkpoints of fcp, brdiv populations of 2 (4,000 steps a member)" in card
@@ -262,6 +325,16 @@ def test_teammates_that_are_all_too_bad(learned, tmp_path):
     ):
         build.build_releases(str(learned / "learned.toml"), tmp_path, ["lite"], Console(file=StringIO()))
     assert not (tmp_path / "lite").exists()
+
+
+def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
+    shutil.copytree(learned / "suite", tmp_path / "suite")
+    path = tmp_path / "suite/demo_wide/fcp/m0/c3/policy.json"
+    card = json.loads(path.read_text())
+    del card["teammate_return"]
+    path.write_text(json.dumps(card))
+    with pytest.raises(OptionError, match=r"demo_wide/fcp/m0/c3: its card lacks 'teammate_return'.*anew"):
+        select.select(tmp_path / "suite", "demo_wide", "fcp", 1, 1)
 
 
 def test_unknown_profile_is_one_line(tmp_path):

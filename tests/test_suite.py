@@ -1,6 +1,6 @@
 """Populations on disk: checkpoints and their cards, runs that are killed and go on, the filter, the manifests.
 
-All four algorithms are trained once, as small as they run: two members, five updates of 100 steps, one episode.
+All four algorithms are trained once, by the shipped profile `smoke`: two members, six updates of 2,048 steps each.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ import numpy as np
 import pytest
 
 from generation import cross_play, suite
+from generation.check import compare
 from generation.env import Environment
 from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
 from generation.learners.network import ActorCritic, Widths
-from generation.learners.ppo import PPOConfig
 from generation.learners.rollout import network_player, policy_player, random_player, roll_out, take_seats
+from generation.profiles import load_profile
 from generation.select import Selection, layout_number, make_tasks, select, write_manifests
 from generation.suite import Checkpoint, Run, checkpoints, is_finished, play_matrix, train
 from generation.teammates import learned
@@ -37,17 +38,8 @@ from icrl4aht_data.release import file_hash
 from icrl4aht_data.tasks import read_tasks, write_tasks
 
 LAYOUT = get_layout("cramped_up")
-WIDTHS = Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8)
-CONFIG = PPOConfig(
-    total_steps=4000,
-    environments=8,
-    rollout=100,
-    epochs=2,
-    minibatches=2,
-    learning_rate=1e-3,
-    shaping_horizon=2000,
-    widths=WIDTHS,
-)
+SMOKE = load_profile("smoke").teammates
+CONFIG, WIDTHS = SMOKE.ppo, SMOKE.ppo.widths
 
 CHILD = """
 import sys, time
@@ -73,8 +65,7 @@ from flax.traverse_util import flatten_dict
 (population,) = test_suite.run_of("fcp").stages
 state = jax.jit(population.init)(jax.random.fold_in(jax.random.key(0), 0))
 update = jax.jit(population.update)
-for _ in range(2):
-    state, _ = update(state)
+state, _ = update(state)
 assert jax.device_count() == 2
 used = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.params)}
 assert used == {2}, used
@@ -83,7 +74,7 @@ np.savez(sys.argv[1], **flatten_dict(jax.tree.map(np.asarray, state.params), sep
 
 
 def run_of(algorithm: str) -> Run:
-    return Run(LAYOUT, algorithm, 2, CONFIG, seed=0)
+    return Run(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -149,9 +140,9 @@ def test_cards_say_what_a_checkpoint_is(trained, algorithm):
         card = point.card
         assert (card["algorithm"], card["layout"], card["seed"]) == (algorithm, "cramped_up", 0)
         assert (card["member"], card["checkpoint"]) == (member, checkpoint)
-        assert card["step"] == 800 * (checkpoint + 1)
+        assert card["step"] == 2048 * (checkpoint + 2)
         assert card["seats"] == ([1] if algorithm in ("brdiv", "lbrdiv") else [0, 1])
-        assert card["shapes"]["params/actor/kernel"] == [8, 6]
+        assert card["shapes"]["params/actor/kernel"] == [16, 6]
         assert Widths.from_table(card["widths"]) == WIDTHS
         assert isinstance(card["return"], float)
         assert isinstance(card["teammate_return"], float)
@@ -173,14 +164,17 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
 def test_the_log_has_a_line_for_each_update(trained, algorithm):
     lines = [json.loads(line) for line in (population(trained, algorithm) / "metrics.jsonl").read_text().splitlines()]
     stages = 2 if algorithm == "comedi" else 1
-    assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(5)]
+    assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
     for line in lines:
-        assert line["step"] == 800 * (line["update"] + 1)
-        ended = line["update"] == 3  # of 400 steps, in five roll-outs of 100
+        assert line["step"] == 2048 * (line["update"] + 1)
+        ended = line["update"] in (1, 3, 4)  # with steps 400, 800 and 1200, in roll-outs of 256
         assert (line["episodes"] > 0, "self_play" in line) == (ended, ended)
         meets_others = algorithm in ("brdiv", "lbrdiv") or line["stage"] > 0
         assert ("cross_play" in line) == (ended and meets_others)
-        np.testing.assert_allclose(line["shaping"], max(0, 1 - line["update"] * 800 / 2000), atol=1e-6)
+        np.testing.assert_allclose(line["shaping"], max(0, 1 - line["update"] * 2048 / 6144), atol=1e-6)
+    timing = [json.loads(line) for line in (population(trained, algorithm) / "timing.jsonl").read_text().splitlines()]
+    assert [(line["stage"], line["update"]) for line in timing] == [(line["stage"], line["update"]) for line in lines]
+    assert all(line["steps_per_second"] > 0 for line in timing)
     assert (population(trained, algorithm) / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -235,7 +229,7 @@ def test_every_result_plays_as_a_teammate_in_both_seats(trained):
 def test_a_killed_run_goes_on_to_the_same_policies(trained, tmp_path):
     """Killed at a random moment; CoMeDi trains its members one after the other."""
     folder = tmp_path / "comedi"
-    moment = int(np.random.default_rng().integers(1, 10))
+    moment = int(np.random.default_rng().integers(1, 12))
     process = child(CHILD, "comedi", str(folder))
     assert process.stdout is not None
     for line in process.stdout:
@@ -247,8 +241,8 @@ def test_a_killed_run_goes_on_to_the_same_policies(trained, tmp_path):
     assert not is_finished(folder, run_of("comedi"))
     done: list[int] = []
     train(run_of("comedi"), folder, lambda update, updates, metrics: done.append(update))
-    assert done[-1] == 10
-    assert moment == 1 or len(done) < 10, f"killed after update {moment}, but began at {done[0]}"
+    assert done[-1] == 12
+    assert moment == 1 or len(done) < 12, f"killed after update {moment}, but began at {done[0]}"
     assert weights(folder) == weights(population(trained, "comedi")), f"killed after update {moment}"
     assert is_finished(folder, run_of("comedi"))
 
@@ -279,13 +273,10 @@ def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(
 
     done: list[int] = []
     train(run_of("lbrdiv"), stopped, lambda update, updates, metrics: done.append(update))
-    assert done == [5]
+    assert done == [6]
     whole = population(trained, "lbrdiv")
     assert weights(stopped) == weights(whole)
-    logs = ([json.loads(line) for line in (f / "metrics.jsonl").read_text().splitlines()] for f in (stopped, whole))
-    for one, other in zip(*logs, strict=True):
-        del one["steps_per_second"], other["steps_per_second"]
-        assert one == other
+    assert not compare(stopped, whole).differences
 
 
 def test_a_run_beside_another_in_the_same_folder_is_refused(tmp_path):
@@ -328,17 +319,17 @@ def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
         list(checkpoints(tmp_path, "cramped_up", "fcp"))
 
 
-def test_a_population_learns_the_same_shared_out_over_two_devices(trained, tmp_path):
-    """To rounding: half of the policies on each device, two updates, against the second checkpoint."""
+def test_a_population_learns_the_same_shared_out_over_two_devices(tmp_path):
+    """To rounding: half of the policies on each device, one update."""
+    (whole,) = run_of("fcp").stages
+    state, _ = jax.jit(whole.update)(jax.jit(whole.init)(jax.random.fold_in(jax.random.key(0), 0)))
     process = child(TWO_DEVICES, str(tmp_path / "weights.npz"), devices=2)
     process.communicate(timeout=300)
     assert process.returncode == 0
     found = np.load(tmp_path / "weights.npz")
-    for member in range(2):
-        _, params, _ = load_policy(population(trained, "fcp") / f"m{member}/c1")
-        for path, leaf in jax.tree.leaves_with_path(params):
-            name = "/".join(str(part.key) for part in path)
-            np.testing.assert_allclose(found[name][member], leaf, rtol=0, atol=1e-4, err_msg=name)
+    for path, leaf in jax.tree.leaves_with_path(state.params):
+        name = "/".join(str(part.key) for part in path)
+        np.testing.assert_allclose(found[name], leaf, rtol=0, atol=1e-4, err_msg=name)
 
 
 # The filter and the manifests.

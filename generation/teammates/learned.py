@@ -16,7 +16,7 @@ from generation.learners.network import ActorCritic, Widths
 from generation.teammates.base import Policy
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.release import file_hash
+from icrl4aht_data.release import checkpoint_folder, file_hash
 
 Action = Literal["greedy", "sampled"]
 """How a checkpoint acts: its likeliest action, as teammates of the dataset do, or a draw from its distribution."""
@@ -55,7 +55,7 @@ def build_entry(layout: Layout, teammate: dict[str, Any], suite: Path | None, ac
     """The policy of a task's teammate entry of kind "rl".
 
     Args:
-        suite: the folder that the entry's checkpoint path starts from: a suite's, or a release's.
+        suite: a suite, or TEAMMATES of a release.
 
     Raises:
         OptionError: without a suite, or if the checkpoint is missing or does not fit.
@@ -65,7 +65,7 @@ def build_entry(layout: Layout, teammate: dict[str, Any], suite: Path | None, ac
         raise OptionError(
             f"teammate {teammate['theta']['checkpoint']} is a checkpoint: say in which folder the suite of teammates is"
         )
-    folder = suite / teammate["theta"]["checkpoint"]
+    folder = checkpoint_folder(suite, teammate)
     policy = build(layout, folder, action)
     digest = file_hash(folder / WEIGHTS)
     if digest != teammate["theta"]["sha256"]:

@@ -16,8 +16,9 @@ from generation.teammates import assembly_line, learned, recipe_aware_button, te
 from generation.teammates.base import Noise, Policy, as_params
 from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import TaskFormatError
+from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.release import checkpoint_folder
 from icrl4aht_data.schema import TEAMMATES
 
 _FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
@@ -120,6 +121,11 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
         OptionError: if the release does not hold the teammate's checkpoint.
     """
     entry = dataset.recover_teammate(history_id)
+    if entry["kind"] == "rl" and not checkpoint_folder(dataset.root / TEAMMATES, entry).is_dir():
+        raise OptionError(
+            f"{dataset.root / TEAMMATES}: lacks checkpoint {entry['theta']['sha256']}, the teammate of history "
+            f"{history_id}: this release came without it; take it from the release that it was made of"
+        )
     layout = get_layout(dataset.index.entry(history_id).layout)
     return build(layout, entry, entry.get("slot", TEAMMATE), entry.get("noise", "seeded"), dataset.root / TEAMMATES)
 
