@@ -179,20 +179,27 @@ class Sampler(Generic[B]):
     def _empty_layouts(self) -> np.ndarray | None:
         return np.empty(self.local_size, np.int32) if len(self.layouts) > 1 and self.dataset.obs == "state" else None
 
-    def _slabs(self, rows: int) -> Iterator[tuple[int, int]]:
-        """Parts of the rows, few enough steps each to stay in the processor's cache."""
-        size = max(1, _SLAB // self.length)
-        return ((start, min(start + size, rows)) for start in range(0, rows, size))
+    @property
+    def _slab(self) -> int:
+        """How many rows have few enough steps to stay in the processor's cache."""
+        return max(1, _SLAB // self.length)
+
+    def _slabs(self, first: int, last: int) -> Iterator[tuple[int, int]]:
+        """Parts of the rows first..last of that size."""
+        return ((start, min(start + self._slab, last)) for start in range(first, last, self._slab))
+
+    def _on_threads(self, rows: int, work: Callable[[int, int], None]) -> None:
+        """Call `work(start, stop)` for parts of the rows, one on each of the dataset's threads."""
+        in_slices(work, rows, self.dataset.threads, least=self._slab)
 
     def _in_slabs(self, rows: int, work: Callable[[int, int], None]) -> None:
-        """Call `work(start, stop)` for all slabs, on the dataset's threads."""
-        slabs = list(self._slabs(rows))
+        """The same for parts that are slabs."""
 
         def some(first: int, last: int) -> None:
-            for start, stop in slabs[first:last]:
+            for start, stop in self._slabs(first, last):
                 work(start, stop)
 
-        in_slices(some, len(slabs), self.dataset.threads)
+        self._on_threads(rows, some)
 
     def _present(self, group: Group, start: int, stop: int, records: np.ndarray, out: np.ndarray) -> None:
         """Show the records of rows start..stop of a group in `out` (B, ...), as the dataset presents them."""

@@ -126,16 +126,16 @@ class ADSampler(Sampler[ADBatch]):
             ("rewards", -1, batch.prev_rewards),
             ("teammate_actions", -1, batch.prev_teammate_actions),
         ]
-        threads = self.dataset.threads
         for group in self._groups(which):
             place, start = self.dataset.holding.place[group.select(which)], group.select(starts)
-            for field, shift, array in scalars:
-                if array is not None:
-                    target = array if isinstance(group.rows, slice) else np.empty_like(array[group.rows])
-                    group.source.windows(field, place, start + shift, target, threads)
-                    if target is not array:
-                        array[group.rows] = target
-            self._fill_obs(group, place, start, batch.obs)
+
+            def fill(first: int, last: int, group=group, place=place, start=start) -> None:
+                for field, shift, array in scalars:
+                    if array is not None:
+                        self._fill_scalar(field, group, place, start + shift, first, last, array)
+                self._fill_obs(group, place, start, first, last, batch.obs)
+
+            self._on_threads(len(place), fill)
             if batch.layouts is not None:
                 batch.layouts[group.rows] = self.layouts.index(group.layout)
         batch.attention_mask[...] = True
@@ -147,17 +147,27 @@ class ADSampler(Sampler[ADBatch]):
                     array[padding] = 0
         return batch
 
-    def _fill_obs(self, group: Group, place: np.ndarray, start: np.ndarray, obs: np.ndarray) -> None:
-        if not self._paints and obs.dtype == np.uint8 and isinstance(group.rows, slice):
-            group.source.windows(self._record, place, start, obs, self.dataset.threads)
+    def _fill_scalar(
+        self, field: str, group: Group, place: np.ndarray, start: np.ndarray, first: int, last: int, out: np.ndarray
+    ) -> None:
+        """Windows first..last of a group, into their rows of `out`."""
+        if isinstance(group.rows, slice):
+            group.source.windows(field, place[first:last], start[first:last], out[first:last])
             return
+        rows = np.empty((last - first, self.length), out.dtype)
+        group.source.windows(field, place[first:last], start[first:last], rows)
+        out[group.rows[first:last]] = rows
 
-        def slab(first: int, last: int) -> None:
-            records = self._empty_records(group, last - first, self.length)
-            group.source.windows(self._record, place[first:last], start[first:last], records)
-            self._present(group, first, last, records, obs)
-
-        self._in_slabs(len(place), slab)
+    def _fill_obs(
+        self, group: Group, place: np.ndarray, start: np.ndarray, first: int, last: int, obs: np.ndarray
+    ) -> None:
+        if not self._paints and obs.dtype == np.uint8 and isinstance(group.rows, slice):
+            group.source.windows(self._record, place[first:last], start[first:last], obs[first:last])
+            return
+        for low, high in self._slabs(first, last):
+            records = self._empty_records(group, high - low, self.length)
+            group.source.windows(self._record, place[low:high], start[low:high], records)
+            self._present(group, low, high, records, obs)
 
 
 class DPTSampler(Sampler[DPTBatch]):

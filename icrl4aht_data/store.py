@@ -30,7 +30,7 @@ CACHES: tuple[Cache, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
 
 _VERSION = 1  # of the memory-mapped arrays
-_COPIED = 2**22  # bytes at a time: the copies in between stay small, and the calls few
+_COPIED = 2**20  # bytes at a time: the copies in between stay small, and the calls few
 
 
 class Choice(NamedTuple):
@@ -43,7 +43,7 @@ class Choice(NamedTuple):
 class Source(Protocol):
     """Rows of the histories of one layout, named by their position in the source. Values are in `Field.compact`."""
 
-    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray, threads: int = 1) -> None:
+    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
         """Rows starts..starts + L of each history into out (n, L, ...), C-contiguous; rows outside a history are zero.
 
         Args:
@@ -51,7 +51,6 @@ class Source(Protocol):
             which: int (n,), positions.
             starts: int (n,), -1 or more.
             out: any dtype for scalars, uint8 (n, L, S) for states, uint8 (n, L, 5, 5, C) for observations.
-            threads: how many may share the work.
         """
         ...
 
@@ -159,7 +158,7 @@ class Flat:
         self._first, self._first_end = _first_rows(entries, "T"), _first_rows(entries, "E")
         self._lengths = np.array([entry.T for entry in entries])
 
-    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray, threads: int = 1) -> None:
+    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
         length = out.shape[1]
         array, first = self._arrays[field], self._first[which] + starts
         beyond = starts + length - self._lengths[which]
@@ -168,7 +167,7 @@ class Flat:
                 kept = max(length - missing, 0)
                 out[row, :kept], out[row, kept:] = array[begin : begin + kept], 0
         else:
-            _copy_windows(array, first, out, threads)
+            _copy_windows(array, first, out)
 
     def steps(self, field: str, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
         return self._arrays[field][self._first[which][:, None] + steps]
@@ -177,19 +176,15 @@ class Flat:
         return self._arrays["episode_end_state"][self._first_end[which] + episodes]
 
 
-def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray, threads: int) -> None:
+def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
     """Rows first..first + L of array (N,) or (N, S) into out (n, L) or (n, L, S), C-contiguous: a block a window."""
     size = array[0].size
     blocks = sliding_window_view(array.reshape(-1), out.shape[1] * size)
     place, target = first * size, out.reshape(len(out), -1)
     windows = max(1, _COPIED // (blocks.shape[1] * blocks.itemsize))
-
-    def part(start: int, stop: int) -> None:
-        for low in range(start, stop, windows):
-            rows = slice(low, min(low + windows, stop))
-            target[rows] = blocks[place[rows]]
-
-    in_slices(part, len(out), threads, least=64)
+    for low in range(0, len(out), windows):
+        rows = slice(low, low + windows)
+        target[rows] = blocks[place[rows]]
 
 
 class Streamed:
@@ -202,21 +197,16 @@ class Streamed:
     def _lengths(self) -> list[int]:
         return [entry.T for entry in self._entries]
 
-    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray, threads: int = 1) -> None:
+    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
         length, lengths = out.shape[1], self._lengths
-        positions, begins = which.tolist(), starts.tolist()
-
-        def part(start: int, stop: int) -> None:
-            for row in range(start, stop):
-                position, begin, window = positions[row], begins[row], out[row]
-                low, high = max(begin, 0), min(begin + length, lengths[position])
-                if high - low < length:
-                    window[...] = 0
-                if low < high:
-                    history_id = self._entries[position].history_id
-                    self._shards[position].read_into(history_id, FIELDS[field], low, window[low - begin : high - begin])
-
-        in_slices(part, len(positions), threads)
+        for row, (position, begin) in enumerate(zip(which.tolist(), starts.tolist(), strict=True)):
+            window = out[row]
+            low, high = max(begin, 0), min(begin + length, lengths[position])
+            if high - low < length:
+                window[...] = 0
+            if low < high:
+                history_id = self._entries[position].history_id
+                self._shards[position].read_into(history_id, FIELDS[field], low, window[low - begin : high - begin])
 
     def steps(self, field: str, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
         rows = []
