@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from icrl4aht_data.cache import cache_room, cached_arrays, free_memory
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -179,9 +178,11 @@ class Flat:
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
     """Rows first..first + L of array (N,) or (N, S) into out (n, L) or (n, L, S), C-contiguous: a block a window."""
     size = array[0].size
-    blocks = sliding_window_view(array.reshape(-1), out.shape[1] * size)
+    flat, width = array.reshape(-1), out.shape[1] * size
+    # What sliding_window_view gives, without its twenty microseconds.
+    blocks = np.ndarray((flat.size - width + 1, width), flat.dtype, flat, strides=flat.strides * 2)
     place, target = first * size, out.reshape(len(out), -1)
-    windows = max(1, _COPIED // (blocks.shape[1] * blocks.itemsize))
+    windows = max(1, _COPIED // (width * flat.itemsize))
     for low in range(0, len(out), windows):
         rows = slice(low, low + windows)
         target[rows] = blocks[place[rows]]
