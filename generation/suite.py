@@ -244,6 +244,7 @@ class _Training:
                     self._save_checkpoints(stage, marks[number + 1], number + 1, state.params)
                 if time.perf_counter() - saved > _SAVE_SECONDS:
                     log.flush()
+                    clock.flush()
                     save_state(self.folder / _RESUME, state, self._notes(stage))
                     saved = time.perf_counter()
 
