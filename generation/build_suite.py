@@ -43,11 +43,8 @@ def build_suite(
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
-    wanted = [(name, algorithm) for name in names for algorithm in algorithms or ALGORITHMS]
-    todo = []
-    for name, algorithm in wanted:
-        own_seed = seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm)
-        todo.append(Run(get_layout(name), algorithm, config.members, config.ppo, own_seed))
+    todo = runs(profile, names, algorithms or ALGORITHMS, seed)
+    wanted = [(run.layout.name, run.algorithm) for run in todo]
     for wait in (False, True):
         todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
     selections = [
@@ -61,6 +58,22 @@ def build_suite(
     for path in write_manifests(suite, selections):
         console.print(f"wrote {path}")
     return [selection for selection in selections if (selection.layout, selection.algorithm) in wanted]
+
+
+def runs(profile: Profile, layouts: Sequence[str], algorithms: Sequence[str], seed: int) -> list[Run]:
+    """The populations of these layouts, each with a seed of its own."""
+    config = profile.teammates
+    return [
+        Run(
+            get_layout(name),
+            algorithm,
+            config.members,
+            config.ppo,
+            seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm),
+        )
+        for name in layouts
+        for algorithm in algorithms
+    ]
 
 
 def training_layouts() -> list[str]:

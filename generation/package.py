@@ -155,7 +155,7 @@ def _smaller(profile: Profile) -> list[str]:
     return [
         f"The paper's scale: its teammates learn for {paper.ppo.total_steps:,} steps and are "
         f"{paper.train * len(ALGORITHMS)} a layout, its egos learn for {PPOConfig().total_steps:,}. Here teammates "
-        f"learned for {own.ppo.total_steps:,} steps, egos for {profile.ego.total_steps:,}, and both play worse."
+        f"learned for {own.ppo.total_steps:,} steps, egos for {profile.ego.total_steps:,}."
     ]
 
 

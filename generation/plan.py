@@ -15,13 +15,13 @@ import numpy as np
 from rich import filesize
 
 from generation import record
+from generation.build_suite import runs
 from generation.env import Environment
 from generation.learners.ego import Learner
 from generation.learners.fcp import FCP
 from generation.learners.population import Population
 from generation.learners.ppo import PPOConfig
 from generation.profiles import Profile
-from generation.suite import Run
 from generation.teammates import learned
 from generation.teammates.registry import build
 from icrl4aht_data.benchmark import KEPT_STEPS
@@ -104,7 +104,7 @@ def cost(profile: Profile, devices: int) -> Cost:
     tasks = count * len(profile.layouts)
     learning = calibrate(ego, partial(task_learner, profile))
     task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
-    populations = [steps for layout in profile.layouts for steps in population_steps(profile, layout)]
+    populations = [run.steps for run in runs(profile, profile.layouts, profile.algorithms, 0)]
     playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
     population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
     in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
@@ -129,14 +129,6 @@ def cost(profile: Profile, devices: int) -> Cost:
         devices=devices,
         hours_on_devices=round(in_turn / 3600, 2),
     )
-
-
-def population_steps(profile: Profile, layout: str) -> list[int]:
-    """Environment steps of each population of a layout, over all its tables."""
-    config = profile.teammates
-    runs = [Run(get_layout(layout), algorithm, config.members, config.ppo, 0) for algorithm in profile.algorithms]
-    updates = config.ppo.updates * config.ppo.rollout
-    return [updates * sum(stage.seating.tables for stage in run.stages) for run in runs]
 
 
 def task_learner(profile: Profile, ego: PPOConfig) -> Learner:
@@ -176,8 +168,7 @@ def _measure(learner: Learner | Population) -> tuple[Speed, int]:
     state, *_ = jax.block_until_ready(update(state))
     began = time.perf_counter()
     jax.block_until_ready(update(state))
-    tables = learner.seating.tables if isinstance(learner, Population) else learner.config.environments
-    steps = tables * learner.config.rollout
+    steps = learner.steps_per_update
     return Speed(steps / (time.perf_counter() - began), compiling), steps
 
 

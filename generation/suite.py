@@ -29,7 +29,7 @@ from generation.artefact import TIMING
 from generation.env import Environment
 from generation.figures import plot_training
 from generation.learners.brdiv import BRDiv
-from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
+from generation.learners.checkpoint import CARD, WEIGHTS, load_card, load_policy, save_policy
 from generation.learners.comedi import CoMeDi
 from generation.learners.fcp import FCP
 from generation.learners.lbrdiv import LBRDiv
@@ -118,6 +118,11 @@ class Run:
     @property
     def updates(self) -> int:
         return len(self.stages) * self.config.updates
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all tables, over the whole run."""
+        return self.config.updates * sum(stage.steps_per_update for stage in self.stages)
 
 
 def is_finished(folder: Path, run: Run) -> bool:
@@ -209,13 +214,11 @@ class _Training:
         """In what a finished population is not this run's."""
         try:
             found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
-            other = {name: found.get(name) for name, value in self._settings().items() if found.get(name) != value}
+            wanted = json.loads(json.dumps(self.run.settings))
+            other = {name: found.get(name) for name, value in wanted.items() if found.get(name) != value}
         except (OSError, ValueError, KeyError, AttributeError):
             other = {}
         return f"of other settings: {other}" if other else "with changed files"
-
-    def _settings(self) -> dict[str, Any]:
-        return json.loads(json.dumps(self.run.settings))
 
     def _key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
@@ -235,8 +238,7 @@ class _Training:
                 state, metrics = update(state)
                 seconds = time.perf_counter() - started
                 line = self._line(stage, number, metrics)
-                steps = population.seating.tables * self.run.config.rollout
-                speed = {"steps_per_second": round((number + 1 - before) / seconds * steps, 1)}
+                speed = {"steps_per_second": round((number + 1 - before) * population.steps_per_update / seconds, 1)}
                 log.write(json.dumps(line) + "\n")
                 clock.write(json.dumps({"stage": stage, "update": number} | speed) + "\n")
                 self.report(stage * updates + number + 1, self.run.updates, line | speed)
@@ -342,7 +344,7 @@ def checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Checkpoint
         raise OptionError(f"{folder}: no finished population; run `python -m generation teammates --layout {layout}`")
     found = [path.parent for path in folder.glob(f"m*/c*/{WEIGHTS}")]
     for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
-        yield Checkpoint(str(path.relative_to(suite)), load_policy(path)[2])
+        yield Checkpoint(str(path.relative_to(suite)), load_card(path))
 
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:

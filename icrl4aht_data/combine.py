@@ -49,7 +49,8 @@ def combine_releases(
             if task.task_id in owners:
                 raise OptionError(f"{dataset.root}: task {task.task_id} is also in {owners[task.task_id]}")
             owners[task.task_id] = dataset.root
-            new.append(_new_task(dataset, task, provenance.get(task.task_id, {})))
+            ids = dataset.index.query(task_id=task.task_id)
+            new.append(stored_task(dataset.select(ids), task, provenance.get(task.task_id, {}), dataset.info["kind"]))
     first = datasets[0].info
     return write_release(
         target,
@@ -83,14 +84,6 @@ def _one_version(datasets: Sequence[Dataset]) -> str:
     return versions.pop()
 
 
-def _new_task(dataset: Dataset, task: Task, provenance: dict[str, Any]) -> NewTask:
-    ids = dataset.index.query(task_id=task.task_id)
-    files = checkpoint_files(dataset.root / TEAMMATES, task)
-    return NewTask(
-        task, provenance, len(ids), lambda: stored_histories(dataset.select(ids), dataset.info["kind"]), files
-    )
-
-
 def release_tasks(dataset: Dataset) -> list[Task]:
     """The tasks of a selection's release; of a release whose tasks were not given, those of the selection, by name."""
     if dataset.knows_tasks:
@@ -98,11 +91,23 @@ def release_tasks(dataset: Dataset) -> list[Task]:
     return list({entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}.values())
 
 
-def stored_histories(dataset: Dataset, kind: Kind) -> Iterator[NewHistory]:
-    """The histories of a selection, in order, for another release of that kind."""
-    for history in dataset:
-        names = [field.name for field in held_fields(kind) if history.entry.has(field)]
-        yield NewHistory(history.entry.env_idx, Deferred(names, history.read))
+def stored_task(
+    dataset: Dataset, task: Task, provenance: dict[str, Any], kind: Kind, taken: Callable[[], None] = lambda: None
+) -> NewTask:
+    """A task for another release of that kind: all histories of the selection, in order, and the teammate's checkpoint.
+
+    Args:
+        dataset: histories of the task.
+        taken: called after each history.
+    """
+
+    def load() -> Iterator[NewHistory]:
+        for history in dataset:
+            names = [field.name for field in held_fields(kind) if history.entry.has(field)]
+            yield NewHistory(history.entry.env_idx, Deferred(names, history.read))
+            taken()
+
+    return NewTask(task, provenance, len(dataset), load, checkpoint_files(dataset.root / TEAMMATES, task))
 
 
 class Deferred(Mapping[str, np.ndarray]):

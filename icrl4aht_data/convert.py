@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, KEPT_STEPS, PUBLISHED_ACTIONS
-from icrl4aht_data.combine import Deferred, release_tasks, stored_histories
+from icrl4aht_data.combine import Deferred, release_tasks, stored_task
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.draws import whole
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
 from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
-from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, write_release
+from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import (
     ACTION_FIELDS,
     FIELDS,
@@ -34,7 +34,6 @@ from icrl4aht_data.schema import (
     OBSERVATIONS,
     PROVENANCE,
     TASKS,
-    TEAMMATES,
     Kind,
     episode_ends,
     held_fields,
@@ -106,18 +105,9 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
         by_task.setdefault(entry.task_id, []).append(entry.history_id)
     done = iter(range(1, len(dataset) + 1))
 
-    def load(ids: list[int]) -> Iterator[NewHistory]:
-        for history in stored_histories(dataset.select(ids), kind):
-            yield history
-            advance(next(done), len(dataset))
-
     tasks = [
-        NewTask(
-            given[name],
-            provenance.get(name, {}),
-            len(ids),
-            lambda ids=ids: load(ids),
-            checkpoint_files(dataset.root / TEAMMATES, given[name]),
+        stored_task(
+            dataset.select(ids), given[name], provenance.get(name, {}), kind, lambda: advance(next(done), len(dataset))
         )
         for name, ids in by_task.items()
     ]

@@ -36,6 +36,13 @@ class Group(NamedTuple):
     rows: slice | np.ndarray
     select: Callable[[np.ndarray], np.ndarray]  # of an array (B, ...): the group's
 
+    def part(self, first: int, last: int) -> Group:
+        """Its rows first..last."""
+        if isinstance(self.rows, slice):
+            start = self.rows.start or 0
+            return self._replace(rows=slice(start + first, start + last))
+        return self._replace(rows=self.rows[first:last])
+
 
 class Sampler(Generic[B]):
     """What both samplers share. See `ADSampler` and `DPTSampler` for the options."""
@@ -201,20 +208,16 @@ class Sampler(Generic[B]):
 
         self._on_threads(rows, some)
 
-    def _present(self, group: Group, start: int, stop: int, records: np.ndarray, out: np.ndarray) -> None:
-        """Show the records of rows start..stop of a group in `out` (B, ...), as the dataset presents them."""
-        if isinstance(group.rows, slice):
-            if self._paints:
-                paint(group.layout, records, out[start:stop])
-            else:
-                out[start:stop] = records
-            return
-        rows = group.rows[start:stop]
-        if self._paints:
-            out[rows] = paint(group.layout, records, np.empty((len(rows), *out.shape[1:]), out.dtype))
-        else:
+    def _present(self, group: Group, records: np.ndarray, out: np.ndarray) -> None:
+        """Show the records of a group's rows in `out` (B, ...), as the dataset presents them."""
+        rows = group.rows
+        if not self._paints:
             out[rows, ..., : records.shape[-1]] = records
             out[rows, ..., records.shape[-1] :] = 0
+        elif isinstance(rows, slice):
+            paint(group.layout, records, out[rows])
+        else:
+            out[rows] = paint(group.layout, records, np.empty((len(rows), *out.shape[1:]), out.dtype))
 
     def _checked(self, out: B | None) -> B:
         """`out`, if batches fit in it, or a new one."""

@@ -130,10 +130,11 @@ class ADSampler(Sampler[ADBatch]):
             place, start = self.dataset.holding.place[group.select(which)], group.select(starts)
 
             def fill(first: int, last: int, group=group, place=place, start=start) -> None:
+                part, which, low = group.part(first, last), place[first:last], start[first:last]
                 for field, shift, array in scalars:
                     if array is not None:
-                        self._fill_scalar(field, group, place, start + shift, first, last, array)
-                self._fill_obs(group, place, start, first, last, batch.obs)
+                        self._fill_scalar(field, part, which, low + shift, array)
+                self._fill_obs(part, which, low, batch.obs)
 
             self._on_threads(len(place), fill)
             if batch.layouts is not None:
@@ -147,27 +148,22 @@ class ADSampler(Sampler[ADBatch]):
                     array[padding] = 0
         return batch
 
-    def _fill_scalar(
-        self, field: str, group: Group, place: np.ndarray, start: np.ndarray, first: int, last: int, out: np.ndarray
-    ) -> None:
-        """Windows first..last of a group, into their rows of `out`."""
+    def _fill_scalar(self, field: str, group: Group, place: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
         if isinstance(group.rows, slice):
-            group.source.windows(field, place[first:last], start[first:last], out[first:last])
+            group.source.windows(field, place, start, out[group.rows])
             return
-        rows = np.empty((last - first, self.length), out.dtype)
-        group.source.windows(field, place[first:last], start[first:last], rows)
-        out[group.rows[first:last]] = rows
+        rows = np.empty((len(place), self.length), out.dtype)
+        group.source.windows(field, place, start, rows)
+        out[group.rows] = rows
 
-    def _fill_obs(
-        self, group: Group, place: np.ndarray, start: np.ndarray, first: int, last: int, obs: np.ndarray
-    ) -> None:
+    def _fill_obs(self, group: Group, place: np.ndarray, start: np.ndarray, obs: np.ndarray) -> None:
         if not self._paints and obs.dtype == np.uint8 and isinstance(group.rows, slice):
-            group.source.windows(self._record, place[first:last], start[first:last], obs[first:last])
+            group.source.windows(self._record, place, start, obs[group.rows])
             return
-        for low, high in self._slabs(first, last):
+        for low, high in self._slabs(0, len(place)):
             records = self._empty_records(group, high - low, self.length)
             group.source.windows(self._record, place[low:high], start[low:high], records)
-            self._present(group, low, high, records, obs)
+            self._present(group.part(low, high), records, obs)
 
 
 class DPTSampler(Sampler[DPTBatch]):
@@ -285,14 +281,13 @@ class DPTSampler(Sampler[DPTBatch]):
             place = self.dataset.holding.place
             query, when = place[group.select(asking)], group.select(step)[:, None]
             batch.query_target[group.rows] = group.source.steps("expert_actions", query, when)[:, 0]
-            self._present(group, 0, len(query), group.source.steps(self._record, query, when)[:, 0], batch.query_obs)
+            self._present(group, group.source.steps(self._record, query, when)[:, 0], batch.query_obs)
             self._fill_context(group, group.select(showing), group.select(steps), batch)
             if batch.layouts is not None:
                 batch.layouts[group.rows] = self.layouts.index(group.layout)
         return batch
 
     def _fill_context(self, group: Group, showing: np.ndarray, steps: np.ndarray, batch: DPTBatch) -> None:
-        rows = np.arange(self.local_size)[group.rows]
         scalars = [
             ("actions", batch.context_actions),
             ("rewards", batch.context_rewards),
@@ -300,16 +295,16 @@ class DPTSampler(Sampler[DPTBatch]):
         ]
 
         def slab(first: int, last: int) -> None:
-            which, when = showing[first:last], steps[first:last]
+            part, which, when = group.part(first, last), showing[first:last], steps[first:last]
             place = self.dataset.holding.place[which]
             for field, array in scalars:
                 if array is not None:
-                    array[rows[first:last]] = self._read(group.source, field, place, when)
+                    array[part.rows] = self._read(group.source, field, place, when)
             records, following = self._before_and_after(group, which, place, when)
-            self._present(group, first, last, records, batch.context_obs)
-            self._present(group, first, last, following, batch.context_next_obs)
+            self._present(part, records, batch.context_obs)
+            self._present(part, following, batch.context_next_obs)
 
-        self._in_slabs(len(rows), slab)
+        self._in_slabs(len(showing), slab)
 
     def _read(self, source: Source, field: str, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
         if self._scattered:

@@ -254,8 +254,8 @@ def _check_chunks(shard: Shard, report: Report) -> set[int]:
 def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator[str]:
     entry = history.entry
     layout = get_layout(entry.layout)
-    dones, rewards, states = history.read("dones"), history.read("rewards"), history._shard.kind in KINDS
-    counted = entry.episodes == entry.T // kept_steps and not (states and entry.T % kept_steps)
+    dones, rewards, replayable = history.read("dones"), history.read("rewards"), history._shard.kind in KINDS
+    counted = entry.episodes == entry.T // kept_steps and not (replayable and entry.T % kept_steps)
     if not counted or not np.array_equal(dones, episode_ends(entry.T, kept_steps)):
         yield f"dones: expected {entry.episodes} episodes of {kept_steps} steps, found {dones.sum()} in {entry.T} steps"
         return
@@ -266,7 +266,7 @@ def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator
     if (rewards != np.rint(rewards)).any() or np.abs(rewards).max() > np.iinfo(FIELDS["rewards"].compact).max:
         yield f"rewards: expected whole numbers that a byte holds, found {rewards.min()}..{rewards.max()}"
     impossible = False
-    for name in ("state", "episode_end_state") if states else ():
+    for name in ("state", "episode_end_state") if replayable else ():
         for fault in faults(layout, history.read(name)):
             impossible = True
             yield f"{name} has {fault}"
@@ -277,7 +277,7 @@ def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator
     for name, value in found.items():
         if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
-    if deep and not states:
+    if deep and not replayable:
         yield from _place_problems(layout, history)
     elif deep and not impossible:
         yield from _physics_problems(layout, history, dones, rewards)

@@ -37,14 +37,26 @@ def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str
     (folder / CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
+def load_card(folder: Path) -> dict[str, Any]:
+    """A checkpoint's card alone.
+
+    Raises:
+        OptionError: if it is missing or not JSON.
+    """
+    try:
+        return json.loads((folder / CARD).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
+
+
 def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     """The network, its weights, and the card.
 
     Raises:
         OptionError: if the files are missing or not readable, or the weights have not the shapes that the card states.
     """
+    card = load_card(folder)
     try:
-        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
         weights = load_file(folder / WEIGHTS)
         network = ActorCritic(Widths.from_table(card["widths"]), card["partners"])
         stated = card["shapes"]

@@ -41,6 +41,11 @@ class Learner:
     config: PPOConfig
 
     @property
+    def steps_per_update(self) -> int:
+        """Environment steps, over all tables."""
+        return self.config.steps_per_update
+
+    @property
     def network(self) -> ActorCritic:
         return ActorCritic(self.config.widths)
 

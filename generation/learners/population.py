@@ -131,6 +131,11 @@ class Population:
     def seating(self) -> Seating:
         return self.algorithm.seating(self.config.environments)
 
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps, over all tables."""
+        return self.seating.tables * self.config.rollout
+
     @cached_property
     def network(self) -> ActorCritic:
         """With a critic that is told who sits opposite, if that varies."""
