@@ -15,7 +15,7 @@ from generation.profiles import Profile, load_profile
 from generation.progress import progress
 from generation.run import CollectionError, collect_tasks
 from generation.select import THRESHOLD, make_tasks
-from icrl4aht_data.index import read_info
+from icrl4aht_data.info import read_info
 from icrl4aht_data.release import check_replaceable
 from icrl4aht_data.schema import Kind
 from icrl4aht_data.statistics import print_statistics

@@ -37,6 +37,15 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "icrl4aht"
 
 
+def data_folder() -> Path:
+    """Where remote releases come to: $ICRL4AHT_DATA_DIR, else icrl4aht below $XDG_DATA_HOME or ~/.local/share; read
+    from the environment at each call. It is no cache: what is in it stays."""
+    given = os.environ.get("ICRL4AHT_DATA_DIR")
+    if given:
+        return Path(given).expanduser()
+    return Path(os.environ.get("XDG_DATA_HOME") or "~/.local/share").expanduser() / "icrl4aht"
+
+
 def cache_limit() -> int:
     """Bytes that the cache folder may hold.
 

@@ -8,19 +8,33 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 from rich.table import Table
 
 from icrl4aht_data.benchmark import KEPT_STEPS
-from icrl4aht_data.dataset import Dataset, load_icrl4aht
-from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import ALL_KINDS, OBSERVATIONS
 
-_root = click.argument("root", required=False, type=click.Path(path_type=Path))
+if TYPE_CHECKING:
+    from icrl4aht_data.verify import Report
+
+
+class _Root(click.ParamType):
+    """A folder, or the address of a remote release."""
+
+    name = "folder or address"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | Path:
+        return value if isinstance(value, Path) or is_address(value) else Path(value)
+
+
+_root = click.argument("root", required=False, type=_Root())
 _json = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 
 
@@ -30,21 +44,29 @@ def _filters(command: Any) -> Any:
     return command
 
 
-def _load(root: Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
-    return load_icrl4aht(root, **{name: list(values) or None for name, values in filters.items()})  # type: ignore[arg-type]
+def _wanted(filters: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+    return {name: list(values) or None for name, values in filters.items()}
+
+
+def _load(root: str | Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
+    return load_icrl4aht(root, **_wanted(filters))
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="icrl4aht-data")
 def cli() -> None:
-    """Learning histories of the ICRL4AHT benchmark. ROOT is a release folder; the bundled mini release by default."""
+    """Learning histories of the ICRL4AHT benchmark.
+
+    ROOT is a release folder, or the address of a release: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://...;
+    by default the mini release that comes with the package.
+    """
 
 
 @cli.command("list")
 @_root
 @_filters
 @_json
-def list_(root: Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
+def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
     """List the tasks of a release: histories, transitions, returns at the start and at the end of learning."""
     dataset = _load(root, filters)
     tasks: dict[str, dict[str, Any]] = {}
@@ -90,7 +112,7 @@ def list_(root: Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
 @click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw the learning curves into this PNG.")
 @_json
 def show(
-    root: Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
+    root: str | Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
 ) -> None:
     """Show what a release, a part of it, or one of its histories is."""
     from icrl4aht_data.release import describe
@@ -100,7 +122,8 @@ def show(
         info = dataset.info
         kept_steps = info["environment"]["kept_steps"]
         facts = {
-            "root": str(dataset.root),
+            "root": str(dataset.origin),
+            **({"revision": remote.revision, "folder": str(dataset.root)} if (remote := dataset.origin.remote) else {}),
             **describe(info["kind"], info["data_version"], kept_steps, dataset.entries),
             **({"lacks": lacks} if (lacks := _lacks(dataset)) else {}),
             "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
@@ -139,38 +162,118 @@ def _lacks(dataset: Dataset) -> list[str]:
 
 
 @cli.command()
-@_root
-@click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
+@click.argument("root", required=False, type=_Root(), envvar="ICRL4AHT_REMOTE")
+@_filters
+@click.option("--to", type=click.Path(path_type=Path, file_okay=False), help="The folder for the release.")
+@click.option("--dry-run", is_flag=True, help="Say which files would come, and how many bytes; fetch only the index.")
 @click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
 @_json
-def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
-    """Verify a release: hashes, chunk checksums, counts, ranges. Exits with 1 if anything is wrong."""
-    from icrl4aht_data.verify import verify_release
+def download(
+    root: str | Path | None, to: Path | None, dry_run: bool, quiet: bool, as_json: bool, **filters: tuple[str, ...]
+) -> None:
+    """Download the release at the address ROOT (by default $ICRL4AHT_REMOTE), or the shards of a part of it.
 
-    console = Console(stderr=True)
-    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
-        tasks = {name: bars.add_task(name, total=None) for name in ("files", "histories")}
-        report = verify_release(
-            root, deep=deep, advance=lambda what, done, total: bars.update(tasks[what], completed=done, total=total)
-        )
+    Each file is checked on arrival; a download that was cut goes on where it was. Without --to a Hub repository goes
+    into the Hub's cache, another release below $ICRL4AHT_DATA_DIR; `load_icrl4aht(root=ROOT)` finds either.
+    """
+    from icrl4aht_data.download import fetch_planned, plan_download
+
+    if root is None:
+        raise click.UsageError("give the address of a release, or set ICRL4AHT_REMOTE")
+    plan = plan_download(str(root), to=to, **_wanted(filters))
+    facts = plan.to_json()
+    if not dry_run:
+        console = Console(stderr=True)
+        columns = (*Progress.get_default_columns(), DownloadColumn(), TransferSpeedColumn())
+        with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
+            bar = bars.add_task("download", total=plan.size)
+            traffic = fetch_planned(plan, lambda size: bars.advance(bar, size))
+        facts |= {"fetched_bytes": traffic.bytes, "requests": traffic.requests}
     if as_json:
-        click.echo(json.dumps(report.to_json(), indent=2))
-    else:
-        for finding in report.findings:
-            click.echo(f"{finding.file}: {finding.problem}")
-        if not quiet:
-            looked = (
-                f"{report.files} files, {report.chunks} chunks, {report.histories} histories, "
-                f"{report.transitions:,} transitions"
-            )
-            verdict = "whole" if report.ok else f"{len(report.findings)} problems"
-            physics = " and their physics" if deep and not report.notes else ""
-            click.echo("\n".join([f"{report.root}: {verdict}; checked {looked}{physics}", *report.notes]))
-    sys.exit(0 if report.ok else 1)
+        click.echo(json.dumps(facts, indent=2))
+    elif not quiet:
+        if dry_run:
+            for name in plan.absent:
+                click.echo(f"{plan.files[name]:>15,}  {name}")
+        verb = "to come" if dry_run else "have come"
+        here = len(plan.files) - len(plan.absent)
+        click.echo(f"{plan.root}: {len(plan.absent)} files, {plan.size:,} bytes {verb}; {here} files were here")
+        click.echo(f"folder: {plan.root.folder}")
 
 
 @cli.command()
-@click.argument("source", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@_root
+@_filters
+@click.option("--quick", is_flag=True, help="Check names, sizes and the index alone.")
+@click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
+@click.option("--repair", is_flag=True, help="Fetch what is wrong or missing again, then verify once more.")
+@click.option("--from", "source", metavar="ADDRESS", help="Where to repair from; by default where ROOT came from.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@_json
+def verify(
+    root: str | Path | None,
+    quick: bool,
+    deep: bool,
+    repair: bool,
+    source: str | None,
+    quiet: bool,
+    as_json: bool,
+    **filters: tuple[str, ...],
+) -> None:
+    """Verify a release: hashes, chunk checksums, counts, ranges. Exits with 1 if anything is wrong.
+
+    Of a remote release, what is checked comes here first, unless --quick; repairing a shard fetches only what is wrong.
+    """
+    from icrl4aht_data.download import repair as repair_files
+    from icrl4aht_data.verify import verify_release
+
+    if quick and (deep or repair):
+        raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
+    console = Console(stderr=True)
+    wanted = _wanted(filters)
+    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
+        tasks = {name: bars.add_task(name, total=None) for name in ("fetched", "files", "histories")}
+
+        def advance(what: str, done: int, total: int) -> None:
+            bars.update(tasks[what], completed=done, total=total)
+
+        report = verify_release(root, deep=deep, quick=quick, advance=advance, **wanted)
+        if repair and not report.ok:
+            if root is None and source is None:
+                raise OptionError("the bundled release is repaired by installing the package again")
+            first = report
+            outcome, traffic = repair_files(MINI if root is None else root, first.files_at_fault, source=source)
+            report = verify_release(root, deep=deep, advance=advance, **wanted)
+            report.repaired = [name for name, error in outcome.items() if error is None]
+            report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
+            report.fetched_bytes += first.fetched_bytes + traffic.bytes
+            report.requests += first.requests + traffic.requests
+    if as_json:
+        click.echo(json.dumps(report.to_json(), indent=2))
+    else:
+        for name in report.repaired:
+            click.echo(f"{name}: repaired")
+        for finding in report.findings:
+            click.echo(f"{finding.file}: {finding.problem}")
+        if not quiet:
+            click.echo("\n".join([f"{report.root}: {_verdict(report)}", *report.notes]))
+    sys.exit(0 if report.ok else 1)
+
+
+def _verdict(report: Report) -> str:
+    verdict = "whole" if report.ok else f"{len(report.findings)} problems"
+    if report.quick:
+        return f"{verdict}; checked names, sizes and the index of {report.files} files, no contents"
+    physics = " and their physics" if report.deep and not report.notes else ""
+    fetched = f"; fetched {report.fetched_bytes:,} bytes in {report.requests} requests" if report.requests else ""
+    return (
+        f"{verdict}; checked {report.files} files, {report.chunks} chunks, {report.histories} histories, "
+        f"{report.transitions:,} transitions{physics}{fetched}"
+    )
+
+
+@cli.command()
+@click.argument("source", type=_Root())
 @click.argument("target", type=click.Path(path_type=Path))
 @click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]))
 @click.option(
@@ -186,7 +289,7 @@ def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @_filters
 def convert(
-    source: Path,
+    source: str | Path,
     target: Path,
     form: str | None,
     tasks: Path | None,
@@ -208,7 +311,7 @@ def convert(
         def advance(done: int, total: int) -> None:
             bars.update(bar, completed=done, total=total)
 
-        if (source / forms.HISTORIES_H5).exists():
+        if isinstance(source, Path) and (source / forms.HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, and whole")
             form = forms.from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
@@ -226,13 +329,13 @@ def convert(
 
 @cli.command()
 @click.argument("out", type=click.Path(path_type=Path))
-@click.argument("releases", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RELEASE...")
+@click.argument("releases", nargs=-1, required=True, type=_Root(), metavar="RELEASE...")
 @click.option("--data-version", help="SemVer of the combination; that of the releases by default, if they agree.")
 @click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
-def combine(out: Path, releases: tuple[Path, ...], data_version: str | None, quiet: bool) -> None:
+def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | None, quiet: bool) -> None:
     """Combine releases of one kind, no two with a task in common, into the release OUT."""
     from icrl4aht_data.combine import combine_releases
-    from icrl4aht_data.index import read_info
+    from icrl4aht_data.info import read_info
     from icrl4aht_data.statistics import print_statistics
 
     combine_releases(out, releases, data_version)

@@ -12,13 +12,14 @@ from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, file_hash, write_release
+from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
 from icrl4aht_data.tasks import Task, named_task, read_tasks
 
 
 def combine_releases(
     target: Path,
-    roots: Sequence[Path],
+    roots: Sequence[str | Path],
     data_version: str | None = None,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
@@ -38,17 +39,17 @@ def combine_releases(
         raise OptionError("expected at least one release to combine")
     datasets = [load_icrl4aht(root) for root in roots]
     for root in roots:
-        if root.resolve() == target.resolve():
+        if not is_address(root) and Path(root).resolve() == target.resolve():
             raise OptionError(f"{target}: is one of the releases to combine; give another folder")
     _check_alike(datasets)
-    owners: dict[str, Path] = {}
+    owners: dict[str, str] = {}
     new = []
     for dataset in datasets:
         provenance = parse_json(read_text(dataset.root / PROVENANCE))
         for task in release_tasks(dataset):
             if task.task_id in owners:
-                raise OptionError(f"{dataset.root}: task {task.task_id} is also in {owners[task.task_id]}")
-            owners[task.task_id] = dataset.root
+                raise OptionError(f"{dataset.origin}: task {task.task_id} is also in {owners[task.task_id]}")
+            owners[task.task_id] = str(dataset.origin)
             ids = dataset.index.query(task_id=task.task_id)
             new.append(stored_task(dataset.select(ids), task, provenance.get(task.task_id, {}), dataset.info["kind"]))
     first = datasets[0].info
@@ -107,6 +108,7 @@ def stored_task(
             yield NewHistory(history.entry.env_idx, Deferred(names, history.read))
             taken()
 
+    dataset.origin.below(f"{TEAMMATES}/")
     return NewTask(task, provenance, len(dataset), load, checkpoint_files(dataset.root / TEAMMATES, task))
 
 
@@ -137,7 +139,7 @@ def _card(datasets: Sequence[Dataset]) -> str:
         f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
         for dataset in datasets
     )
-    cards = "\n".join(read_text(dataset.root / "README.md") for dataset in datasets)
+    cards = "\n".join(read_text(dataset.origin.file("README.md")) for dataset in datasets)
     return (
         f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
     )

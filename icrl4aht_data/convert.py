@@ -116,7 +116,7 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
         kind,
         tasks,
         data_version=dataset.info["data_version"],
-        card=read_text(dataset.root / "README.md"),
+        card=read_text(dataset.origin.file("README.md")),
         kept_steps=dataset.info["environment"]["kept_steps"],
     )
 

@@ -26,11 +26,13 @@ from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.paint import paint
+from icrl4aht_data.remote import Root, open_root
 from icrl4aht_data.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry, Field, episode_returns
 from icrl4aht_data.shard import Shard, Shards
 from icrl4aht_data.store import CACHES, Cache, Choice, Source, choose, decoded_size, open_source
 from icrl4aht_data.tasks import Task, read_tasks
 from icrl4aht_data.threads import usable_cores
+from icrl4aht_data.transport import Traffic
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -64,7 +66,9 @@ def load_icrl4aht(
     """Open a release and select histories.
 
     Args:
-        root: a release folder; the bundled mini release by default.
+        root: a release folder, or an address: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://..., any other
+            that fsspec opens; the bundled mini release by default. Of a remote release the index comes here at once,
+            all else when it is read.
         split: "train" or "test".
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple); or several.
         track: "teammate" or "layout".
@@ -87,9 +91,11 @@ def load_icrl4aht(
     if cache not in CACHES:
         raise unknown("cache", cache, CACHES)
     options = Options(obs, cache, usable_cores() if threads is None else whole("threads", threads, 1))
-    index = read_index(MINI if root is None else Path(root).expanduser())
+    index = read_index(open_root(MINI if root is None else root))
     if obs == "state" and index.info["kind"] not in KINDS:
-        raise OptionError(f'obs = "state": {index.root} has observations only, no state records; take float32 or uint8')
+        raise OptionError(
+            f'obs = "state": {index.origin} has observations only, no state records; take float32 or uint8'
+        )
     everything = np.arange(len(index.entries))
     dataset = Dataset(index, everything, options, Shards(index))
     return dataset.filter(
@@ -164,7 +170,19 @@ class Dataset:
 
     @property
     def root(self) -> Path:
+        """The release's folder on this machine; of a remote release the one that its files come to."""
         return self.index.root
+
+    @property
+    def origin(self) -> Root:
+        """Where the release is: its name, and the way to its files."""
+        return self.index.origin
+
+    @property
+    def traffic(self) -> Traffic:
+        """What this release's remote was asked for so far; nothing of a local one."""
+        remote = self.origin.remote
+        return Traffic() if remote is None else remote.store.traffic
 
     @property
     def info(self) -> dict[str, Any]:
@@ -204,7 +222,7 @@ class Dataset:
         return (
             f"Dataset({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
-            f"{self.info['kind']} release {self.info['data_version']} at {self.root})"
+            f"{self.info['kind']} release {self.info['data_version']} at {self.origin})"
         )
 
     def column(self, name: str) -> np.ndarray:
@@ -226,11 +244,20 @@ class Dataset:
     @cached_property
     def cache(self) -> Choice:
         """How samplers hold this selection, and why; see `store.CACHES`."""
+        away = [name for name in self.shards if not self.origin.is_here(name)]
+        if self.options.cache == "auto" and away:
+            return Choice("stream", f"{len(away)} of {len(self.shards)} shards are not downloaded")
         size = 0
         for layout, rows in self._by_layout():
             steps, episodes = (int(self.column(name)[rows].sum()) for name in ("T", "episodes"))
             size += decoded_size(layout, self.info["kind"], steps, len(rows), episodes)
         return choose(self.options.cache, size)
+
+    @cached_property
+    def shards(self) -> list[str]:
+        """The shards of the selection, paths in the release."""
+        names = self.index.values("shard")
+        return [names[code] for code in np.unique(self.column("shard")).tolist()]
 
     def _by_layout(self) -> Iterator[tuple[Layout, np.ndarray]]:
         codes, names = self.column("layout"), self.index.values("layout")
@@ -250,6 +277,8 @@ class Dataset:
     @cached_property
     def _holding(self) -> Holding:
         sources, layout_of, place = [], np.zeros(len(self), np.intp), np.zeros(len(self), np.intp)
+        if self.origin.remote is not None and self.cache.cache != "stream":
+            self.origin.remote.fetch(self.shards)
         for number, (_, rows) in enumerate(self._by_layout()):
             ids, place[rows] = np.unique(self.ids[rows], return_inverse=True)
             layout_of[rows] = number

@@ -74,5 +74,26 @@ class FormatTooOldError(ReleaseError):
     """The release was written in an older format than this package reads."""
 
 
+class RemoteError(ReleaseError, OSError):
+    """A remote did not give what was asked of it, for longer than we try, or what came is not what its manifest lists.
+
+    Args:
+        message: names the address.
+        missing: whether the remote has no such file.
+    """
+
+    def __init__(self, message: str, missing: bool = False) -> None:
+        super().__init__(message)
+        self.missing = missing
+
+
+class OfflineError(ReleaseError):
+    """Something is not here and may not be fetched: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE is set."""
+
+
+class UnsafePathError(ReleaseError):
+    """A path in a release leads out of it."""
+
+
 class TaskFormatError(Icrl4ahtError, ValueError):
     """A task line is malformed."""

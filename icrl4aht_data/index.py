@@ -13,24 +13,28 @@ from icrl4aht_data.benchmark import FAMILIES, SPLITS, TRACKS, unknown
 from icrl4aht_data.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.errors import (
     EmptySelectionError,
-    FormatTooNewError,
-    FormatTooOldError,
     IndexFormatError,
-    RootNotFoundError,
     UnknownNameError,
 )
-from icrl4aht_data.files import parse_json, read_text
+from icrl4aht_data.info import read_info
+from icrl4aht_data.manifest import inside
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.schema import ALL_KINDS, FORMAT_VERSION, HISTORIES, INFO, KINDS, Entry
+from icrl4aht_data.remote import Root
+from icrl4aht_data.schema import HISTORIES, INFO, KINDS, Entry
 
 
 @dataclass(frozen=True, eq=False)
 class Index:
     """A release's index. A history's id is its place in `entries`, which makes an entry when it is asked for."""
 
-    root: Path
+    origin: Root
     info: dict[str, Any]
     entries: Columns
+
+    @property
+    def root(self) -> Path:
+        """The release's folder on this machine."""
+        return self.origin.folder
 
     def entry(self, history_id: int) -> Entry:
         """The entry of one history.
@@ -95,7 +99,7 @@ class Index:
         return ", ".join(parts) or "no histories"
 
 
-def read_index(root: Path) -> Index:
+def read_index(origin: Root | Path) -> Index:
     """Read and check a release's index.
 
     A large one is parsed once; what was parsed is kept in the cache folder, by content: see `icrl4aht_data.cache`.
@@ -103,8 +107,10 @@ def read_index(root: Path) -> Index:
     Raises:
         RootNotFoundError, FormatTooNewError, FormatTooOldError, IndexFormatError: each names the file, and the line.
     """
+    origin = Root(origin) if isinstance(origin, Path) else origin
+    root = origin.folder
     info = read_info(root)
-    path = root / HISTORIES
+    path = inside(root, HISTORIES)
     entries = read_columns(path)
     if len(entries) != info["histories"]:
         raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info['histories']} histories")
@@ -113,46 +119,4 @@ def read_index(root: Path) -> Index:
         raise IndexFormatError(
             f"{path}, line {lacking[0] + 1}: expected has_teammate_actions true in a {info['kind']} release"
         )
-    return Index(root, info, entries)
-
-
-_INFO_TYPES: dict[str, type | tuple[type, ...]] = {
-    "kind": str,
-    "data_version": str,
-    "histories": int,
-    "environment": dict,
-    "layouts": dict,
-}
-
-
-def read_info(root: Path) -> dict[str, Any]:
-    """meta/info.json of a release whose format this package reads."""
-    path = root / INFO
-    if not path.is_file():
-        raise RootNotFoundError(
-            f"{root}: no release here, expected {INFO} in it; give a release folder, or make one with `make generate`"
-        )
-    try:
-        info = parse_json(read_text(path))
-    except IndexFormatError as error:
-        raise IndexFormatError(f"{path}: malformed: {error}") from error
-    version = info.get("format_version") if isinstance(info, dict) else None
-    if not isinstance(version, int):
-        raise IndexFormatError(f"{path}: malformed: expected an object with an integer format_version")
-    if version > FORMAT_VERSION:
-        raise FormatTooNewError(
-            f"{path}: format version {version}, this package reads {FORMAT_VERSION}: `pip install -U icrl4aht-data`"
-        )
-    if version < FORMAT_VERSION:
-        raise FormatTooOldError(
-            f"{path}: format version {version}, this package reads {FORMAT_VERSION}: rebuild or fetch the release again"
-        )
-    wrong = [name for name, kind in _INFO_TYPES.items() if not isinstance(info.get(name), kind)]
-    if wrong or info["kind"] not in ALL_KINDS or not _is_environment(info["environment"]):
-        raise IndexFormatError(f"{path}: malformed: {', '.join(wrong) or 'kind or environment'} not as expected")
-    return info
-
-
-def _is_environment(value: dict[str, Any]) -> bool:
-    steps = [value.get(name) for name in ("max_steps", "kept_steps")]
-    return len(value) == 2 and all(isinstance(n, int) and n > 0 for n in steps)
+    return Index(origin, info, entries)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections import defaultdict
@@ -18,7 +17,8 @@ from filelock import FileLock, Timeout
 
 from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import file_in_place_of, write_json
+from icrl4aht_data.files import write_json
+from icrl4aht_data.manifest import file_hash, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
@@ -26,7 +26,6 @@ from icrl4aht_data.schema import (
     HISTORIES,
     INFO,
     KINDS,
-    MANIFEST,
     OBSERVATIONS,
     PROVENANCE,
     TASKS,
@@ -227,7 +226,8 @@ def _fill(
     provenance = {new.task.task_id: new.provenance for new in tasks}
     write_json(root / PROVENANCE, provenance)
     statistics = layout_statistics(root, entries, given, provenance, kept_steps)
-    write_json(root / INFO, describe(kind, data_version, kept_steps, entries) | {"statistics": statistics})
+    info = describe(kind, data_version, kept_steps, entries)
+    write_json(root / INFO, info | {"shards": shard_sizes(root, entries), "statistics": statistics})
     (root / "README.md").write_text(card, encoding="utf-8")
     write_manifest(root)
 
@@ -339,18 +339,9 @@ def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry
     }
 
 
-def write_manifest(root: Path) -> None:
-    """MANIFEST.sha256 over every other file of the folder, in the format of sha256sum."""
-    files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != MANIFEST)
-    lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
-    with file_in_place_of(root / MANIFEST) as partial:
-        partial.write_text("".join(lines), encoding="utf-8")
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+def shard_sizes(root: Path, entries: Iterable[Entry]) -> dict[str, int]:
+    """Bytes of every shard, in the order of the index."""
+    return {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}
 
 
 def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:

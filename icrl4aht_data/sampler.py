@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from icrl4aht_data.blocks import bring
 from icrl4aht_data.draws import Curriculum, Episodes, Weights, check_weights, episode_range, part_of, whole
 from icrl4aht_data.errors import LabelsMissingError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
@@ -26,6 +27,16 @@ B = TypeVar("B", bound=tuple)
 """A batch: a named tuple of arrays, some of which may be None."""
 
 _SLAB = 8192  # steps gathered and painted at a time: the records in between stay few
+
+
+class Needed(NamedTuple):
+    """Rows that a batch needs."""
+
+    source: Source
+    fields: Sequence[str]
+    which: np.ndarray  # int (n,): histories, positions in the source
+    low: np.ndarray  # int (n,): the first row of each
+    high: np.ndarray  # int (n,): the one behind the last
 
 
 class Group(NamedTuple):
@@ -164,6 +175,10 @@ class Sampler(Generic[B]):
         for k in np.unique(number).tolist():
             rows = np.flatnonzero(number == k)
             yield Group(self.layouts[k], holding.sources[k], rows, lambda array, rows=rows: array[rows])
+
+    def _bring(self, needed: Iterable[Needed]) -> None:
+        """Fetch what a batch needs of a remote release, all at once."""
+        bring(part for n in needed for part in n.source.lacking(n.fields, n.which, n.low, n.high))
 
     @property
     def _paints(self) -> bool:

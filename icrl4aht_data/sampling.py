@@ -7,6 +7,7 @@ on beyond. `B` denotes the batch size, `L` the window's length, `K` the context'
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from icrl4aht_data.benchmark import unknown
 from icrl4aht_data.draws import below, pick, words
 from icrl4aht_data.errors import LabelsMissingError, OptionError
-from icrl4aht_data.sampler import Group, Sampler
+from icrl4aht_data.sampler import Group, Needed, Sampler
 from icrl4aht_data.store import Source
 
 if TYPE_CHECKING:
@@ -126,8 +127,11 @@ class ADSampler(Sampler[ADBatch]):
             ("rewards", -1, batch.prev_rewards),
             ("teammate_actions", -1, batch.prev_teammate_actions),
         ]
-        for group in self._groups(which):
-            place, start = self.dataset.holding.place[group.select(which)], group.select(starts)
+        place = self.dataset.holding.place
+        groups = [(group, place[group.select(which)], group.select(starts)) for group in self._groups(which)]
+        fields = list(dict.fromkeys([self._record, *(name for name, _, array in scalars if array is not None)]))
+        self._bring(Needed(g.source, fields, where, low - 1, low + self.length) for g, where, low in groups)
+        for group, place, start in groups:
 
             def fill(first: int, last: int, group=group, place=place, start=start) -> None:
                 part, which, low = group.part(first, last), place[first:last], start[first:last]
@@ -277,8 +281,10 @@ class DPTSampler(Sampler[DPTBatch]):
     def batch(self, i: int, out: DPTBatch | None = None) -> DPTBatch:
         asking, step, showing, steps = self._draw(i)
         batch = self._checked(out)
-        for group in self._groups(asking):  # a task, and so a row, has one layout
-            place = self.dataset.holding.place
+        groups = list(self._groups(asking))  # a task, and so a row, has one layout
+        place = self.dataset.holding.place
+        self._bring(part for group in groups for part in self._needed(group, asking, step, showing, steps))
+        for group in groups:
             query, when = place[group.select(asking)], group.select(step)[:, None]
             batch.query_target[group.rows] = group.source.steps("expert_actions", query, when)[:, 0]
             self._present(group, group.source.steps(self._record, query, when)[:, 0], batch.query_obs)
@@ -286,6 +292,18 @@ class DPTSampler(Sampler[DPTBatch]):
             if batch.layouts is not None:
                 batch.layouts[group.rows] = self.layouts.index(group.layout)
         return batch
+
+    def _needed(
+        self, group: Group, asking: np.ndarray, step: np.ndarray, showing: np.ndarray, steps: np.ndarray
+    ) -> Iterator[Needed]:
+        place = self.dataset.holding.place
+        query, when = place[group.select(asking)], group.select(step)
+        yield Needed(group.source, [self._record, "expert_actions"], query, when, when + 1)
+        shown, low, high = (group.select(array) for array in (place[showing], steps.min(axis=1), steps.max(axis=1) + 1))
+        labels = ["teammate_actions"] if self.teammate_actions else []
+        yield Needed(group.source, [self._record, "actions", "rewards", "dones", *labels], shown, low, high + 1)
+        if self.dataset.has_states:
+            yield Needed(group.source, ["episode_end_state"], shown, low // self._kept, high // self._kept + 1)
 
     def _fill_context(self, group: Group, showing: np.ndarray, steps: np.ndarray, batch: DPTBatch) -> None:
         scalars = [

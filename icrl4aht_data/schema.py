@@ -25,7 +25,7 @@ from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Of the files' layout. A reader takes exactly this one; see `FormatTooOldError` and `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
@@ -47,8 +47,9 @@ ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
 CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")])
 """One line of a chunk table: where the stored bytes are, how many of the chunk's rows are the history's (the last chunk
-is padded), and the checksum of the stored bytes. Lines stand in the order of histories, then of `FIELDS`, then of
-chunks."""
+is padded), and the checksum of the stored bytes. What lies between the chunks follows in lines of 0 rows, so that every
+byte of a shard stands in its table once. Chunks stand in the order of histories, then of `FIELDS`, then of
+chunks. In the file a history's chunks stand by time, so that a window is one range of bytes; see `shard.in_time`."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,11 @@ FIELDS: dict[str, Field] = {
     field.name: field
     for field in (
         Field("state", "uint8", "uint8", "T", "state", 1000, absent=(OBSERVATIONS,)),
-        Field("actions", "int32", "int8", "T", "scalar", 4000),
-        Field("rewards", "float32", "int8", "T", "scalar", 4000),
-        Field("dones", "bool", "bool", "T", "scalar", 4000),
-        Field("teammate_actions", "int32", "int8", "T", "scalar", 4000, optional=(OBSERVATIONS,)),
-        Field("expert_actions", "int32", "int8", "T", "scalar", 4000, optional=ALL_KINDS),
+        Field("actions", "int32", "int8", "T", "scalar", 2000),
+        Field("rewards", "float32", "int8", "T", "scalar", 2000),
+        Field("dones", "bool", "bool", "T", "scalar", 2000),
+        Field("teammate_actions", "int32", "int8", "T", "scalar", 2000, optional=(OBSERVATIONS,)),
+        Field("expert_actions", "int32", "int8", "T", "scalar", 2000, optional=ALL_KINDS),
         Field("episode_end_state", "uint8", "uint8", "E", "state", 1000, absent=(OBSERVATIONS,)),
         Field("obs", "uint8", "uint8", "T", "obs", 500, absent=("lite",)),
     )

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from icrl4aht_data.blocks import bring
 from icrl4aht_data.errors import (
     ChunkTableError,
     OptionError,
@@ -23,23 +24,33 @@ from icrl4aht_data.errors import (
     ShardMissingError,
     ShardTruncatedError,
 )
+from icrl4aht_data.manifest import inside
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 
 if TYPE_CHECKING:
     import h5py  # libhdf5 is needed to write and to check, not to read
 
+    from icrl4aht_data.blocks import PartialFile
     from icrl4aht_data.index import Index
+    from icrl4aht_data.remote import Root
 
 _Arrays = Mapping[str, np.ndarray]
 
 _DEFLATE_LEVEL = 6
+_BETWEEN = 2048  # bytes: what a fault between the chunks costs to repair
+_BLOCK = 2000  # steps: a chunk of scalars, two of records
 _CACHE_BYTES = 256 * 2**20
 
 
+def chunk_table_name(shard: str) -> str:
+    """The chunk table of a shard (`data/...h5`), path in the release."""
+    return f"meta/chunks/{shard.removeprefix('data/').removesuffix('.h5')}.npy"
+
+
 def chunk_table_path(root: Path, shard: str) -> Path:
-    """Where the chunk table of a shard (`data/...h5`) lies."""
-    return (root / "meta" / "chunks" / Path(shard).relative_to("data")).with_suffix(".npy")
+    """Where it lies."""
+    return root / chunk_table_name(shard)
 
 
 def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[_Arrays]) -> None:
@@ -74,7 +85,22 @@ def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], hi
         table["crc32"] = checksums
         places = [place for entry in entries for place in _chunk_places(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
-    np.save(table_path, table, allow_pickle=False)
+    np.save(table_path, np.concatenate([table, _between(path, table)]), allow_pickle=False)
+
+
+def _between(path: Path, chunks: np.ndarray) -> np.ndarray:
+    """Lines for what lies between a shard's chunks."""
+    ordered = np.sort(chunks, order="offset")
+    starts = [*ordered["offset"].tolist(), path.stat().st_size]
+    stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
+    lines = []
+    with path.open("rb") as stream:
+        for stop, start in zip(stops, starts, strict=True):
+            for low in range(stop, start, _BETWEEN):
+                stream.seek(low)
+                data = stream.read(min(_BETWEEN, start - low))
+                lines.append((low, len(data), 0, zlib.crc32(data)))
+    return np.array(lines, CHUNK_DTYPE)
 
 
 def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
@@ -98,13 +124,25 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
 
 
 def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> list[int]:
-    """Write every chunk of a history; their checksums, in table order."""
-    checksums = []
-    for field, start, data in _encoded(layout, kind, entry, arrays):
+    """Write every chunk of a history, by time; their checksums, in table order."""
+    encoded = list(_encoded(layout, kind, entry, arrays))
+    for field, start, data in sorted(encoded, key=lambda part: in_time(*part[:2])):
         place = (start,) if entry.h5_row is None else (entry.h5_row, start)
         group[field.name].id.write_direct_chunk(place, data)
-        checksums.append(zlib.crc32(data))
-    return checksums
+    return [zlib.crc32(data) for _, _, data in encoded]
+
+
+def in_time(field: Field, start: int) -> tuple[int, ...]:
+    """Sorts the chunks of a history as they stand in the file: what a window needs in one range of bytes.
+
+    That is by block of `_BLOCK` steps, and in a block the first records, what every window needs of scalars, the other
+    records, labels, observations.
+    """
+    if field.axis == "E":
+        return (1,)
+    order = ("actions", "rewards", "dones", "state", "teammate_actions", "expert_actions", "obs")
+    leads = field.name == "state" and start % _BLOCK == 0
+    return (0, start // _BLOCK, -1 if leads else order.index(field.name), start)
 
 
 def stored_bytes(kind: Kind, entry: Entry, arrays: _Arrays) -> int:
@@ -213,7 +251,7 @@ class Shard:
     """Reads one shard's histories by offset. May be shared between threads and pickled.
 
     Args:
-        root: the release folder.
+        root: the release; of a remote one the chunk table comes here, and of the shard what is read.
         name: path of the shard below it.
         kind: of the release.
         entries: all histories of this shard, in index order.
@@ -225,18 +263,31 @@ class Shard:
     """
 
     def __init__(
-        self, root: Path, name: str, kind: Kind, entries: Sequence[Entry], cache: ChunkCache | None = None
+        self, root: Root, name: str, kind: Kind, entries: Sequence[Entry], cache: ChunkCache | None = None
     ) -> None:
-        self.path, self.name = root / name, name
+        self.path, self.name = inside(root.folder, name), name
+        self._remote = root.remote
         self.kind: Kind = kind
         self.layout = get_layout(entries[0].layout)
         self._entries = {entry.history_id: entry for entry in entries}
         self._cache = cache or ChunkCache()
-        self._table = _read_table(root, name)
         self._first: dict[tuple[int, str], int] = {}
         self._elements: dict[str, tuple[np.dtype, tuple[int, ...], int]] = {}
+        self._table = self._read_table(
+            root, sum(entry.chunks(f) for entry in entries for f in entry.stored_fields(kind))
+        )
         self._check_rows(entries)
         self._check_size()
+
+    def _read_table(self, root: Root, expected: int) -> np.ndarray:
+        table = read_table(root.file(chunk_table_name(self.name)))
+        found = int(np.count_nonzero(table["rows"]))
+        if found != expected or not table["rows"][:expected].all():
+            raise ShardMismatchError(
+                f"{self.path}: the index implies {expected} chunks, the chunk table has {found}; "
+                f"fetch meta/ and the shard again"
+            )
+        return np.array(table)
 
     def _check_rows(self, entries: Sequence[Entry]) -> None:
         """Whether the chunk table has the rows that the index says."""
@@ -252,18 +303,15 @@ class Shard:
                         f"chunk table says {found}; fetch meta/ and the shard again"
                     )
                 total += chunks
-        if total != len(self._table):
-            raise ShardMismatchError(
-                f"{self.path}: the index implies {total} chunks, the chunk table has {len(self._table)}; "
-                f"fetch meta/ and the shard again"
-            )
 
     def _check_size(self) -> None:
         """Whether the file is long enough for every chunk."""
         try:
             size = self.path.stat().st_size
         except FileNotFoundError as error:
-            raise self._missing() from error
+            if self._remote is None:
+                raise self._missing() from error
+            size = self._remote.size(self.name)
         offset, length = self._table["offset"], self._table["size"]
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
@@ -274,6 +322,23 @@ class Shard:
 
     def _missing(self) -> ShardMissingError:
         return ShardMissingError(f"{self.path}: the index names this shard, but there is no such file")
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether the shard may have to be fetched."""
+        return self._remote is not None
+
+    def needed(self, history_id: int, field: Field, start: int, stop: int) -> range:
+        """The rows of the chunk table with rows start..stop of a field."""
+        first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        return range(first + start // chunk, first + -(-stop // chunk))
+
+    def lacking(self, rows: Iterable[int]) -> list[tuple[PartialFile, np.ndarray]]:
+        """What `blocks.bring` takes, to make chunks ready to be read; nothing where they are on this machine's disk."""
+        if self._remote is None or self.path.exists():
+            return []
+        wanted = [row for row in sorted(set(rows)) if self._cache.get((self.name, row)) is None]
+        return [(self._remote.part(self.name), self._table[wanted])] if wanted else []
 
     def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
         """Rows start..stop of a field, in the field's dtype. The range must lie within the history.
@@ -289,6 +354,8 @@ class Shard:
         """The same for the rows from `start` that fill `out`, cast to its dtype."""
         first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
         stop = start + len(out)
+        if self._remote is not None:
+            bring(self.lacking(self.needed(history_id, field, start, stop)))
         for number in range(start // chunk, -(-stop // chunk)):
             rows = self._cache.get((self.name, first + number))
             if rows is None:
@@ -330,7 +397,7 @@ class Shard:
         element, shape, size_of_row = self._element(field)
         length = self._chunk_rows(history_id, field)
         offset, size, _, expected = self._table[row].item()
-        data = self._bytes(offset, size)
+        data = self._bytes(offset, size, expected)
         found = zlib.crc32(data)
         if found != expected or len(data) != size:
             raise ShardCorruptError(
@@ -353,13 +420,15 @@ class Shard:
             known = self._elements[field.name] = element, element.shape, element.itemsize
         return known
 
-    def _bytes(self, offset: int, size: int) -> bytes:
+    def _bytes(self, offset: int, size: int, crc32: int) -> bytes:
         try:
             with self.path.open("rb", buffering=0) as stream:
                 stream.seek(offset)
                 return stream.read(size)
         except FileNotFoundError as error:
-            raise self._missing() from error
+            if self._remote is None:
+                raise self._missing() from error
+            return self._remote.part(self.name).chunk(offset, size, crc32)
 
     def describe(self, row: int) -> str:
         """A chunk in words: history, field, number, bytes."""
@@ -376,6 +445,20 @@ class Shard:
                 first = self._first[history_id, field.name]
                 for number in range(entry.chunks(field)):
                     yield first + number, history_id, field
+
+    def check_between(self) -> list[str]:
+        """Whether every byte of the file stands in the table once, and what lies between the chunks is whole."""
+        ordered = np.sort(self._table, order="offset")
+        stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
+        if [0, *stops] != [*starts, size := self.path.stat().st_size]:
+            return [f"the chunk table does not cover the file's {size} bytes, each once"]
+        faults = []
+        for offset, size, _, expected in self._table[self._table["rows"] == 0].tolist():
+            found = zlib.crc32(self._bytes(offset, size, expected))
+            if found != expected:
+                where = f"bytes {offset}..{offset + size}, between the chunks"
+                faults.append(f"{where}: expected crc32 {expected:08x}, found {found:08x}")
+        return faults
 
     def check_structure(self, values: bool = False) -> list[str]:
         """What another HDF5 reader would see otherwise than we do; empty if it sees the same.
@@ -453,16 +536,20 @@ class Shards:
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
-            self._open[name] = Shard(self._index.root, name, self._index.info["kind"], members, self._cache)
+            self._open[name] = Shard(self._index.origin, name, self._index.info["kind"], members, self._cache)
         return self._open[name]
 
 
-def _read_table(root: Path, name: str) -> np.ndarray:
-    path = chunk_table_path(root, name)
+def read_table(path: Path) -> np.ndarray:
+    """A chunk table (CHUNK_DTYPE), mapped from its file: it may be larger than it should be.
+
+    Raises:
+        ChunkTableError: if it is missing, or no chunk table.
+    """
     try:
-        table = np.load(path, allow_pickle=False)
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError as error:
-        raise ChunkTableError(f"{path}: the chunk table of {name} is missing") from error
+        raise ChunkTableError(f"{path}: the chunk table is missing") from error
     except Exception as error:  # a damaged header makes NumPy's parser raise anything
         raise ChunkTableError(f"{path}: not a chunk table: {error!r}") from error
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:

@@ -61,6 +61,10 @@ class Source(Protocol):
         """uint8 (m, S): the state after the last kept step of an episode (m,) of a history (m,). Of states only."""
         ...
 
+    def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
+        """What `blocks.bring` takes so that rows low..high of some fields of histories (n,) are at hand."""
+        ...
+
 
 def choose(cache: Cache, size: int) -> Choice:
     """How to hold arrays of that many bytes."""
@@ -174,6 +178,9 @@ class Flat:
     def ends(self, which: np.ndarray, episodes: np.ndarray) -> np.ndarray:
         return self._arrays["episode_end_state"][self._first_end[which] + episodes]
 
+    def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
+        return []
+
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
     """Rows first..first + L of array (N,) or (N, S) into out (n, L) or (n, L, S), C-contiguous: a block a window."""
@@ -225,3 +232,15 @@ class Streamed:
             history_id = self._entries[position].history_id
             out[row] = self._shards[position].read(history_id, FIELDS["episode_end_state"], episode, episode + 1)[0]
         return out
+
+    def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
+        shards = {id(shard): shard for shard in self._shards if shard.is_remote}
+        if not shards:
+            return []
+        rows: dict[int, list[int]] = {key: [] for key in shards}
+        for position, first, last in zip(which.tolist(), low.tolist(), high.tolist(), strict=True):
+            entry, shard = self._entries[position], self._shards[position]
+            for field in map(FIELDS.__getitem__, fields):
+                stop = min(last, entry.rows(field))
+                rows[id(shard)].extend(shard.needed(entry.history_id, field, max(first, 0), stop))
+        return [part for key, some in rows.items() for part in shards[key].lacking(some)]

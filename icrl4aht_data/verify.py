@@ -6,7 +6,8 @@ A release of observations cannot be replayed; `deep` then asks whether each obse
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,18 @@ from typing import Any
 import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, EGO
-from icrl4aht_data.dataset import MINI, History
-from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.dataset import MINI, History, Names
+from icrl4aht_data.download import ORIGIN, chosen_files
+from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError, UnsafePathError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
+from icrl4aht_data.manifest import file_hash, inside, read_manifest
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import columns, faults, record_size, start
-from icrl4aht_data.release import checkpoint_files, describe, file_hash
+from icrl4aht_data.release import checkpoint_files, describe, shard_sizes
+from icrl4aht_data.remote import Remote, Root, open_root
 from icrl4aht_data.schema import (
     ACTION_FIELDS,
     FIELDS,
@@ -33,7 +37,6 @@ from icrl4aht_data.schema import (
     PROVENANCE,
     TASKS,
     TEAMMATES,
-    Entry,
     curve_ends,
     episode_ends,
     episode_returns,
@@ -43,6 +46,7 @@ from icrl4aht_data.schema import (
 from icrl4aht_data.shard import Shard
 from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.transport import Traffic
 
 
 @dataclass(frozen=True)
@@ -59,16 +63,25 @@ class Report:
 
     root: str
     deep: bool
+    quick: bool = False
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # what was asked for but could not be checked, which is no fault
+    repaired: list[str] = field(default_factory=list)
     files: int = 0
     chunks: int = 0
     histories: int = 0
     transitions: int = 0
+    fetched_bytes: int = 0
+    requests: int = 0
 
     @property
     def ok(self) -> bool:
         return not self.findings
+
+    @property
+    def files_at_fault(self) -> set[str]:
+        """Of the release, in which something is wrong."""
+        return {finding.file for finding in self.findings}
 
     def to_json(self) -> dict[str, Any]:
         return {"ok": self.ok, **asdict(self)}
@@ -82,40 +95,92 @@ Advance = Callable[[str, int, int], None]
 
 
 def verify_release(
-    root: str | Path | None = None, *, deep: bool = False, advance: Advance = lambda what, done, total: None
+    root: str | Path | None = None,
+    *,
+    deep: bool = False,
+    quick: bool = False,
+    advance: Advance = lambda what, done, total: None,
+    **wanted: Names,
 ) -> Report:
-    """Check a release folder; never raises for what is wrong in it.
+    """Check a release; never raises for what is wrong in it.
 
     Args:
-        root: a release folder; the bundled mini release by default.
+        root: a release folder, or an address as in `load_icrl4aht`; the bundled mini release by default. Of a remote
+            release all that is checked comes here first, unless `quick`.
         deep: also check that observations are what the states show, that every recorded step follows from the one
             before under the rules, with the recorded reward, and that every episode starts as the environment starts.
             Without state records only that every observation shows the layout; a note says so.
+        quick: check names, sizes and the index alone, no contents.
         advance: progress.
+        wanted: check the shards of these histories alone; see `load_icrl4aht`. A folder that `download` filled with a
+            part of a release has to have that part.
     """
-    root = MINI if root is None else Path(root)
-    report = Report(str(root), deep)
-    if not root.is_dir():
-        report.add(".", f"no such folder: {root}")
-        return report
-    _check_manifest(root, report, advance)
+    if deep and quick:
+        raise OptionError("deep and quick: give one of them")
+    report = Report(str(MINI if root is None else root), deep, quick)
     try:
-        index = read_index(root)
-        tasks = read_tasks(root / TASKS)
+        origin = open_root(MINI if root is None else root)
+    except Icrl4ahtError as error:
+        report.add(".", str(error))
+        return report
+    if not origin.folder.is_dir():
+        report.add(".", f"no such folder: {origin.folder}")
+        return report
+    before = origin.remote.store.traffic if origin.remote else Traffic()
+    report.root = str(origin)
+    try:
+        _verify(origin, report, advance, wanted)
     except Icrl4ahtError as error:
         report.add("meta", str(error))
-        return report
-    if deep and index.info["kind"] not in KINDS:
-        report.notes.append(
-            "nothing was replayed: without state records it cannot be said whether steps obey the rules"
-        )
-    _check_index(index, tasks, report)
-    _check_teammates(root, tasks, report)
-    _check_shards(index, report, advance)
+    if origin.remote is not None:
+        traffic = origin.remote.store.traffic - before
+        report.fetched_bytes, report.requests = traffic.bytes, traffic.requests
     return report
 
 
-def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
+def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Names]) -> None:
+    listed = _manifest(origin, report)
+    chosen: set[str] | None = None
+    try:
+        chosen = chosen_files(origin, **wanted)
+    except (EmptySelectionError, UnknownNameError):
+        raise
+    except Icrl4ahtError as error:
+        report.add("meta", str(error))
+    expected = listed.keys() if chosen is None else listed.keys() & chosen
+    if origin.remote is not None and not report.quick:
+        _fetch(origin.remote, sorted(expected), report, advance)
+    _check_files(origin, {name: listed[name] for name in expected}, listed.keys(), report, advance)
+    if chosen is None:
+        return
+    index = read_index(origin)
+    tasks = read_tasks(inside(origin.folder, TASKS))
+    if report.deep and index.info["kind"] not in KINDS:
+        report.notes.append(
+            "nothing was replayed: without state records it cannot be said whether steps obey the rules"
+        )
+    _check_index(index, tasks, chosen, report)
+    shards = [name for name in index.values("shard") if name in chosen]
+    left = len(index.values("shard")) - len(shards)
+    if left:
+        report.notes.append(f"{left} of {left + len(shards)} shards were not asked for")
+    if report.quick:
+        _check_sizes(index, shards, report)
+    else:
+        _check_teammates(origin.folder, tasks, report)
+        _check_shards(index, shards, report, advance)
+
+
+def _fetch(remote: Remote, names: list[str], report: Report, advance: Advance) -> None:
+    for number, name in enumerate(names, start=1):  # one by one, so that each that cannot be had is named
+        try:
+            remote.fetch([name])
+        except Icrl4ahtError as error:
+            report.add(name, str(error))
+        advance("fetched", number, len(names))
+
+
+def _check_index(index: Index, tasks: list[Task], chosen: set[str], report: Report) -> None:
     """Index, tasks, totals and shard names against each other."""
     by_id = {task.task_id: task for task in tasks}
     given = bool(tasks) or index.info["kind"] in KINDS
@@ -139,13 +204,17 @@ def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
         streams.add((entry.task_id, entry.env_idx))
     for task_id in by_id.keys() - {entry.task_id for entry in index.entries}:
         report.add(TASKS, f"task {task_id!r} has no history")
+    _check_apart(tasks, report)
     if not index.entries:
         report.add(HISTORIES, "no histories")
     info = index.info
     kept_steps = info["environment"]["kept_steps"]
     expected = describe(info["kind"], info["data_version"], kept_steps, list(index.entries))
-    if "statistics" in info and report.ok:  # else what they are made of is at fault
+    if report.ok and chosen.issuperset(index.values("shard")) and not report.quick:
+        expected["shards"] = shard_sizes(index.root, index.entries)  # else what they are made of is at fault, or away
         expected["statistics"] = _statistics(index, tasks)
+    elif info["shards"].keys() != set(index.values("shard")):
+        report.add(INFO, f"shards: expected {sorted(index.values('shard'))}, found {sorted(info['shards'])}")
     for name in expected:
         if info.get(name) != expected[name]:
             report.add(INFO, f"{name}: expected {expected[name]!r}, found {info.get(name)!r}")
@@ -155,6 +224,34 @@ def _check_index(index: Index, tasks: list[Task], report: Report) -> None:
         missing = {f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count)} - shards
         for name in sorted(missing):
             report.add(name, f"the name of {shard} promises this shard, the index has no history in it")
+
+
+def _check_apart(tasks: list[Task], report: Report) -> None:
+    """Whether no teammate of a training task is one of a test task on the same track."""
+    seen: dict[tuple[str, str, str], str] = {}
+    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # train before test
+        who = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
+        if task.split == "train":
+            seen[who] = task.task_id
+        elif who in seen:
+            report.add(TASKS, f"task {task.task_id!r} ({task.split}) has the teammate of {seen[who]!r} (train)")
+
+
+def _check_sizes(index: Index, shards: list[str], report: Report) -> None:
+    """Whether every shard is as long as the release says, where it is."""
+    for name in shards:
+        expected, found = index.info["shards"][name], None
+        remote, path = index.origin.remote, inside(index.root, name)
+        if path.exists():
+            found = path.stat().st_size
+        elif remote is not None:
+            try:
+                found = remote.store.size(name)
+            except Icrl4ahtError as error:
+                report.add(name, str(error))
+                continue
+        if found is not None and found != expected:
+            report.add(name, f"expected {expected} bytes, found {found}")
 
 
 def _check_teammates(root: Path, tasks: list[Task], report: Report) -> None:
@@ -181,45 +278,55 @@ def _statistics(index: Index, tasks: list[Task]) -> Any:
         return f"what {PROVENANCE} and the shards give: {error}"
 
 
-def _check_manifest(root: Path, report: Report, advance: Advance) -> None:
-    path = root / MANIFEST
+def _manifest(origin: Root, report: Report) -> dict[str, str]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        report.add(MANIFEST, f"cannot be read: {error}")
-        return
-    listed = {}
-    for number, line in enumerate(lines, start=1):
-        digest, separator, name = line.partition("  ")
-        if len(digest) != 64 or not separator or not name:
-            report.add(MANIFEST, f"line {number}: expected '<sha256>  <path>', found {line!r}")
-        else:
-            listed[name] = digest
-    present = {p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file()} - {MANIFEST}
-    for name in sorted(listed.keys() - present):
-        report.add(name, "listed in the manifest, but missing")
-    for name in sorted(present - listed.keys()):
+        return read_manifest(origin.folder)
+    except Icrl4ahtError as error:
+        report.add(MANIFEST, str(error))
+        return {}
+
+
+def _check_files(
+    origin: Root, expected: dict[str, str], listed: Collection[str], report: Report, advance: Advance
+) -> None:
+    """Whether the files that are expected are here as the manifest has them, and no others.
+
+    Args:
+        expected: file -> SHA-256.
+        listed: all files of the manifest.
+    """
+    root = origin.folder
+    present = {p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file() or p.is_symlink()}
+    if not report.quick or origin.remote is None:
+        for name in sorted(expected.keys() - present):
+            report.add(name, "listed in the manifest, but missing")
+    for name in sorted(present - set(listed) - {MANIFEST, ORIGIN}):
         report.add(name, "not listed in the manifest")
-    both = sorted(listed.keys() & present)
+    both = sorted(expected.keys() & present)
     for number, name in enumerate(both, start=1):
-        found = file_hash(root / name)
-        if found != listed[name]:
-            report.add(name, f"sha256: expected {listed[name]}, found {found}")
+        try:
+            path = inside(root, name)
+            found = expected[name] if report.quick else file_hash(path)
+        except (UnsafePathError, OSError) as error:
+            report.add(name, str(error))
+            continue
+        if found != expected[name]:
+            report.add(name, f"sha256: expected {expected[name]}, found {found}")
         report.files += 1
         advance("files", number, len(both))
 
 
-def _check_shards(index: Index, report: Report, advance: Advance) -> None:
-    members: dict[str, list[Entry]] = {}
-    for entry in index.entries:
-        members.setdefault(entry.shard, []).append(entry)
+def _check_shards(index: Index, shards: list[str], report: Report, advance: Advance) -> None:
+    local = Root(index.root)  # what could not be fetched has been reported
+    members = {name: [index.entries[row] for row in index.entries.shard_rows(name).tolist()] for name in shards}
+    total = sum(map(len, members.values()))
     for name, entries in members.items():
         try:
-            shard = Shard(index.root, name, index.info["kind"], entries)
+            shard = Shard(local, name, index.info["kind"], entries)
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue
-        for fault in shard.check_structure(values=report.deep):
+        for fault in shard.check_between() + shard.check_structure(values=report.deep):
             report.add(name, fault)
         damaged = _check_chunks(shard, report)
         seen: dict[tuple[str, bytes], int] = {}
@@ -235,7 +342,7 @@ def _check_shards(index: Index, report: Report, advance: Advance) -> None:
                     report.add(name, f"history {entry.history_id}: the same as history {twin}")
                 report.transitions += entry.T
             report.histories += 1
-            advance("histories", report.histories, len(index.entries))
+            advance("histories", report.histories, total)
 
 
 def _check_chunks(shard: Shard, report: Report) -> set[int]:

@@ -121,6 +121,8 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
         OptionError: if the release does not hold the teammate's checkpoint.
     """
     entry = dataset.recover_teammate(history_id)
+    if entry["kind"] == "rl":
+        dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}/")
     if entry["kind"] == "rl" and not checkpoint_folder(dataset.root / TEAMMATES, entry).is_dir():
         raise OptionError(
             f"{dataset.root / TEAMMATES}: lacks checkpoint {entry['theta']['sha256']}, the teammate of history "

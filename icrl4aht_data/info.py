@@ -1,0 +1,58 @@
+"""meta/info.json of a release: read and checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data.errors import FormatTooNewError, FormatTooOldError, IndexFormatError, RootNotFoundError
+from icrl4aht_data.files import parse_json, read_text
+from icrl4aht_data.manifest import inside
+from icrl4aht_data.schema import ALL_KINDS, FORMAT_VERSION, INFO
+
+_INFO_TYPES: dict[str, type | tuple[type, ...]] = {
+    "kind": str,
+    "data_version": str,
+    "histories": int,
+    "environment": dict,
+    "layouts": dict,
+    "shards": dict,
+}
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """meta/info.json of a release whose format this package reads."""
+    path = inside(root, INFO)
+    if not path.is_file():
+        raise RootNotFoundError(
+            f"{root}: no release here, expected {INFO} in it; give a release folder, or make one with `make generate`"
+        )
+    try:
+        info = parse_json(read_text(path))
+    except IndexFormatError as error:
+        raise IndexFormatError(f"{path}: malformed: {error}") from error
+    version = info.get("format_version") if isinstance(info, dict) else None
+    if not isinstance(version, int):
+        raise IndexFormatError(f"{path}: malformed: expected an object with an integer format_version")
+    if version > FORMAT_VERSION:
+        raise FormatTooNewError(
+            f"{path}: format version {version}, this package reads {FORMAT_VERSION}: `pip install -U icrl4aht-data`"
+        )
+    if version < FORMAT_VERSION:
+        raise FormatTooOldError(
+            f"{path}: format version {version}, this package reads {FORMAT_VERSION}: rebuild or fetch the release again"
+        )
+    wrong = [name for name, kind in _INFO_TYPES.items() if not isinstance(info.get(name), kind)]
+    if wrong or info["kind"] not in ALL_KINDS or not _is_environment(info["environment"]) or not _are_sizes(info):
+        what = ", ".join(wrong) or "kind, environment or shards"
+        raise IndexFormatError(f"{path}: malformed: {what} not as expected")
+    return info
+
+
+def _is_environment(value: dict[str, Any]) -> bool:
+    steps = [value.get(name) for name in ("max_steps", "kept_steps")]
+    return len(value) == 2 and all(isinstance(n, int) and n > 0 for n in steps)
+
+
+def _are_sizes(info: dict[str, Any]) -> bool:
+    return all(isinstance(size, int) and 0 <= size < 2**62 for size in info["shards"].values())
