@@ -1,4 +1,4 @@
-"""Servers on 127.0.0.1 that speak to the real clients: HTTP and S3, and what they may do wrong."""
+"""Servers on 127.0.0.1 that speak to the real clients: HTTP, S3, the Hugging Face Hub; and what they may do wrong."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from servers_faults import (
     Status,
 )
 from servers_http import Server, http_server
+from servers_hub import Hub, hub_server
+from servers_process import forget_filesystems, uploads
 from servers_s3 import Bucket, s3_server
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "Fault",
     "Faults",
     "Flip",
+    "Hub",
     "IgnoreRange",
     "Long",
     "Redirect",
@@ -36,6 +39,9 @@ __all__ = [
     "Short",
     "Slow",
     "Status",
+    "forget_filesystems",
     "http_server",
+    "hub_server",
     "s3_server",
+    "uploads",
 ]

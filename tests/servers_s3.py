@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import urllib.request
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -12,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import boto3
-import fsspec
 from moto.server import ThreadedMotoServer
+from servers_process import environment, forget_filesystems
 
 
 @dataclass(frozen=True)
@@ -39,31 +37,6 @@ class Bucket:
     def keys(self) -> list[str]:
         """What the bucket holds, in order; the first 1000."""
         return [entry["Key"] for entry in self.client.list_objects_v2(Bucket=self.name).get("Contents", ())]
-
-
-@contextmanager
-def environment(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """These variables for a while; None is unset."""
-    before = {name: os.environ.get(name) for name in changes}
-    try:
-        _set(changes)
-        yield
-    finally:
-        _set(before)
-
-
-def _set(changes: Mapping[str, str | None]) -> None:
-    for name, value in changes.items():
-        os.environ.pop(name, None)
-        if value is not None:
-            os.environ[name] = value
-
-
-def forget_filesystems(*protocols: str) -> None:
-    """No filesystem of fsspec outlives the server that it talked to, nor the settings it was made from."""
-    for protocol in protocols:
-        fsspec.get_filesystem_class(protocol).clear_instance_cache()
-    gc.collect()
 
 
 @contextmanager

@@ -25,10 +25,10 @@ from servers import (
     Short,
     Slow,
     Status,
+    forget_filesystems,
     http_server,
     s3_server,
 )
-from servers_s3 import forget_filesystems
 
 DATA = np.random.default_rng(0).bytes(200_000)
 
@@ -51,11 +51,15 @@ def web(folder) -> Iterator[Server]:
     forget_filesystems("http")
 
 
-def get(server: Server, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
+def get(
+    server: Server | str, path: str, method: str = "GET", body: bytes = b"", **headers: str
+) -> tuple[HTTPResponse, bytes]:
     """One request without a client's repairs. IncompleteRead where the body is cut."""
-    connection = HTTPConnection(urlsplit(server.url).netloc, timeout=10)
+    url = server if isinstance(server, str) else server.url
+    connection = HTTPConnection(urlsplit(url).netloc, timeout=10)
     try:
-        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, body, named)
         response = connection.getresponse()
         return response, response.read()
     finally:
@@ -122,7 +126,7 @@ def test_fsspec_reads_over_http(web):
         filesystem.cat_file(f"{web.url}/none")
 
 
-@pytest.mark.parametrize(
+FAULTS = pytest.mark.parametrize(
     ("fault", "status", "body"),
     [
         (Status(429, {"Retry-After": "1"}), 429, b"as the test ordered\n"),
@@ -133,17 +137,26 @@ def test_fsspec_reads_over_http(web):
         (IgnoreRange(), 200, DATA),
         (Redirect("/empty"), 302, b""),
     ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Fault) else "",
 )
-def test_faults_of_a_range(web, fault: Fault, status, body):
-    web.faults.next(fault)
-    response, found = get(web, SHARD, Range="bytes=10-19")
+
+
+def check_fault(server: Server | str, path: str, fault: Fault, status: int, body: bytes) -> None:
+    """What was ordered comes once, for the range 10-19."""
+    response, found = get(server, path, Range="bytes=10-19")
     assert (response.status, found) == (status, body)
     assert response.headers["Content-Length"] == str(len(body))
     if isinstance(fault, Status):
         assert response.headers["Retry-After"] == "1"
     if isinstance(fault, Redirect):
         assert response.headers["Location"] == "/empty"
-    assert get(web, SHARD, Range="bytes=10-19")[1] == DATA[10:20]
+    assert get(server, path, Range="bytes=10-19")[1] == DATA[10:20]
+
+
+@FAULTS
+def test_faults_of_a_range(web, fault: Fault, status, body):
+    web.faults.next(fault)
+    check_fault(web, SHARD, fault, status, body)
 
 
 def test_a_body_longer_than_its_file_ends_in_zeros(web):
