@@ -83,7 +83,8 @@ class Hub:
         if request.method == "PUT":
             if hashlib.sha256(body).hexdigest() != sha256:
                 return Answer(b"the content does not have the SHA-256 it was announced with\n", 400)
-            self.blobs.add(body, lfs=True)
+            with self._lock:
+                self.blobs.add(body, lfs=True)
             return Answer()
         path = self.blobs.path(sha256)
         return Answer(path, etag=f'"{sha256}"') if path.exists() else Answer(b"no such object\n", 404)

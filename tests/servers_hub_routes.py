@@ -51,7 +51,7 @@ class Call:
 
     @property
     def repo(self) -> Repo:
-        """The repo in its path, which it must be allowed to see, and to change if that is what it asks for."""
+        """The repo in its path; one that is private is not there without the token."""
         repo = self.hub.repo(self.names["id"], self.names["kind"])
         if repo.private and not self.known:
             raise Refusal(401, "Repository not found", "RepoNotFound")

@@ -55,6 +55,7 @@ def hub_environment(endpoint: str, home: Path, token: str) -> dict[str, str]:
         "HF_HUB_DISABLE_XET": "1",
         "HF_HUB_DISABLE_TELEMETRY": "1",
         "HF_HUB_DISABLE_UPDATE_CHECK": "1",
+        "HF_UPDATE_DOWNLOAD_COUNTS": "0",  # `datasets` counts at another address
     }
 
 
@@ -69,8 +70,7 @@ def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
     Its constants are replaced in every module that has copied them, and the endpoint of the two clients that it makes
     on import; its HTTP session and the cached filesystems are dropped on the way in and out.
     """
-    changes = {name: (_constant(name), value) for name, value in _constants(variables).items()}
-    before = constants.ENDPOINT
+    changes, before = _changes(variables), constants.ENDPOINT
     with environment({**variables, **dict.fromkeys(NOT_FOR_A_TEST)}):
         try:
             _replace(changes)
@@ -81,15 +81,13 @@ def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
             _restart(before)
 
 
-def _constants(variables: Mapping[str, str]) -> dict[str, Any]:
+def _changes(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
+    """Old and new values of constants, by name."""
     endpoint, home = variables["HF_ENDPOINT"], variables["HF_HOME"]
-    return {
+    values = {
         "ENDPOINT": endpoint,
-        "HF_ENDPOINT": endpoint,  # of `datasets`, as is the next
-        "HUB_DATASETS_URL": endpoint + "/datasets/{repo_id}/resolve/{revision}/{path}",
         "HUGGINGFACE_CO_URL_TEMPLATE": endpoint + "/{repo_id}/resolve/{revision}/{filename}",
         "HF_URL_HOSTS": constants.HF_URL_HOSTS | {"127.0.0.1"},
-        "_HUB_ORIGINS": _http._HUB_ORIGINS | {_http._url_origin(endpoint)},
         "HF_HOME": home,
         "HF_HUB_CACHE": variables["HF_HUB_CACHE"],
         "HUGGINGFACE_HUB_CACHE": variables["HF_HUB_CACHE"],
@@ -102,14 +100,15 @@ def _constants(variables: Mapping[str, str]) -> dict[str, Any]:
         "HF_HUB_DISABLE_TELEMETRY": True,
         "HF_HUB_OFFLINE": False,
     }
-
-
-def _constant(name: str) -> Any:
-    if name == "_HUB_ORIGINS":
-        return _http._HUB_ORIGINS
-    if name == "HUB_DATASETS_URL":
-        return constants.ENDPOINT + "/datasets/{repo_id}/resolve/{revision}/{path}"
-    return constants.ENDPOINT if name == "HF_ENDPOINT" else getattr(constants, name)
+    path, counts = "/datasets/{repo_id}/resolve/{revision}/{path}", "HF_UPDATE_DOWNLOAD_COUNTS"
+    of_datasets = {
+        "HF_ENDPOINT": (constants.ENDPOINT, endpoint),
+        "HUB_DATASETS_URL": (constants.ENDPOINT + path, endpoint + path),
+        counts: (getattr(sys.modules.get("datasets.config"), counts, True), False),
+    }
+    origins = _http._HUB_ORIGINS, _http._HUB_ORIGINS | {_http._url_origin(endpoint)}
+    replaced = {name: (getattr(constants, name), value) for name, value in values.items()}
+    return replaced | of_datasets | {"_HUB_ORIGINS": origins}
 
 
 def _replace(changes: Mapping[str, tuple[Any, Any]]) -> None:
