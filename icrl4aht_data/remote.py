@@ -29,7 +29,7 @@ from icrl4aht_data.files import file_in_place_of
 from icrl4aht_data.info import read_info
 from icrl4aht_data.manifest import file_hash, inside, parse_manifest
 from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.transport import Patience, Store
+from icrl4aht_data.transport import HubStore, Patience, Store
 
 _OPENED = (INFO, HISTORIES, TASKS, PROVENANCE)
 """What opening a release reads."""
@@ -253,9 +253,9 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     match = _HUB.fullmatch(url)
     if match is None:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
-    store = Store(f"hf://datasets/{match['repo']}", patience)
     try:
-        path = store.patiently(MANIFEST, lambda: _from_hub(url, MANIFEST, match["revision"]))
+        asking = Store(url, patience)
+        path = asking.patiently(MANIFEST, lambda: _from_hub(url, MANIFEST, match["revision"]))
     except RemoteError as error:
         if error.missing:
             raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
@@ -263,7 +263,7 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     folder, commit = path.parent, path.parent.name
     pinned = f"hf://datasets/{match['repo']}@{commit}"
     manifest = _checked_manifest(path.read_bytes(), pinned)
-    store = Store(pinned, patience)
+    store = HubStore(match["repo"], commit, patience)
     if to is not None:
         _write_once(to, path.read_bytes(), pinned)
         return Remote(pinned, commit, to, _beside(to), manifest, store)

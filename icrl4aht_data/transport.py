@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, RemoteError
 
@@ -48,7 +49,7 @@ class Store:
     """Files below an address. May be shared between threads, pickled, and used after a fork.
 
     Args:
-        url: of a folder: https://, s3://, hf://datasets/<org>/<repo>@<revision>, or any other that fsspec opens.
+        url: of a folder: https://, s3://, or any other that fsspec opens; for the Hub see `HubStore`.
         patience: see there.
     """
 
@@ -81,30 +82,32 @@ class Store:
     def size(self, name: str) -> int:
         """Of a file, in bytes."""
 
-        def ask() -> int:
-            size = self._files.info(self._address(name))["size"]
-            if size is None:
-                raise WrongLengthError("the server does not say how long the file is")
-            return int(size)
+        return self.patiently(name, lambda: self._size(name))
 
-        return self.patiently(name, ask)
+    def _size(self, name: str) -> int:
+        size = self._files.info(f"{self.url}/{name}")["size"]
+        if size is None:
+            raise WrongLengthError("the server does not say how long the file is")
+        return int(size)
 
     def _range(self, name: str, start: int, stop: int) -> bytes:
-        # cache_type: the Hub's file system would read five megabytes ahead
-        hub = {"cache_type": "none"} if self.url.startswith("hf://") else {}
-        data = self._files.cat_file(self._address(name), start=start, end=stop, **hub)
+        return self._counted(name, start, stop, self._files.cat_file(f"{self.url}/{name}", start=start, end=stop))
+
+    def _counted(self, name: str, start: int, stop: int, data: bytes) -> bytes:
+        """What a request has given, if it is what was asked for, or a whole file."""
         with self._lock:
             self._traffic.requests += 1
             self._traffic.bytes += len(data)
         if len(data) != stop - start:
-            whole = len(data) >= stop and len(data) == self._files.info(self._address(name))["size"]
-            if not whole:
+            if len(data) < stop or len(data) != self._size(name):
                 raise WrongLengthError(f"asked for bytes {start}..{stop}, got {len(data)} bytes")
             data = data[start:stop]  # a server without ranges
         return data
 
-    def _address(self, name: str) -> str:
-        return f"{self.url}/{name}" if name else self.url
+    @property
+    def _opens(self) -> str:
+        """An address of the kind that the file system is for."""
+        return self.url
 
     @property
     def _files(self) -> Any:
@@ -117,7 +120,8 @@ class Store:
     def _opened(self) -> tuple[int, Any]:
         import fsspec
 
-        scheme = self.url.partition("://")[0]
+        url = self._opens
+        scheme = url.partition("://")[0]
         options: dict[str, Any] = {"skip_instance_cache": True, "use_listings_cache": False}
         if scheme in ("http", "https"):
             import aiohttp
@@ -126,10 +130,8 @@ class Store:
             options["client_kwargs"] = {"timeout": timeout}
         elif scheme == "s3":
             options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT}
-        elif scheme == "hf":
-            options = {"skip_instance_cache": True}
         try:
-            return os.getpid(), fsspec.url_to_fs(self.url, **options)[0]
+            return os.getpid(), fsspec.url_to_fs(url, **options)[0]
         except ImportError as error:
             extra = {"s3": "s3"}.get(scheme)
             remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
@@ -162,14 +164,73 @@ class Store:
             if not isinstance(error, FileNotFoundError) and _status(error) != 404:
                 tried = f" ({self.patience.attempts} attempts)" if _passes(error) else ""
                 raise RemoteError(
-                    f"{self._address(name)}: {_in_words(error)}{tried}; what has arrived is kept: try again to go on"
+                    f"{self.url}/{name}: {_in_words(error)}{tried}; what has arrived is kept: try again to go on"
                 ) from error
-            raise RemoteError(f"{self._address(name)}: the remote has no such file", missing=True) from error
+            raise RemoteError(f"{self.url}/{name}: the remote has no such file", missing=True) from error
 
     def _wait(self, state: Any) -> float:
         error = state.outcome.exception()
         doubled = self.patience.first * 2 ** (state.attempt_number - 1)
         return min(max(doubled, _retry_after(error)), self.patience.longest)
+
+
+class HubStore(Store):
+    """Files of a dataset repository of the Hub at one commit.
+
+    The Hub answers for a large file with the place where it lies; that is asked for once and then read by ranges, which
+    is one request each.
+
+    Args:
+        repo: <org>/<repo>.
+        commit: all 40 digits.
+        patience: see `Patience`.
+    """
+
+    def __init__(self, repo: str, commit: str, patience: Patience | None = None) -> None:
+        super().__init__(f"hf://datasets/{repo}@{commit}", patience)
+        self._repo, self._commit = repo, commit
+        self._places: dict[str, Any] = {}
+
+    def __getstate__(self) -> tuple:
+        return self._repo, self._commit, self.patience
+
+    def __setstate__(self, state: tuple) -> None:
+        self.__init__(*state)
+
+    @property
+    def _opens(self) -> str:
+        return "https://"
+
+    def _place(self, name: str) -> Any:
+        """The Hub's metadata of a file: `location` and `size`."""
+        from huggingface_hub import get_hf_file_metadata, hf_hub_url
+
+        if name not in self._places:
+            url = hf_hub_url(self._repo, name, repo_type="dataset", revision=self._commit)
+            self._places[name] = get_hf_file_metadata(url)
+        return self._places[name]
+
+    def _size(self, name: str) -> int:
+        size = self._place(name).size
+        if size is None:
+            raise WrongLengthError("the Hub does not say how long the file is")
+        return int(size)
+
+    def _range(self, name: str, start: int, stop: int) -> bytes:
+        from huggingface_hub import constants
+        from huggingface_hub.utils import build_hf_headers
+
+        place = self._place(name).location
+        of_hub = urlsplit(place).netloc == urlsplit(constants.ENDPOINT).netloc
+        headers = build_hf_headers() if of_hub else {}  # the token is nobody else's business
+        try:
+            data = self._files.cat_file(place, start=start, end=stop, headers=headers)
+        except Exception as error:
+            if _status(error) in (401, 403, 404, 410) and not of_hub:  # the place is lent for a while
+                self._places.pop(name, None)
+                raise ConnectionError(f"{name}: its place at the Hub has changed") from None
+            raise
+        return self._counted(name, start, stop, data)
 
 
 def _passes(error: BaseException) -> bool:
