@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,15 @@ def _filters(command: Any) -> Any:
     for name in ("teammate-kind", "teammate-family", "track", "split", "layout"):
         command = click.option(f"--{name}", multiple=True, help=f"Only this {name}; may be given again.")(command)
     return command
+
+
+@contextmanager
+def _bars(quiet: bool, *names: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Progress of several things by name, on a terminal only."""
+    console = Console(stderr=True)
+    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
+        tasks = {name: bars.add_task(name, total=None) for name in names}
+        yield lambda what, done, total: bars.update(tasks[what], completed=done, total=total)
 
 
 def _load(root: Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
@@ -147,12 +158,8 @@ def verify(root: Path | None, deep: bool, quiet: bool, as_json: bool) -> None:
     """Verify a release: hashes, chunk checksums, counts, ranges. Exits with 1 if anything is wrong."""
     from icrl4aht_data.verify import verify_release
 
-    console = Console(stderr=True)
-    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
-        tasks = {name: bars.add_task(name, total=None) for name in ("files", "histories")}
-        report = verify_release(
-            root, deep=deep, advance=lambda what, done, total: bars.update(tasks[what], completed=done, total=total)
-        )
+    with _bars(quiet, "files", "histories") as advance:
+        report = verify_release(root, deep=deep, advance=advance)
     if as_json:
         click.echo(json.dumps(report.to_json(), indent=2))
     else:
@@ -239,6 +246,39 @@ def combine(out: Path, releases: tuple[Path, ...], data_version: str | None, qui
     if not quiet:
         click.echo(f"release: {out}")
         print_statistics(read_info(out), Console())
+
+
+@cli.group()
+def release() -> None:
+    """Make releases ready for other people."""
+
+
+@release.command()
+@click.argument("source", nargs=-1, type=click.Path(path_type=Path), metavar="[SOURCE]")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--link", is_flag=True, help="Hard links instead of copies: no space, but both change if one is changed.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@_json
+def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json: bool) -> None:
+    """Build the release OUT for publication: all of SOURCE, a release, and what people and tools look for beside it.
+
+    That is README.md with a dataset card, figures, the index as Parquet for viewers, croissant.json, LICENSE,
+    CITATION.cff, cards of the learned teammates and a new manifest. SOURCE is verified first; by default it is the
+    bundled mini release.
+    """
+    from icrl4aht_data.publish import build_release
+    from icrl4aht_data.release import read_manifest
+
+    if len(source) > 1:
+        raise click.UsageError("give one SOURCE at most, then OUT")
+    with _bars(quiet, "files", "histories", "copying") as advance:
+        build_release(source[0] if source else None, out, link=link, advance=advance)
+    files = list(read_manifest(out))
+    size = sum((out / name).stat().st_size for name in files)
+    if as_json:
+        click.echo(json.dumps({"release": str(out), "files": files, "bytes": size}, indent=2))
+    elif not quiet:
+        click.echo(f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}")
 
 
 def run(command: click.Command) -> None:

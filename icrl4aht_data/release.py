@@ -17,8 +17,9 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
-from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import file_in_place_of, write_json
+from icrl4aht_data.dataset_card import dataset_card
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.files import file_in_place_of, read_text, write_json
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
@@ -42,6 +43,9 @@ from icrl4aht_data.schema import (
 from icrl4aht_data.shard import stored_bytes, write_shard
 from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import NamedTask, Task, write_tasks
+
+CARD = "README.md"
+"""What a release is, for people."""
 
 SHARD_BYTES = 256 * 2**20
 """The size that shards should have, where there is data enough."""
@@ -109,7 +113,7 @@ def write_release(
     tasks: Iterable[NewTask],
     *,
     data_version: str,
-    card: str,
+    card: str | None = None,
     kept_steps: int = KEPT_STEPS,
     shard_histories: int = 1024,
     shard_bytes: int = SHARD_BYTES,
@@ -123,7 +127,7 @@ def write_release(
             (no states; an unfinished episode may end a history).
         tasks: what to write; histories are numbered in this order.
         data_version: SemVer of the data.
-        card: README.md of the release.
+        card: README.md of the release; by default it is made of what the release says, see `dataset_card`.
         kept_steps: steps of every episode.
         shard_histories: at most this many histories a shard.
         shard_bytes: about how large a shard should be, judged by the first history of each layout.
@@ -193,7 +197,7 @@ def _fill(
     kind: Kind,
     tasks: list[NewTask],
     data_version: str,
-    card: str,
+    card: str | None,
     kept_steps: int,
     shard_limits: tuple[int, int],
     done: Callable[[Task], None],
@@ -228,7 +232,7 @@ def _fill(
     write_json(root / PROVENANCE, provenance)
     statistics = layout_statistics(root, entries, given, provenance, kept_steps)
     write_json(root / INFO, describe(kind, data_version, kept_steps, entries) | {"statistics": statistics})
-    (root / "README.md").write_text(card, encoding="utf-8")
+    (root / CARD).write_text(dataset_card(root) if card is None else card, encoding="utf-8")
     write_manifest(root)
 
 
@@ -345,6 +349,21 @@ def write_manifest(root: Path) -> None:
     lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
     with file_in_place_of(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")
+
+
+def read_manifest(root: Path) -> dict[str, str]:
+    """path below the root -> SHA-256, as a release's manifest says.
+
+    Raises:
+        IndexFormatError: if it is missing or a line is malformed.
+    """
+    digests = {}
+    for number, line in enumerate(read_text(root / MANIFEST).splitlines(), start=1):
+        digest, separator, name = line.partition("  ")
+        if len(digest) != 64 or not separator or not name:
+            raise IndexFormatError(f"{root / MANIFEST}, line {number}: expected '<sha256>  <path>', found {line!r}")
+        digests[name] = digest
+    return digests
 
 
 def file_hash(path: Path) -> str:
