@@ -281,6 +281,32 @@ def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json:
         click.echo(f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}")
 
 
+@cli.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("address", metavar="hf://datasets/ORG/REPO")
+@click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done; change nothing.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@_json
+def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool, as_json: bool) -> None:
+    """Upload the release FOLDER to a dataset repository of the Hugging Face Hub, and tag it with the data version.
+
+    The release is verified first, the repository made if there is none. An upload that was cut off goes on with the
+    same command. Afterwards what the repository holds is compared with the manifest; only then it is tagged. A tag
+    never moves: other data need another version. `hf auth login` gives the token.
+    """
+    from icrl4aht_data.upload import upload_release
+
+    with _bars(quiet, "files", "histories") as advance:
+        done = upload_release(
+            folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
+        )
+    if as_json:
+        click.echo(json.dumps(done.to_json(), indent=2))
+    elif not quiet:
+        click.echo("\n".join(done.in_words()))
+
+
 def run(command: click.Command) -> None:
     """Run a command line; what is wrong with the input becomes one line and exit code 1."""
     try:

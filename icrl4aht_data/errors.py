@@ -74,5 +74,9 @@ class FormatTooOldError(ReleaseError):
     """The release was written in an older format than this package reads."""
 
 
+class UploadError(Icrl4ahtError):
+    """A Hub repository did not take a release, or holds something else than it; names the repository."""
+
+
 class TaskFormatError(Icrl4ahtError, ValueError):
     """A task line is malformed."""
