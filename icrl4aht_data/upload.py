@@ -265,7 +265,7 @@ def _explained(repo: str, endpoint: str) -> Iterator[None]:
         cause = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error
         status = getattr(getattr(cause, "response", None), "status_code", None)
         remedy = "what was sent stays there: go on with the same command"
-        if status in (401, 403) or isinstance(cause, LocalTokenNotFoundError):
+        if status in (401, 403) or isinstance(cause, (LocalTokenNotFoundError, PermissionError)):
             remedy = f"expected a token that may write to {repo.split('/')[0]}: `hf auth login`, or set HF_TOKEN"
         elif isinstance(cause, ValueError):
             remedy = "correct it, then give the same command"
