@@ -11,7 +11,8 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import parse_json, read_text
-from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, file_hash, write_release
+from icrl4aht_data.manifest import file_hash
+from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
 from icrl4aht_data.tasks import Task, named_task, read_tasks

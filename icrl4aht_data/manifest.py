@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
@@ -53,6 +54,15 @@ def file_hash(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
+    """Whether every file (path in the folder -> SHA-256) is as it was.
+
+    Raises:
+        OSError: if one cannot be read.
+    """
+    return all(file_hash(folder / name) == digest for name, digest in files.items())
 
 
 def is_inside(name: str) -> bool:

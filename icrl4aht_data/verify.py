@@ -140,18 +140,20 @@ def verify_release(
 
 def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Names]) -> None:
     listed = _manifest(origin, report)
-    chosen: set[str] | None = None
+    chosen, unreadable = set(listed), None
     try:
         chosen = chosen_files(origin, **wanted)
     except (EmptySelectionError, UnknownNameError):
         raise
     except Icrl4ahtError as error:
-        report.add("meta", str(error))
-    expected = listed.keys() if chosen is None else listed.keys() & chosen
+        unreadable = error
     if origin.remote is not None and not report.quick:
-        _fetch(origin.remote, sorted(expected), report, advance)
-    _check_files(origin, {name: listed[name] for name in expected}, listed.keys(), report, advance)
-    if chosen is None:
+        _fetch(origin.remote, sorted(chosen), report, advance)
+    _check_files(
+        origin, {name: digest for name, digest in listed.items() if name in chosen}, listed.keys(), report, advance
+    )
+    if unreadable is not None:
+        report.add("meta", str(unreadable))
         return
     index = read_index(origin)
     tasks = read_tasks(inside(origin.folder, TASKS))

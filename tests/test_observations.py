@@ -23,9 +23,10 @@ from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.convert import PUBLISHED_FIELDS, from_published, to_published, to_release
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
 from icrl4aht_data.interop import hf_episodes
+from icrl4aht_data.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.release import NewHistory, NewTask, write_manifest, write_release
+from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import KINDS
 from icrl4aht_data.shard import chunk_table_path
 from icrl4aht_data.tasks import write_tasks
