@@ -151,9 +151,9 @@ def _take(source: Path, target: Path, link: bool) -> None:
 
 
 def _keep_source_card(source: Path, root: Path) -> None:
-    """Keep a card that was not made by filling the template, which begins with YAML."""
+    """Keep a card that was not made by filling the template, which begins with YAML, unless one is kept already."""
     text = read_text(source / CARD) if (source / CARD).is_file() else ""
-    if text and not text.startswith("---\n"):
+    if text and not text.startswith("---\n") and not (root / SOURCE_CARD).exists():
         (root / SOURCE_CARD).write_text(text, encoding="utf-8")
 
 

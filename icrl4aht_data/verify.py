@@ -48,7 +48,6 @@ from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import Task, read_tasks
 from icrl4aht_data.transport import Traffic
 
-
 _OF_THE_HUB = (".gitattributes", ".cache/huggingface/")
 """What its own tools put beside a repository's files."""
 

@@ -21,6 +21,7 @@ from plays import play, random_release
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.cards import card_file, fill
 from icrl4aht_data.cli import cli
+from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.dataset_card import dataset_card, evaluated_on, size_category
 from icrl4aht_data.descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
@@ -111,6 +112,29 @@ def test_it_holds_the_source_and_is_whole(release, published):
 def test_built_of_a_built_one_it_is_the_same(published, tmp_path):
     again = build_release(published, tmp_path / "again", published=DAY)
     assert (again / "MANIFEST.sha256").read_bytes() == (published / "MANIFEST.sha256").read_bytes()
+
+
+def test_a_combination_of_built_ones_says_of_what(published, tmp_path):
+    random_release(tmp_path / "other", "full", ("demo_wide",))
+    both = combine_releases(tmp_path / "both", [published, tmp_path / "other"])
+    card = (both / "README.md").read_text()
+    assert card.count("SHA-256 of its manifest") == 2
+    assert "# test\n" in card and "12 histories of 6 tasks" in card
+    assert "pretty_name" not in card and "![" not in card
+    out = build_release(both, tmp_path / "out")
+    assert verify_release(out).ok
+    assert (out / "meta/source_card.md").read_text() == card
+
+
+def test_links_are_not_written_through(published, tmp_path):
+    """A built release whose card somebody rewrote."""
+    source = tmp_path / "source"
+    shutil.copytree(published, source)
+    (source / "README.md").write_text("# mine\n")
+    write_manifest(source)
+    build_release(source, tmp_path / "linked", link=True)
+    assert verify_release(source).ok
+    assert verify_release(tmp_path / "linked").ok
 
 
 def test_links_cost_no_space(release, tmp_path):
