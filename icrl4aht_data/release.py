@@ -18,8 +18,8 @@ from filelock import FileLock, Timeout
 from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.dataset_card import dataset_card
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import write_json
-from icrl4aht_data.manifest import write_manifest
+from icrl4aht_data.files import plain_size, write_json
+from icrl4aht_data.manifest import inside, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
@@ -48,6 +48,9 @@ CARD = "README.md"
 
 SHARD_BYTES = 256 * 2**20
 """The size that shards should have, where there is data enough."""
+
+CHECKPOINT_BYTES = 64 * 2**20
+"""Of each file of a learned teammate: sixty times what the paper's network takes."""
 
 
 @dataclass(frozen=True)
@@ -94,15 +97,23 @@ def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
     return folder / (theta["sha256"] if (folder / theta["sha256"]).is_dir() else theta["checkpoint"])
 
 
-def checkpoint_files(folder: Path, task: Task) -> dict[str, Path]:
+def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict[str, Path]:
     """The files of a task's learned teammate by their path in a release; none for a heuristic, or where there are none.
 
     Args:
         folder: see `checkpoint_folder`.
+        root: the release that the folder is in, out of which no link may lead.
+
+    Raises:
+        UnsafePathError, IndexFormatError: for what is none of the release's files, or too large for a checkpoint.
     """
     if task.teammate.get("kind") != "rl":
         return {}
     found = sorted(checkpoint_folder(folder, task.teammate).glob("policy.*"))
+    for path in found:
+        if root is not None:
+            inside(root, path.relative_to(root).as_posix())
+        plain_size(path, CHECKPOINT_BYTES)
     return {f"{TEAMMATES}/{task.teammate['theta']['sha256']}/{path.name}": path for path in found}
 
 

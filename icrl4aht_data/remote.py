@@ -25,9 +25,9 @@ from filelock import FileLock
 from icrl4aht_data.blocks import PartialFile, whole_file
 from icrl4aht_data.cache import data_folder
 from icrl4aht_data.errors import IndexFormatError, OfflineError, OptionError, RemoteError, RootNotFoundError
-from icrl4aht_data.files import file_in_place_of
+from icrl4aht_data.files import file_in_place_of, holds, plain_size
 from icrl4aht_data.info import read_info
-from icrl4aht_data.manifest import file_hash, inside, parse_manifest
+from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, parse_manifest
 from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.transport import HubStore, Patience, Store
 
@@ -67,8 +67,7 @@ class Root:
     def below(self, prefix: str) -> list[str]:
         """The names of the release's files that begin so, fetched first if they are not here."""
         if self.remote is None:
-            found = (path for path in inside(self.folder, prefix.rstrip("/")).rglob("*") if path.is_file())
-            return sorted(path.relative_to(self.folder).as_posix() for path in found)
+            return sorted(prefix + name for name in files_below(inside(self.folder, prefix.rstrip("/"))))
         names = [name for name in self.remote.manifest if name.startswith(prefix)]
         self.remote.fetch(names)
         return names
@@ -174,7 +173,15 @@ class Remote:
         if name.startswith("data/") and name in self._sizes:
             return self._sizes[name]
         path = self.path(name)
-        return path.stat().st_size if path.exists() else self.store.size(name)
+        return path.stat().st_size if path.exists() else self._size_there(name)
+
+    def _size_there(self, name: str) -> int:
+        size = self.store.size(name)
+        if name.startswith("data/"):  # of which the chunk table has to account for every byte
+            return size
+        if not 0 <= size <= LARGEST:
+            raise RemoteError(f"{self.url}/{name}: expected at most {LARGEST:,} bytes, the remote says {size:,}")
+        return size
 
     def sizes(self, names: Sequence[str]) -> dict[str, int]:
         """The same of several files, asked at once."""
@@ -202,11 +209,11 @@ class Remote:
         target, chunks = self.path(name), self._chunks(name)
         if chunks is not None and target.exists():
             in_place = PartialFile(self.store, name, target)
-            whole_file(in_place, self.store.size(name), self.manifest[name], chunks, lambda size: None, keep=True)
+            whole_file(in_place, self._size_there(name), self.manifest[name], chunks, lambda size: None, keep=True)
             return
         part = self.part(name)
         part.path.unlink(missing_ok=True)
-        whole_file(part, self.store.size(name), self.manifest[name], chunks, lambda size: None)
+        whole_file(part, self._size_there(name), self.manifest[name], chunks, lambda size: None)
         target.parent.mkdir(parents=True, exist_ok=True)
         with file_in_place_of(target) as new:
             shutil.move(part.path, new)
@@ -227,6 +234,7 @@ class HubRemote(Remote):
 
     def _fetch_one(self, name: str, advance: Advance) -> None:
         expected, found = self.manifest[name], ""
+        most = self._sizes.get(name, LARGEST) if name.startswith("data/") else LARGEST
         for _ in range(2):
             arrived = 0
 
@@ -235,7 +243,9 @@ class HubRemote(Remote):
                 arrived += size
                 advance(size)
 
-            target = self.store.patiently(name, lambda count=count: _from_hub(self.url, name, self.revision, count))
+            target = self.store.patiently(
+                name, lambda count=count: _from_hub(self.url, name, self.revision, most, count)
+            )
             advance(target.stat().st_size - arrived)
             found = file_hash(target)
             if found == expected:
@@ -255,7 +265,8 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
     try:
         asking = Store(url, patience)
-        path = asking.patiently(MANIFEST, lambda: _from_hub(url, MANIFEST, match["revision"]))
+        path = asking.patiently(MANIFEST, lambda: _from_hub(url, MANIFEST, match["revision"], _MANIFEST_BYTES))
+        plain_size(path, _MANIFEST_BYTES)
     except RemoteError as error:
         if error.missing:
             raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
@@ -270,8 +281,8 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     return HubRemote(pinned, commit, folder, data_folder() / _slug(url) / f"{commit}.partial", manifest, store)
 
 
-def _from_hub(url: str, name: str, revision: str | None, advance: Advance = lambda size: None) -> Path:
-    """A file of a repository in the Hub's cache."""
+def _from_hub(url: str, name: str, revision: str | None, most: int, advance: Advance = lambda size: None) -> Path:
+    """A file of a repository in the Hub's cache, which takes at most so many bytes."""
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import LocalEntryNotFoundError
     from tqdm import tqdm
@@ -281,9 +292,14 @@ def _from_hub(url: str, name: str, revision: str | None, advance: Advance = lamb
             super().__init__(*args, **options | {"disable": True})
 
         def update(self, n: float | None = 1) -> bool | None:
+            nonlocal arrived
+            arrived += int(n or 0)
+            if arrived > most:
+                raise RemoteError(f"{url}/{name}: expected at most {most:,} bytes, and more came")
             advance(int(n or 0))
             return super().update(n)
 
+    arrived = 0
     match = _HUB.fullmatch(url)
     assert match is not None
     where: dict[str, Any] = {"repo_type": "dataset", "revision": revision, "local_files_only": offline()}
@@ -323,8 +339,9 @@ def _asked_manifest(url: str, store: Store) -> bytes:
 
 def _kept_manifest(url: str, folder: Path) -> bytes:
     try:
+        plain_size(folder / MANIFEST, _MANIFEST_BYTES)
         return (folder / MANIFEST).read_bytes()
-    except OSError as error:
+    except (OSError, IndexFormatError) as error:
         raise OfflineError(f"{url}: offline, and nothing of this release is here; go online to fetch it") from error
 
 
@@ -342,7 +359,7 @@ def _checked_manifest(text: bytes, url: str) -> dict[str, str]:
 def _write_once(folder: Path, text: bytes, url: str) -> None:
     """The manifest into the mirror, which holds files of this manifest alone."""
     path = folder / MANIFEST
-    if path.exists() and path.read_bytes() != text:
+    if path.exists() and not holds(path, text):
         raise OptionError(f"{folder}: holds another release or version than {url} now; give another folder")
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)

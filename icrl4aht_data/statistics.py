@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from operator import mul
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +54,10 @@ def _of_layout(
     lengths = {entry.task_id: entry.T for entry in entries}
     steps = [entry.T for entry in entries]
     streams = [provenance.get(task_id, {}).get(STREAMS_RECORDED) for task_id in lengths]
+    known = all(type(number) is int and 0 <= number < 2**31 for number in streams)
     teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
     return {
-        "original_transitions": None if None in streams else int(np.dot(streams, list(lengths.values()))),
+        "original_transitions": sum(map(mul, streams, lengths.values())) if known else None,
         "filtered_transitions": sum(steps),
         "history_length": [min(steps), max(steps)],
         "teammates": len(teammates) or None,

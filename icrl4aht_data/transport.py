@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ T = TypeVar("T")
 _PASSING = {408, 425, 429, 500, 502, 503, 504}
 _LASTING = (FileNotFoundError, PermissionError, Icrl4ahtError, ImportError, NotImplementedError, MemoryError, TypeError)
 _TIMEOUT = 30  # seconds without a byte, or until a connection
+_TOTAL = 300  # seconds for a request, of a server that sends a byte now and then
+_WHOLE = 64 * 2**20  # bytes taken from a server that gives all of a file instead of a range
 
 
 @dataclass(frozen=True)
@@ -126,8 +129,8 @@ class Store:
         if scheme in ("http", "https"):
             import aiohttp
 
-            timeout = aiohttp.ClientTimeout(total=None, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
-            options["client_kwargs"] = {"timeout": timeout}
+            timeout = aiohttp.ClientTimeout(total=_TOTAL, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
+            options["client_kwargs"] = {"timeout": timeout, "response_class": _bounded_response()}
         elif scheme == "s3":
             options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT}
         try:
@@ -230,6 +233,27 @@ class HubStore(Store):
                 raise ConnectionError(f"{name}: its place at the Hub has changed") from None
             raise
         return self._counted(name, start, stop, data)
+
+
+def _bounded_response() -> type:
+    """aiohttp's response, but that it takes no longer body than was asked for: a hostile server's has no end."""
+    from aiohttp import ClientResponse
+
+    class BoundedResponse(ClientResponse):
+        async def read(self) -> bytes:
+            if self._body is None:
+                asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.request_info.headers.get("Range", ""))
+                most = int(asked[2]) - int(asked[1]) + 1 if asked and self.status == 206 else _WHOLE
+                body = bytearray()
+                async for part in self.content.iter_any():
+                    body += part
+                    if len(body) > most:
+                        self.close()
+                        raise WrongLengthError(f"expected at most {most:,} bytes, and more came")
+                self._body = bytes(body)
+            return self._body
+
+    return BoundedResponse
 
 
 def _passes(error: BaseException) -> bool:
