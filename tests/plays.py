@@ -88,3 +88,9 @@ def random_release(
         root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
     )
     return written
+
+
+def equal_batches(first: tuple, second: tuple) -> bool:
+    """Whether two batches have the same arrays, and lack the same ones."""
+    pairs = zip(first, second, strict=True)
+    return all((ours is None and theirs is None) or np.array_equal(ours, theirs) for ours, theirs in pairs)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from plays import equal_batches
 from servers import Cut, http_server, hub_server
 
 from benchmarks import bench_remote
@@ -46,10 +47,6 @@ def served(request, lite) -> Iterator[str]:
         yield url
 
 
-def same(first, second) -> bool:
-    return all(a is b is None or np.array_equal(a, b) for a, b in zip(first, second, strict=True))
-
-
 def in_part(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -74,10 +71,10 @@ def test_batches_are_the_same_however_held(lite, cache):
                 assert remote.cache.cache == "stream" and "are not downloaded" in remote.cache.reason
             asked = {"batch_size": 16, "seed": 3, "teammate_actions": True}
             for i in range(2):
-                assert same(remote.ad(length=30, **asked)[i], local.ad(length=30, **asked)[i])
+                assert equal_batches(remote.ad(length=30, **asked)[i], local.ad(length=30, **asked)[i])
                 for order in ("contiguous", "random"):
                     options = {"context": 25, "order": order, **asked}
-                    assert same(remote.dpt(**options)[i], local.dpt(**options)[i])
+                    assert equal_batches(remote.dpt(**options)[i], local.dpt(**options)[i])
 
 
 @pytest.mark.parametrize("kind", ["http", "s3", "hub"])
@@ -113,7 +110,7 @@ def test_datasets_travel_between_processes(lite):
     with http_server(lite[0]) as server:
         remote = pickle.loads(pickle.dumps(load_icrl4aht(server.url, layout="demo_wide")))
         local = load_icrl4aht(lite[0], layout="demo_wide")
-        assert same(remote.ad(batch_size=4, length=30)[0], local.ad(batch_size=4, length=30)[0])
+        assert equal_batches(remote.ad(batch_size=4, length=30)[0], local.ad(batch_size=4, length=30)[0])
 
 
 def test_a_part_is_downloaded(served, lite, folders):
@@ -126,7 +123,7 @@ def test_a_part_is_downloaded(served, lite, folders):
     assert again.absent == [] and again.files == plan.files
     dataset = load_icrl4aht(served, layout="demo_wide")
     assert dataset.cache.cache == "ram"
-    assert same(
+    assert equal_batches(
         dataset.ad(batch_size=4, length=30)[0],
         load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)[0],
     )
@@ -197,7 +194,7 @@ def test_the_stream_cache_is_bounded(many, monkeypatch, folders):
             dataset = load_icrl4aht(server.url, layout=layout, obs="state")
             for i in range(6):
                 expected = load_icrl4aht(many, layout=layout, obs="state").ad(batch_size=16, length=500)[i]
-                assert same(dataset.ad(batch_size=16, length=500)[i], expected)
+                assert equal_batches(dataset.ad(batch_size=16, length=500)[i], expected)
                 kept = sum(path.stat().st_blocks * 512 for path in folders.glob("*/*.partial/**/*") if path.is_file())
                 assert kept <= 300_000 + 100_000
 
@@ -211,7 +208,7 @@ def test_offline(served, lite, monkeypatch, variable):
     fetch_planned(plan_download(served, layout="demo_wide"))
     monkeypatch.setenv(variable, "1")
     remote = load_icrl4aht(served, layout="demo_wide")
-    assert same(
+    assert equal_batches(
         remote.ad(batch_size=4, length=30)[0], load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)[0]
     )
     missing = load_icrl4aht(served, layout="coord_simple", cache="ram")

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from huggingface_hub import DatasetCard, ModelCard, snapshot_download
-from plays import random_release
+from plays import equal_batches, random_release
 from servers import Hub, Request, Slow, Status, hub_server, uploads
 
-from icrl4aht_data import verify_release
+from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.cards import fill
 from icrl4aht_data.cli import cli
 from icrl4aht_data.errors import OptionError, ReleaseError, UploadError
@@ -254,3 +254,12 @@ def test_json_says_it_all(hub, published):
     assert done["done"] == "uploaded"
     assert done["bytes"] == sum((published / name).stat().st_size for name in done["files"])
     assert done["url"] == f"{hub.endpoint}/datasets/{REPO}"
+
+
+def test_what_was_uploaded_loads(hub, published, tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    done = upload_release(published, ADDRESS)
+    there, here = (load_icrl4aht(root, layout="demo_wide") for root in (f"{ADDRESS}@v0.0.1", published))
+    assert str(there.origin) == f"{ADDRESS}@{done.commit}" and there.info == here.info
+    assert equal_batches(there.ad(batch_size=4, length=30)[0], here.ad(batch_size=4, length=30)[0])
+    assert verify_release(f"{ADDRESS}@v0.0.1", deep=True).ok
