@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import TEXT_BYTES, plain_size, read_text
-from icrl4aht_data.manifest import inside
-from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, file_hash, write_release
+from icrl4aht_data.manifest import file_hash, inside
+from icrl4aht_data.release import CARD, NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
 from icrl4aht_data.tasks import Task, named_task, read_provenance, read_tasks
@@ -143,7 +144,12 @@ def _card(datasets: Sequence[Dataset]) -> str:
         f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
         for dataset in datasets
     )
-    cards = "\n".join(read_text(dataset.origin.file("README.md")) for dataset in datasets)
+    cards = "\n".join(_text_of_card(read_text(dataset.origin.file(CARD))) for dataset in datasets)
     return (
         f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
     )
+
+
+def _text_of_card(card: str) -> str:
+    """Without YAML, which may stand only at a file's beginning, and pictures, which do not go along."""
+    return re.sub(r"\A---\n(?s:.*?)\n---\n|^!\[.*\n\n?", "", card, flags=re.MULTILINE)

@@ -23,7 +23,7 @@ from icrl4aht_data.combine import Deferred, release_tasks, stored_task
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.draws import whole
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
-from icrl4aht_data.files import file_in_place_of, parse_json, read_lines, read_text, write_json
+from icrl4aht_data.files import file_in_place_of, parse_json, read_lines, write_json
 from icrl4aht_data.manifest import inside
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
@@ -31,6 +31,7 @@ from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import (
     ACTION_FIELDS,
     FIELDS,
+    JSON_TYPES,
     KINDS,
     OBSERVATIONS,
     PROVENANCE,
@@ -118,7 +119,6 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
         kind,
         tasks,
         data_version=dataset.info["data_version"],
-        card=read_text(dataset.origin.file("README.md")),
         kept_steps=dataset.info["environment"]["kept_steps"],
     )
 
@@ -242,13 +242,7 @@ def from_published(
             NewTask(task, provenance.get(task.task_id, {}), len(members), lambda members=members: load(members))
             for task, members in _tasks_of(groups, source, tasks, made)
         ]
-        card = f"# Converted from {HISTORIES_H5}\n"
-        if made == OBSERVATIONS:
-            card += (
-                "\nObservations only: no state records, so nothing can be replayed or drawn. The files do not name the "
-                "recipes that were cooked; those in `meta/info.json` are the layouts' usual ones.\n"
-            )
-        write_release(target, made, new, data_version=data_version, card=card, kept_steps=kept_steps)
+        write_release(target, made, new, data_version=data_version, kept_steps=kept_steps)
     return made
 
 
@@ -397,7 +391,9 @@ def to_parquet(dataset: Dataset, path: Path) -> Path:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise OptionError("Parquet needs pyarrow: pip install icrl4aht-data[hf]") from error
-    with_rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries])
+    types = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_(), list: pa.list_(pa.int64())}
+    columns = {name: next(types[kind] for kind in types if kind in kinds) for name, kinds in JSON_TYPES.items()}
+    rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], pa.schema(list(columns.items())))
     with file_in_place_of(path) as partial:
-        pq.write_table(with_rows, partial)
+        pq.write_table(rows, partial)
     return path

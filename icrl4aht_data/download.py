@@ -84,7 +84,7 @@ def plan_download(
         raise OptionError(f"{url}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
     root = open_root(url, to, patience)
     assert root.remote is not None
-    names = sorted(chosen_files(root, **wanted) & root.remote.manifest.keys())
+    names = sorted(chosen_files(root, **wanted))
     absent = [name for name in names if not root.is_here(name)]
     return Plan(root, root.remote.sizes(names), absent)
 
@@ -117,7 +117,7 @@ def chosen_files(root: Root, **wanted: str | Iterable[str] | None) -> set[str]:
     every = set(index.values("shard"))
     shards = _selected(index, **wanted) if any(wanted.values()) else every
     others = every - shards
-    chosen = set(listed) - others - {chunk_table_name(name) for name in others}
+    chosen = (set(listed) | shards) - others - {chunk_table_name(name) for name in others}
     if any(wanted.values()) or root.remote is not None or not (root.folder / ORIGIN).exists():
         return chosen
     asked = set(_noted(root.folder)["files"])

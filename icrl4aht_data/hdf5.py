@@ -86,7 +86,7 @@ def filters(dataset: Any) -> list[int]:
     if made.get_layout() == h5d.VIRTUAL or made.get_external_count():
         raise ValueError(f"{dataset.name}: keeps its values in other files")
     if _kind(dataset.id) not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) or dataset.id.get_type().get_size() > _ELEMENT_BYTES:
-        raise ValueError(f"{dataset.name}: expected numbers, or small arrays of them")
+        raise ValueError(f"{dataset.name}: expected numbers, or small arrays of them, found {dataset.dtype}")
     return [made.get_filter(number)[0] for number in range(made.get_nfilters())]
 
 

@@ -7,7 +7,7 @@ import os
 import re
 import stat
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
@@ -72,6 +72,15 @@ def file_hash(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
+    """Whether every file (path in the folder -> SHA-256) is as it was.
+
+    Raises:
+        OSError: if one cannot be read.
+    """
+    return all(file_hash(folder / name) == digest for name, digest in files.items())
 
 
 def files_below(folder: Path) -> Iterator[str]:

@@ -69,14 +69,22 @@ def _of_layout(
     }
 
 
+def statistics_rows(statistics: dict[str, dict[str, Any]]) -> list[list[str]]:
+    """The table in words: a row per property, which names it and has a cell per layout."""
+    return [
+        [label, *(_in_words(name, of_layout[name]) for of_layout in statistics.values())]
+        for name, label in _ROWS.items()
+    ]
+
+
 def print_statistics(info: dict[str, Any], console: Console) -> None:
     """The table of a release's meta/info.json: a row per property, a column per layout."""
     statistics = info["statistics"]
     table = Table("property", box=box.MARKDOWN, title=f"{info['kind']} release {info['data_version']}")
     for layout in statistics:
         table.add_column(layout, justify="right")
-    for name, label in _ROWS.items():
-        table.add_row(label, *(_in_words(name, of_layout[name]) for of_layout in statistics.values()))
+    for row in statistics_rows(statistics):
+        table.add_row(*row)
     console.print(table, width=max(console.width, 30 + 16 * len(statistics)), crop=False)
 
 

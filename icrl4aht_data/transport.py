@@ -164,11 +164,10 @@ class Store:
         except Exception as error:  # every file system has errors of its own
             if _is_of_disk(error):
                 raise
-            if not isinstance(error, FileNotFoundError) and _status(error) != 404:
+            if not isinstance(_cause(error), FileNotFoundError) and _status(error) != 404:
                 tried = f" ({self.patience.attempts} attempts)" if _passes(error) else ""
-                raise RemoteError(
-                    f"{self.url}/{name}: {_in_words(error)}{tried}; what has arrived is kept: try again to go on"
-                ) from error
+                what = f"{_in_words(_cause(error))}{tried}"
+                raise RemoteError(f"{self.url}/{name}: {what}; what has arrived is kept: try again to go on") from error
             raise RemoteError(f"{self.url}/{name}: the remote has no such file", missing=True) from error
 
     def _wait(self, state: Any) -> float:
@@ -262,7 +261,14 @@ def _passes(error: BaseException) -> bool:
     status = _status(error)
     if status is not None:
         return status in _PASSING
-    return isinstance(error, Exception) and not isinstance(error, _LASTING) and not _is_of_disk(error)
+    return isinstance(error, Exception) and not isinstance(_cause(error), _LASTING) and not _is_of_disk(error)
+
+
+def _cause(error: BaseException) -> BaseException:
+    """What is behind a FileNotFoundError: fsspec makes one of any failure to learn a file's size."""
+    while isinstance(error, FileNotFoundError) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 def _is_of_disk(error: BaseException) -> bool:

@@ -49,6 +49,9 @@ from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import Task, read_provenance, read_tasks
 from icrl4aht_data.transport import Traffic
 
+_OF_THE_HUB = (".gitattributes", ".cache/huggingface/")
+"""What its own tools put beside a repository's files."""
+
 _FINDINGS = 100_000
 _LOST = 100  # shards of one set that are named
 _COPIES = 4  # of a history that checking it takes
@@ -155,18 +158,20 @@ def verify_release(
 
 def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Names]) -> None:
     listed = _manifest(origin, report)
-    chosen: set[str] | None = None
+    chosen, unreadable = set(listed), None
     try:
         chosen = chosen_files(origin, **wanted)
     except (EmptySelectionError, UnknownNameError):
         raise
     except Icrl4ahtError as error:
-        report.add("meta", str(error))
-    expected = listed.keys() if chosen is None else listed.keys() & chosen
+        unreadable = error
     if origin.remote is not None and not report.quick:
-        _fetch(origin.remote, sorted(expected), report, advance)
-    _check_files(origin, {name: listed[name] for name in expected}, listed.keys(), report, advance)
-    if chosen is None:
+        _fetch(origin.remote, sorted(chosen), report, advance)
+    _check_files(
+        origin, {name: digest for name, digest in listed.items() if name in chosen}, listed.keys(), report, advance
+    )
+    if unreadable is not None:
+        report.add("meta", str(unreadable))
         return
     index = read_index(origin)
     tasks = read_tasks(inside(origin.folder, TASKS))
@@ -225,7 +230,8 @@ def _check_index(index: Index, tasks: list[Task], chosen: set[str], report: Repo
     info = index.info
     kept_steps = info["environment"]["kept_steps"]
     expected = describe(info["kind"], info["data_version"], kept_steps, list(index.entries))
-    if report.ok and chosen.issuperset(index.values("shard")) and not report.quick:
+    here = all(name in chosen and (index.root / name).is_file() for name in index.values("shard"))
+    if report.ok and here and not report.quick:
         expected["shards"] = shard_sizes(index.root, index.entries)  # else what they are made of is at fault, or away
         expected["statistics"] = _statistics(index, tasks)
     elif info["shards"].keys() != set(index.values("shard")):
@@ -320,7 +326,8 @@ def _check_files(
         for name in sorted(expected.keys() - present):
             report.add(name, "listed in the manifest, but missing")
     for name in sorted(present - set(listed) - {MANIFEST, ORIGIN}):
-        report.add(name, "not listed in the manifest")
+        if not name.startswith(_OF_THE_HUB):
+            report.add(name, "not listed in the manifest")
     both = sorted(expected.keys() & present)
     for number, name in enumerate(both, start=1):
         try:

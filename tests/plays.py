@@ -88,3 +88,13 @@ def random_release(
         root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
     )
     return written
+
+
+def equal_batches(first: tuple, second: tuple) -> bool:
+    """Whether two batches have the same arrays, and lack the same ones."""
+    for ours, theirs in zip(first, second, strict=True):
+        if (ours is None) != (theirs is None):
+            return False
+        if ours is not None and not np.array_equal(ours, theirs):
+            return False
+    return True

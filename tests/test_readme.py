@@ -9,10 +9,13 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from servers import hub_server, uploads
 
 from baselines.cli import cli as baselines_cli
 from generation.cli import cli as generation_cli
 from icrl4aht_data.cli import cli
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.info import read_info
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -40,11 +43,42 @@ def test_python_snippets(snippet):
     exec(compile(snippet, "README.md", "exec"), {})
 
 
-@pytest.mark.parametrize("arguments", commands("icrl4aht-data"), ids=" ".join)
+def of_a_remote(arguments: list[str]) -> bool:
+    return any("icrl4aht" in argument for argument in arguments)
+
+
+def publishes(arguments: list[str]) -> bool:
+    return arguments[0] in ("release", "upload")
+
+
+@pytest.mark.parametrize(
+    "arguments", [a for a in commands("icrl4aht-data") if not (publishes(a) or of_a_remote(a))], ids=" ".join
+)
 def test_reader_commands(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
+
+
+def test_remote_commands(tmp_path, monkeypatch):
+    """One after the other, from a hub of the test's own that has the bundled release."""
+    monkeypatch.chdir(tmp_path)
+    with hub_server(tmp_path / "hub") as hub:
+        hub.add_repo("you/icrl4aht", MINI, tag=f"v{read_info(MINI)['data_version']}")
+        for arguments in (a for a in commands("icrl4aht-data") if of_a_remote(a) and not publishes(a)):
+            result = CliRunner().invoke(cli, arguments)
+            assert result.exit_code == 0, result.output
+
+
+@uploads
+def test_publishing_commands(tmp_path, monkeypatch):
+    """One after the other, to a hub of the test's own."""
+    monkeypatch.chdir(tmp_path)
+    with hub_server(tmp_path / "hub") as hub:
+        for arguments in filter(publishes, commands("icrl4aht-data")):
+            result = CliRunner().invoke(cli, arguments)
+            assert result.exit_code == 0, result.output
+        assert "README.md" in hub.files("you/icrl4aht")
 
 
 @pytest.mark.parametrize("arguments", commands("python -m generation"), ids=" ".join)

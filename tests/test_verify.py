@@ -8,13 +8,16 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from plays import play, random_release
+from plays import make_tasks, play, random_release
 
 from icrl4aht_data import verify_release
 from icrl4aht_data.cli import cli
-from icrl4aht_data.release import NewHistory, NewTask, write_manifest, write_release
+from icrl4aht_data.manifest import write_manifest
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import Kind
 from icrl4aht_data.shard import chunk_table_path
+from icrl4aht_data.tasks import make_task
 
 SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 
@@ -342,3 +345,21 @@ class TestCommand:
     def test_quiet(self, lite):
         result = CliRunner().invoke(cli, ["verify", "-q", str(lite[0])])
         assert (result.exit_code, result.output) == (0, "")
+
+
+def test_a_shard_that_neither_manifest_nor_folder_has(damaged):
+    (damaged / SHARD).unlink()
+    write_manifest(damaged)
+    assert any("the index names this shard" in problem for problem in problems(damaged))
+
+
+def test_a_teammate_of_training_and_test(tmp_path):
+    rng = np.random.default_rng(0)
+    layout = get_layout("coord_simple")
+    (train,) = make_tasks(["coord_simple"])
+    tasks = [train, make_task("teammate", "test", "coord_simple", train.teammate, 9)]
+    new = [NewTask(task, {}, 1, lambda: [NewHistory(0, play(layout, 6, 20, rng))]) for task in tasks]
+    write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
+    assert problems(tmp_path / "r") == [
+        f"meta/tasks.jsonl: task {tasks[1].task_id!r} (test) has the teammate of {train.task_id!r} (train)"
+    ]
