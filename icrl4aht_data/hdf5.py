@@ -7,7 +7,9 @@ h5py raises; whoever calls names the file.
 from __future__ import annotations
 
 import math
+import mmap
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -21,6 +23,8 @@ h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
+_HEAP = b"GCOL\x01"  # how a heap of texts begins
+_HEAPS, _HEAP_BYTES = 16, 2**16
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
 _ATTRIBUTES = 16
@@ -70,8 +74,38 @@ def attributes(file: h5py.File) -> dict[str, Any]:
         attribute = file.attrs.get_id(name)
         if number == _ATTRIBUTES or attribute.shape or _kind(attribute) not in (h5t.INTEGER, h5t.STRING):
             raise ValueError(f"attribute {name!r}: expected few attributes, single numbers and texts")
+        if _kind(attribute) == h5t.STRING:
+            _check_heaps(Path(file.filename))
         found[name] = file.attrs[name]
     return found
+
+
+def _check_heaps(path: Path) -> None:
+    """Whether the heaps of texts are small and sound: libhdf5 stays for ever at an object whose size adds up to 0.
+
+    Raises:
+        ValueError: if they are not.
+    """
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        at, heaps = data.find(_HEAP), 0
+        while at >= 0:
+            size = int.from_bytes(data[at + 8 : at + 16], "little")
+            if size <= len(data) - at:  # else these bytes are no heap
+                heaps += 1
+                if heaps > _HEAPS or size > _HEAP_BYTES or not _is_sound(data[at : at + size]):
+                    raise ValueError(f"texts at byte {at}: not stored as libhdf5 stores them")
+            at = data.find(_HEAP, at + 1)
+
+
+def _is_sound(heap: bytes) -> bool:
+    """Each object is a number (2 bytes), 6 more, its size (8 bytes) and itself; number 0 is the room that is left."""
+    place = 16
+    while place + 16 <= len(heap):
+        number, size = (int.from_bytes(heap[place + low : place + high], "little") for low, high in ((0, 2), (8, 16)))
+        if number == 0:
+            return place + size == len(heap)
+        place += 16 + -(-size // 8) * 8
+    return place <= len(heap)
 
 
 def filters(dataset: Any) -> list[int]:
