@@ -92,5 +92,9 @@ def random_release(
 
 def equal_batches(first: tuple, second: tuple) -> bool:
     """Whether two batches have the same arrays, and lack the same ones."""
-    pairs = zip(first, second, strict=True)
-    return all((ours is None and theirs is None) or np.array_equal(ours, theirs) for ours, theirs in pairs)
+    for ours, theirs in zip(first, second, strict=True):
+        if (ours is None) != (theirs is None):
+            return False
+        if ours is not None and not np.array_equal(ours, theirs):
+            return False
+    return True
