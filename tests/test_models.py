@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -31,8 +31,7 @@ from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.sampling import ADBatch, DPTBatch
 
 TINY = ModelOptions(layers=2, width=16, heads=2, teammate_actions=True, next_obs=True)
-jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-"""Compiled in half the time, and slower, which small models do not feel."""
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 STEPS = ("ad", "hybrid_ad", "amago_offline")
 FLAT = World(lambda dtype: FlatEncoder(8, dtype), (3,), plain_view, 4)
@@ -115,7 +114,7 @@ class TestSizes:
 
 def reach(f, *inputs) -> list[np.ndarray]:
     """For each input (T, ..): bool (outputs, T), which outputs (outputs, ..) of f move with which of its rows."""
-    jacobians = jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
+    jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
         np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
         for jacobian, x in zip(jacobians, inputs, strict=True)
@@ -203,11 +202,11 @@ def test_padding_has_no_part_in_the_loss(name):
     def of(batch):
         return method.loss(params, params, batch, None)
 
-    loss = jit(of)
+    loss = jax.jit(of)
     assert loss(batch)[0] != loss(batch._replace(attention_mask=np.ones_like(mask)))[0]
     for one, two in zip(*(jax.tree.leaves(loss(b)) for b in (batch, other)), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6)
-    gradient = jit(jax.grad(lambda obs: of(batch._replace(obs=obs))[0]))(batch.obs)
+    gradient = jax.jit(jax.grad(lambda obs: of(batch._replace(obs=obs))[0]))(batch.obs)
     assert not np.abs(gradient)[~mask].any()
 
 
@@ -215,7 +214,7 @@ def test_padding_has_no_part_in_the_loss(name):
 def test_bfloat16_computes_nearly_the_same(name):
     full, params = tiny(name, layers=1)
     half, batch = tiny(name, layers=1, bfloat16=True)[0], batch_for(full)
-    one, two = (jit(method.loss)(params, params, batch, None)[0] for method in (full, half))
+    one, two = (jax.jit(method.loss)(params, params, batch, None)[0] for method in (full, half))
     assert one != two
     np.testing.assert_allclose(one, two, rtol=0.03)
 
@@ -225,7 +224,7 @@ def test_remat_changes_no_gradient():
     for remat in (False, True):
         method, params = tiny("ad", layers=1, remat=remat)
         key = jax.random.key(0)
-        gradients.append(jit(jax.grad(lambda p, m=method: m.loss(p, p, ad_batch(), key)[0]))(params))  # noqa: B023
+        gradients.append(jax.jit(jax.grad(lambda p, m=method: m.loss(p, p, ad_batch(), key)[0]))(params))  # noqa: B023
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *gradients)
 
 
@@ -233,14 +232,14 @@ def test_remat_changes_no_gradient():
 def test_dropout_is_a_function_of_its_key(name):
     method, params = tiny(name, layers=1)
     batch = batch_for(method)
-    loss = jit(lambda key: method.loss(params, params, batch, key)[0])
+    loss = jax.jit(lambda key: method.loss(params, params, batch, key)[0])
     assert loss(jax.random.key(0)) == loss(jax.random.key(0)) != loss(jax.random.key(1))
 
 
 def test_next_observations_are_of_the_same_episode():
     method, params = tiny("ad", layers=1)
     batch = ad_batch()
-    loss = jit(lambda b: method.loss(params, params, b, None)[1]["next_obs_loss"])
+    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1]["next_obs_loss"])
     after_the_end, within = batch.obs.copy(), batch.obs.copy()
     after_the_end[:, 4] += 100  # follows the done at step 3
     within[:, 3] += 100
@@ -266,8 +265,8 @@ class TestKitchen:
                 d.ad(batch_size=2, length=6)[3] if name == "ad" else d.dpt(batch_size=2, context=5)[3]
                 for d in data.values()
             )
-            one = jit(rendered.loss)(params, None, state, None)[0]
-            np.testing.assert_allclose(one, jit(shown.loss)(params, None, obs, None)[0], rtol=1e-6)
+            one = jax.jit(rendered.loss)(params, None, state, None)[0]
+            np.testing.assert_allclose(one, jax.jit(shown.loss)(params, None, obs, None)[0], rtol=1e-6)
 
     def test_a_batch_of_several_layouts(self, tmp_path):
         from plays import random_release
@@ -301,7 +300,7 @@ def percepts(steps: int, episode: int, seed=0) -> Percept:
 def player(name: str, context: int, cached: bool, **changes: Any):
     method, params = tiny(name, **changes)
 
-    @jit
+    @jax.jit
     def play(seen: Percept):
         def step(memory, percept):
             logits, memory = method.act(params, step_of(percept), percept.prev_done, memory)
@@ -325,7 +324,7 @@ def test_acting_computes_what_training_computes(name):
     method, params = tiny(name)
     seen = percepts(9, episode=4)
     steps = jax.tree.map(lambda x: x[None], step_of(seen))
-    policy = jit(lambda steps: method.logits(run(method, params, steps).head)[0])
+    policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
     whole = policy(steps)
     np.testing.assert_allclose(player(name, 12, False)(seen), whole, rtol=1e-4, atol=1e-5)
     # a full window holds the last K steps, as a window of training data does
@@ -342,7 +341,7 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
     transitions = Transition(
         seen.obs[known][None], after.prev_action, after.prev_reward, after.obs, after.prev_teammate_action
     )
-    answer = jit(lambda query: run(method, params, transitions, query).logits[0, -1])
+    answer = jax.jit(lambda query: run(method, params, transitions, query).logits[0, -1])
     expected = [answer(seen.obs[t][None]) for t in (8, 9, 10)]
     np.testing.assert_allclose(player("dpt", context, False)(seen)[8:], np.stack(expected), rtol=1e-4, atol=1e-5)
 
@@ -373,7 +372,7 @@ def test_amago_prefers_what_is_rewarded():
         obs, mask = jnp.ones((8, 8, 3)), jnp.ones((8, 8), bool)
         return ADBatch(obs, actions[:, :-1], rewards[:, :-1], actions[:, 1:], none > 0, mask)  # type: ignore[arg-type]
 
-    @jit
+    @jax.jit
     def train(params, state):
         def step(carry, key):
             params, slow, state = carry
