@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote clean
+.PHONY: help install demo generate teammates verify control test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -36,6 +36,9 @@ teammates: install ## train the suite of learned teammates: PROFILE=smoke|mini|p
 
 verify: install ## verify a release, every byte and the physics: ROOT=folder (default: the bundled mini release)
 	$(BIN)/icrl4aht-data verify --deep $(ROOT)
+
+control: install ## show that the models adapt in context where that is possible (about 10 minutes)
+	$(BIN)/python -m baselines control
 
 test: check ## lint, types and all tests
 	$(BIN)/python -m pytest
