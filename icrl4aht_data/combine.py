@@ -11,7 +11,7 @@ import numpy as np
 
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import read_text
+from icrl4aht_data.files import TEXT_BYTES, plain_size, read_text
 from icrl4aht_data.manifest import file_hash, inside
 from icrl4aht_data.release import CARD, NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
@@ -137,9 +137,11 @@ class Deferred(Mapping[str, np.ndarray]):
 
 
 def _card(datasets: Sequence[Dataset]) -> str:
+    for dataset in datasets:
+        plain_size(inside(dataset.root, MANIFEST), TEXT_BYTES)
     parts = "\n".join(
         f"* {dataset.root.name}: data version {dataset.info['data_version']}, {len(dataset):,} histories, "
-        f"SHA-256 of its manifest {file_hash(inside(dataset.root, MANIFEST))}"
+        f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
         for dataset in datasets
     )
     cards = "\n".join(_text_of_card(read_text(dataset.origin.file(CARD))) for dataset in datasets)

@@ -8,7 +8,7 @@ import re
 import stat
 import unicodedata
 from collections.abc import Iterator, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
 from icrl4aht_data.files import file_in_place_of, read_text
@@ -19,6 +19,7 @@ LARGEST = 4 * 2**30
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # a name that Windows keeps for itself
+_RESERVED = re.compile(r'[\\:*?"<>|]')
 _PART = 200  # bytes between two slashes: what is written beside a file has a longer name
 
 
@@ -101,9 +102,9 @@ def files_below(folder: Path) -> Iterator[str]:
 
 def is_inside(name: str) -> bool:
     """Whether a relative path names a file below its root on every system: no "..", drive, backslash, control code."""
-    if len(name) >= 1024 or PurePosixPath(name).is_absolute() or not name.isprintable():
+    if len(name) >= 1024 or not name.isprintable() or _RESERVED.search(name):
         return False
-    return not re.search(r'[\\:*?"<>|]', name) and all(map(_is_part, name.split("/")))
+    return all(map(_is_part, name.split("/")))
 
 
 def _is_part(part: str) -> bool:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from generation.learners.network import ActorCritic, Widths
@@ -47,9 +46,12 @@ def load_card(folder: Path) -> dict[str, Any]:
         OptionError: if it is missing or not JSON.
     """
     try:
-        return parse_json(read_text(folder / CARD))
+        card = parse_json(read_text(folder / CARD))
     except IndexFormatError as error:
         raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
+    if not isinstance(card, dict):
+        raise OptionError(f"{folder}: not a checkpoint; expected an object in {CARD}")
+    return card
 
 
 def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
@@ -64,9 +66,10 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
         weights = load_file(folder / WEIGHTS)
         network = ActorCritic(Widths.from_table(card["widths"]), card["partners"])
         stated = card["shapes"]
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError, IndexFormatError) as error:
+        tree = unflatten_dict(weights, sep="/")
+    except Exception as error:  # of three libraries, and whatever a name that is also a folder makes of them
         raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
     shapes = {name: list(w.shape) for name, w in weights.items()}
-    if shapes != stated:
+    if shapes != stated or "params" not in tree:
         raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {stated}")
-    return network, unflatten_dict(weights, sep="/"), card
+    return network, tree, card
