@@ -51,11 +51,23 @@ def json_hash(content: Any) -> str:
 
 
 @contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of the disk name the file: those of writing to an open one do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def file_in_place_of(path: Path) -> Iterator[Path]:
     """A name beside `path` to write to. At the end the file takes its place at once; after an error nothing changes."""
     partial = path.with_name(f".{path.name}.partial")
     try:
-        yield partial
+        with naming(path):
+            yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

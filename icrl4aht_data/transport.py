@@ -5,8 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -126,16 +129,20 @@ class Store:
             options["client_kwargs"] = {"timeout": timeout}
         elif scheme == "s3":
             options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT}
+            options["config_kwargs"]["retries"] = {"total_max_attempts": 1}  # `Patience` is enough
         elif scheme == "hf":
             options = {"skip_instance_cache": True}
         try:
-            return os.getpid(), fsspec.url_to_fs(self.url, **options)[0]
+            files = fsspec.url_to_fs(self.url, **options)[0]
         except ImportError as error:
             extra = {"s3": "s3"}.get(scheme)
             remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
             raise OptionError(f"{self.url}: {error}; {remedy}") from error
         except ValueError as error:
             raise OptionError(f"{self.url}: not an address that fsspec opens: {error}") from error
+        if scheme == "s3":
+            files.retries = 1
+        return os.getpid(), files
 
     def patiently(self, name: str, ask: Callable[[], T]) -> T:
         """What `ask` gives, asked again while its errors are of the passing kind.
@@ -156,7 +163,8 @@ class Store:
             return retrying(ask)
         except (Icrl4ahtError, MemoryError):
             raise
-        except Exception as error:  # every file system has errors of its own
+        except Exception as raised:  # every file system has errors of its own
+            error = _behind(raised)
             if _is_of_disk(error):
                 raise
             if not isinstance(error, FileNotFoundError) and _status(error) != 404:
@@ -174,10 +182,19 @@ class Store:
 
 def _passes(error: BaseException) -> bool:
     """Whether the same request may succeed a moment later."""
+    error = _behind(error)
     status = _status(error)
     if status is not None:
         return status in _PASSING
     return isinstance(error, Exception) and not isinstance(error, _LASTING) and not _is_of_disk(error)
+
+
+def _behind(error: BaseException) -> BaseException:
+    """What went wrong: fsspec says "not found" of whatever keeps it from asking for a file's length."""
+    status = _status(error)
+    if isinstance(error, FileNotFoundError) and error.__cause__ and (status is None or status in _PASSING):
+        return error.__cause__
+    return error
 
 
 def _is_of_disk(error: BaseException) -> bool:
@@ -207,11 +224,18 @@ def _retry_after(error: BaseException | None) -> float:
             headers = response.get("ResponseMetadata", {}).get("HTTPHeaders", {})
         asked = {str(key).lower(): value for key, value in dict(headers).items()}.get("retry-after")
         if asked is not None:
-            try:
-                return float(asked)
-            except ValueError:  # a date
-                return 0.0
+            return _seconds(asked)
         error = error.__cause__
+    return 0.0
+
+
+def _seconds(asked: str) -> float:
+    """From now, of a number or a date."""
+    try:
+        return float(asked)
+    except ValueError:
+        with suppress(ValueError):
+            return parsedate_to_datetime(asked).timestamp() - time.time()
     return 0.0
 
 
