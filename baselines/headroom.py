@@ -10,11 +10,11 @@ from rich.progress import Progress
 
 from baselines.agents import get_agent
 from baselines.evaluate import evaluate, get_protocol
-from baselines.report import CARDS, HEURISTICS, LAYOUTS, Run, as_run, has_headroom
+from baselines.report import LAYOUTS, Run, as_run
 from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.cards import card_file
+from icrl4aht_data.headroom import REFERENCES, headroom_table
 from icrl4aht_data.tasks import manifest_path, read_tasks
-
-REFERENCES = ("stay", "random", "oracle")
 
 
 def measure(out: Path, protocols: Sequence[str], bars: Progress) -> list[Run]:
@@ -36,8 +36,9 @@ def measure(out: Path, protocols: Sequence[str], bars: Progress) -> list[Run]:
     return runs
 
 
-def write_cards(runs: Sequence[Run], folder: Path = CARDS) -> list[Path]:
-    """headroom.json (protocol -> layout -> family -> agent -> mean return) and headroom.md."""
+def write_cards(runs: Sequence[Run], folder: Path | None = None) -> list[Path]:
+    """headroom.json (protocol -> layout -> family -> agent -> mean return) and headroom.md, into `cards` by default."""
+    folder = folder or card_file("headroom.json").parent
     table: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for run in runs:
         for layout, family in run.cells:
@@ -59,23 +60,6 @@ def _markdown(table: dict[str, dict[str, dict[str, dict[str, float]]]]) -> str:
     ]
     for protocol, layouts in table.items():
         names = [layout for layout in LAYOUTS if layout in layouts]
-        lines += [
-            "",
-            f"## Protocol `{protocol}`",
-            "",
-            f"| family | {' | '.join(names)} |",
-            "|---|" + "---|" * len(names),
-        ]
-        for family in HEURISTICS:
-            cells = [layouts[layout].get(family) for layout in names]
-            lines.append(f"| {family} | {' | '.join(_cell(cell) for cell in cells)} |")
-        flat = [f"{n}/{f}" for n in names for f in HEURISTICS if f in layouts[n] and not has_headroom(layouts[n][f])]
-        lines += ["", f"No headroom: {', '.join(flat) or 'none'}."]
+        cells = {(layout, family): cell for layout in names for family, cell in layouts[layout].items()}
+        lines += ["", f"## Protocol `{protocol}`", "", headroom_table(cells, names)]
     return "\n".join(lines) + "\n"
-
-
-def _cell(references: dict[str, float] | None) -> str:
-    if references is None:
-        return ""
-    text = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
-    return f"**{text}**" if has_headroom(references) else text

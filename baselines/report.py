@@ -14,19 +14,15 @@ from typing import Any
 import numpy as np
 
 from baselines.evaluate import Result, read_result
-from icrl4aht_data.benchmark import FAMILIES, TRACKS
+from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.cards import card_file
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.headroom import HEURISTICS, Cell, has_headroom, read_headroom
 from icrl4aht_data.tasks import manifest_path, read_tasks
 
-CARDS = Path(__file__).parent.parent / "cards"
-HEURISTICS = FAMILIES[1:]
 LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 _RESAMPLES = 10_000
-_NO_HEADROOM = 1.0  # a cell whose best reference ego is within this of `stay` leaves the ego nothing to do
-
-Cell = tuple[str, str]
-"""(layout, family)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,22 +119,8 @@ def rows(run: Run) -> list[dict[str, Any]]:
 
 
 def _published(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    content = json.loads((CARDS / "published.json").read_text(encoding="utf-8"))
+    content = json.loads(card_file("published.json").read_text(encoding="utf-8"))
     return content["methods"].get(agent, {})
-
-
-def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
-    """cell -> mean returns of `stay`, `random`, `oracle`; empty if none was measured under this protocol."""
-    path = CARDS / "headroom.json"
-    if not path.exists():
-        return {}
-    content = json.loads(path.read_text(encoding="utf-8")).get(protocol, {})
-    return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
-
-
-def has_headroom(references: dict[str, float]) -> bool:
-    """Whether a reference ego of this cell gets more than one that only stays."""
-    return references["oracle"] - references["stay"] > _NO_HEADROOM
 
 
 def normalised(mean: float, references: dict[str, float] | None) -> float | None:

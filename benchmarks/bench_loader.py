@@ -19,7 +19,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,11 @@ import click
 import h5py
 import numpy as np
 
+from benchmarks.histories import write_many
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.convert import to_published, to_release
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.sampling import ADSampler
-from icrl4aht_data.schema import held_fields
-from icrl4aht_data.tasks import read_tasks
 
 TARGETS = {  # (how held, observations) -> least ratio to the published and to the fair reader
     ("ram", "state"): (1000, 200),
@@ -65,22 +63,7 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
         return
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    source = load_icrl4aht(layout=layout)
-    kept = source.info["environment"]["kept_steps"]
-
-    def shifted() -> Iterator[NewHistory]:
-        for number in range(histories):
-            history, episodes = source[number % len(source)], number // len(source)
-            arrays = {
-                field.name: np.roll(history.read(field.name), episodes * (kept if field.axis == "T" else 1), axis=0)
-                for field in held_fields("lite")
-            }
-            yield NewHistory(number, arrays)
-
-    task = next(task for task in read_tasks(source.root / "meta" / "tasks.jsonl") if task.layout.name == layout)
-    lite = write_release(
-        folder / "lite", "lite", [NewTask(task, {}, histories, shifted)], data_version="0.0.0", card="# benchmark\n"
-    )
+    lite = write_many(folder / "lite", [layout], histories)
     dataset = load_icrl4aht(lite)
     to_release(dataset, folder / "full", "full")
     to_published(dataset, folder / "published", states=False)

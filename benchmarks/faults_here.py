@@ -1,4 +1,4 @@
-"""Faults of this machine: full disks, killed processes, processes at the same time, and files that are not as written."""
+"""Faults of this machine: full disks, killed processes, two processes at once, files that are not as written."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from servers import Request, Slow
+from servers_process import environment
 
 from benchmarks.faults_remote import ANY, on_http
 from benchmarks.faults_scene import PATIENCE, PIECE, Ordered, Scene, Target, Try, arrays, batches, check, received
 from icrl4aht_data import columns, load_icrl4aht
-from icrl4aht_data import cache as cache_module
 from icrl4aht_data.blocks import PartialFile
 from icrl4aht_data.dataset import Dataset, Options
 from icrl4aht_data.download import fetch_planned, plan_download
@@ -36,10 +37,6 @@ from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.shard import Shards, chunk_table_name, read_table
 from icrl4aht_data.transport import Store
 from icrl4aht_data.verify import verify_release
-
-# isort: split
-from servers import Request, Slow
-from servers_process import environment
 
 _PAGE = 4096
 _GIB = 2**30
@@ -315,7 +312,7 @@ def _check_damaged(root: Path, before: tuple[bytes, str]) -> str | None:
     except Icrl4ahtError:
         return None
     check(after[0] == before[0], "other data, silently")
-    return None if after[1] == before[1] else "said otherwise"
+    return None if after[1] == before[1] else "metadata unnoticed"
 
 
 def bit_flips(scene: Scene, n: int) -> Iterator[Try]:

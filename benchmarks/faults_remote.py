@@ -16,14 +16,13 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+from servers import Cut, Etag, Flip, IgnoreRange, Long, Request, Short, Slow, Status, http_server, hub_server, s3_server
+from servers_http import Answer, Server
+from servers_process import environment, forget_filesystems
+
 from benchmarks.faults_scene import Ordered, Scene, Target, Try, check, length
 from icrl4aht_data import transport
 from icrl4aht_data.errors import Icrl4ahtError
-
-# isort: split
-from servers import Cut, Etag, Flip, IgnoreRange, Long, Request, Short, Slow, Status, hub_server, http_server, s3_server
-from servers_http import Answer, Server
-from servers_process import environment, forget_filesystems
 
 ALWAYS = 10**9
 ANY = ("GET", "HEAD")
@@ -249,8 +248,11 @@ def versions(scene: Scene, n: int) -> Iterator[Try]:
             except Icrl4ahtError as error:
                 scene.check_error(error)
                 scene.check_arrived(to)
+            target.faults.clear()
             shutil.copytree(scene.release, served, dirs_exist_ok=True)
             use(target.url, to)
 
-    for number in range(n):
-        yield partial(attempt, int(scene.rng.integers(1, 25)), number % 2 > 0)
+    with on_http(scene) as target:
+        places = [max(1, _some(scene, target, number % 2 > 0)) for number in range(n)]
+    for number, first in enumerate(places):
+        yield partial(attempt, first, number % 2 > 0)

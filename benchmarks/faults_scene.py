@@ -1,11 +1,10 @@
-"""What the families of faults share: releases, what is right of them, and how a remote is met while something is wrong."""
+"""What the families of faults share: releases, what is right of them, and how a faulty remote is met."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +14,9 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+from plays import random_release
+from servers import Fault, Faults, Flip, Long, Request, Short
+from servers_process import environment
 
 from icrl4aht_data import blocks, load_icrl4aht
 from icrl4aht_data.dataset import Dataset, Options
@@ -26,14 +28,6 @@ from icrl4aht_data.remote import open_root
 from icrl4aht_data.schema import MANIFEST, held_fields
 from icrl4aht_data.shard import Shards
 from icrl4aht_data.transport import Patience
-
-TESTS = Path(__file__).parent.parent / "tests"
-if str(TESTS) not in sys.path:  # the servers are the tests' own
-    sys.path.append(str(TESTS))
-
-from plays import random_release  # noqa: E402
-from servers import Fault, Faults, Flip, Long, Request, Short  # noqa: E402
-from servers_process import environment  # noqa: E402
 
 PIECE = 2**14
 """Bytes asked for at once, so that the files of a small release come in many parts."""
@@ -105,8 +99,7 @@ class Scene:
     @cached_property
     def release(self) -> Path:
         """Of some hundred kilobytes: shards of many pieces."""
-        options = {"teammates": 1, "streams": 3, "episodes": 80, "length": 25}
-        random_release(self.folder / "release", "full", **options)
+        random_release(self.folder / "release", "full", teammates=1, streams=3, episodes=80, length=25)
         return self.folder / "release"
 
     @cached_property

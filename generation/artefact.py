@@ -30,7 +30,7 @@ from generation.profiles import Profile
 from generation.snapshot import keep_lines, sync_file
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.files import parse_json, read_text, write_json
-from icrl4aht_data.release import file_hash, hashes_hold
+from icrl4aht_data.manifest import file_hash, hashes_hold
 from icrl4aht_data.tasks import Task
 
 METADATA, METRICS, TIMING, LEARNER = "metadata.json", "metrics.jsonl", "timing.jsonl", "learner.safetensors"

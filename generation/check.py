@@ -11,7 +11,7 @@ import numpy as np
 from generation.artefact import FILTER_CURVES, TIMING
 from generation.run import FAILED
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.release import file_hash
+from icrl4aht_data.manifest import file_hash
 
 _APART = {TIMING, FAILED, FILTER_CURVES}
 """Files that say how a rebuild went, and pictures of what it made."""

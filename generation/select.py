@@ -15,7 +15,7 @@ from generation.suite import Checkpoint, checkpoints
 from icrl4aht_data.benchmark import ALGORITHMS, TRACKS, track_of
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of
-from icrl4aht_data.release import file_hash
+from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.tasks import Task, make_task, write_tasks
 
 THRESHOLD = 20.0

@@ -40,8 +40,8 @@ from generation.teammates.base import stacked
 from icrl4aht_data.benchmark import ALGORITHMS, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of, json_hash, write_json
+from icrl4aht_data.manifest import file_hash, hashes_hold
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.release import file_hash, hashes_hold
 
 CHECKPOINTS = 5
 """Evenly spaced over a policy's training (paper, App. B.1)."""

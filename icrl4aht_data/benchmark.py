@@ -50,6 +50,15 @@ EPISODE_STEPS = 400
 KEPT_STEPS = 100
 """Steps kept of each training episode, and steps of an evaluation episode (paper, App. C and Sec. 4.3)."""
 
+PAPER_EGO_STEPS = 60_000_000
+"""Environment steps for which an ego learns (paper, App. C.2.2)."""
+
+PAPER_TEAMMATE_STEPS = 30_000_000
+"""Environment steps for which a member of a population of teammates learns (paper, App. B.1)."""
+
+PAPER_TEAMMATES = 20
+"""Training teammates of each algorithm and layout (paper, App. B.1)."""
+
 _LISTED, _COMPARED = 50, 1000  # names that an error lists, and looks at for the nearest
 
 

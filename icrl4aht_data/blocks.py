@@ -29,6 +29,7 @@ _PIECE = 2**20  # bytes asked for at once: what a cut can lose
 _AT_ONCE = 16  # requests
 _TRIES = 3  # for bytes that come, but wrong
 _OVERFLOW = 64 * 2**20  # bytes kept in memory where the disk takes no more
+_DISK_BLOCK = 4096  # bytes: what a disk gives to a sparse file at once
 _CHECKED = 64 * 2**20  # bytes written between two looks at the folder's size
 
 
@@ -129,7 +130,8 @@ def bring(wanted: Iterable[tuple[PartialFile, np.ndarray]]) -> None:
     """
     pieces = [(file, piece) for file, chunks in wanted for piece in _pieces(file.missing(chunks))]
     _at_once([lambda file=file, piece=piece: _fetch(file, piece, file.keep) for file, piece in pieces])
-    _bound({file.path for file, _ in pieces}, sum(piece.stop - piece.start for _, piece in pieces))
+    disk = sum(piece.stop // _DISK_BLOCK - piece.start // _DISK_BLOCK + 1 for _, piece in pieces) * _DISK_BLOCK
+    _bound({file.path for file, _ in pieces}, disk)
 
 
 def _pieces(chunks: np.ndarray, gap: int = _GAP) -> list[Piece]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import time
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from filelock import FileLock
+from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import OptionError
 
@@ -25,6 +27,7 @@ _DEFAULT_LIMIT = 100 * 10**9
 _TICK_NS = 10**8  # a file changed this recently may change again within one tick of its clock
 _COARSE_TICK_NS = 2 * 10**9  # where the clock shows no parts of a millisecond
 _SMALL = 2**20  # hashing this is quicker than remembering
+_PLENTY = 2**29  # bytes that need no look at what is free
 
 Arrays = dict[str, np.ndarray]
 
@@ -217,6 +220,19 @@ def _hash(path: Path) -> str:
 def hash_text(text: str) -> str:
     """SHA-256 of a text, its first 32 hexadecimal digits."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray:
+    """np.empty, if the memory is there.
+
+    Raises:
+        OptionError: says what is too large.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    if size < _PLENTY or size <= free_memory():
+        with suppress(MemoryError):
+            return np.empty(shape, dtype)
+    raise OptionError(f"{what}: takes {size / 1e9:.3g} GB of memory, more than is free: read fewer steps at a time")
 
 
 def free_memory() -> int:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +44,15 @@ def _filters(command: Any) -> Any:
     for name in ("teammate-kind", "teammate-family", "track", "split", "layout"):
         command = click.option(f"--{name}", multiple=True, help=f"Only this {name}; may be given again.")(command)
     return command
+
+
+@contextmanager
+def _bars(quiet: bool, *names: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Progress of several things by name, on a terminal only."""
+    console = Console(stderr=True)
+    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
+        tasks = {name: bars.add_task(name, total=None) for name in names}
+        yield lambda what, done, total: bars.update(tasks[what], completed=done, total=total)
 
 
 def _wanted(filters: dict[str, tuple[str, ...]]) -> dict[str, Any]:
@@ -229,14 +240,8 @@ def verify(
 
     if quick and (deep or repair):
         raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
-    console = Console(stderr=True)
     wanted = _wanted(filters)
-    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
-        tasks = {name: bars.add_task(name, total=None) for name in ("fetched", "files", "histories")}
-
-        def advance(what: str, done: int, total: int) -> None:
-            bars.update(tasks[what], completed=done, total=total)
-
+    with _bars(quiet, "fetched", "files", "histories") as advance:
         report = verify_release(root, deep=deep, quick=quick, advance=advance, **wanted)
         if repair and not report.ok:
             if root is None and source is None:
@@ -342,6 +347,65 @@ def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | Non
     if not quiet:
         click.echo(f"release: {out}")
         print_statistics(read_info(out), Console())
+
+
+@cli.group()
+def release() -> None:
+    """Make releases ready for other people."""
+
+
+@release.command()
+@click.argument("source", nargs=-1, type=click.Path(path_type=Path), metavar="[SOURCE]")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--link", is_flag=True, help="Hard links instead of copies: no space, but both change if one is changed.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@_json
+def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json: bool) -> None:
+    """Build the release OUT for publication: all of SOURCE, a release, and what people and tools look for beside it.
+
+    That is README.md with a dataset card, figures, the index as Parquet for viewers, croissant.json, LICENSE,
+    CITATION.cff, cards of the learned teammates and a new manifest. SOURCE is verified first; by default it is the
+    bundled mini release.
+    """
+    from icrl4aht_data.manifest import read_manifest
+    from icrl4aht_data.publish import build_release
+
+    if len(source) > 1:
+        raise click.UsageError("give one SOURCE at most, then OUT")
+    with _bars(quiet, "files", "histories", "copying") as advance:
+        build_release(source[0] if source else None, out, link=link, advance=advance)
+    files = list(read_manifest(out))
+    size = sum((out / name).stat().st_size for name in files)
+    if as_json:
+        click.echo(json.dumps({"release": str(out), "files": files, "bytes": size}, indent=2))
+    elif not quiet:
+        click.echo(f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}")
+
+
+@cli.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("address", metavar="hf://datasets/ORG/REPO")
+@click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done; change nothing.")
+@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@_json
+def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool, as_json: bool) -> None:
+    """Upload the release FOLDER to a dataset repository of the Hugging Face Hub, and tag it with the data version.
+
+    The release is verified first, the repository made if there is none. An upload that was cut off goes on with the
+    same command. Afterwards what the repository holds is compared with the manifest; only then it is tagged. A tag
+    never moves: other data need another version. `hf auth login` gives the token.
+    """
+    from icrl4aht_data.upload import upload_release
+
+    with _bars(quiet, "files", "histories") as advance:
+        done = upload_release(
+            folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
+        )
+    if as_json:
+        click.echo(json.dumps(done.to_json(), indent=2))
+    elif not quiet:
+        click.echo("\n".join(done.in_words()))
 
 
 def run(command: click.Command) -> None:

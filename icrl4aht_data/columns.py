@@ -15,9 +15,10 @@ import numpy as np
 from icrl4aht_data.benchmark import ACTIONS, FAMILIES, check_place, unknown
 from icrl4aht_data.cache import cached_arrays, content_hash
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
-from icrl4aht_data.files import parse_json
+from icrl4aht_data.files import LINE_BYTES, parse_json, plain_size
+from icrl4aht_data.manifest import LARGEST
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from icrl4aht_data.schema import JSON_TYPES, Entry
+from icrl4aht_data.schema import FINITE, JSON_TYPES, LONGEST, Entry, is_name
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id")
 """The entry fields that can be filtered by."""
@@ -114,7 +115,7 @@ def read_columns(path: Path) -> Columns:
         IndexFormatError: names the file and the line.
     """
     try:
-        size = path.stat().st_size
+        size = plain_size(path, LARGEST)
         if size < _UNCACHED:
             return Columns(_parse(path))
         key = f"index-{_VERSION}-{content_hash(path)}"
@@ -159,7 +160,10 @@ def _blocks(path: Path) -> Iterator[bytes]:
     try:
         with path.open("rb") as stream:
             while text := stream.read(_BLOCK):
-                yield (text + stream.readline()).removesuffix(b"\n")
+                text += stream.readline(LINE_BYTES)
+                if len(text) - text.rfind(b"\n", 0, -1) > LINE_BYTES:
+                    raise IndexFormatError(f"{path}: a line has more than {LINE_BYTES:,} bytes")
+                yield text.removesuffix(b"\n")
     except FileNotFoundError as error:
         raise IndexFormatError(f"{path}: missing; fetch the release again") from error
     except OSError as error:
@@ -290,6 +294,11 @@ def _is_valid(block: Block, first: int) -> bool:
     lists = {name: values for name, (values, _) in block.items() if not isinstance(values, np.ndarray)}
     if not all(set(map(type, values)) <= JSON_TYPES[name] for name, values in lists.items()):
         return False
+    if not all(is_name(value) for name in _STRINGS for value in lists[name]):
+        return False
+    for name in (name for name, dtype in _NUMBERS.items() if dtype is np.float64):
+        if not (np.abs(np.asarray(block[name][0], np.float64)) < FINITE).all():
+            return False
     try:
         ids, steps, episodes, _, _ = (
             np.asarray(block[name][0], np.int64)[block[name][1]]
@@ -306,7 +315,7 @@ def _is_valid(block: Block, first: int) -> bool:
     except (Icrl4ahtError, OverflowError):
         return False
     counted = np.array_equal(ids, np.arange(first, first + len(ids)))
-    return bool(counted and (episodes > 0).all() and (episodes <= steps).all())
+    return bool(counted and (episodes > 0).all() and (episodes <= steps).all() and (steps < LONGEST).all())
 
 
 def check_entry(entry: Entry, number: int) -> None:
@@ -326,7 +335,7 @@ def check_entry(entry: Entry, number: int) -> None:
     if entry.action_dim != len(ACTIONS):
         raise IndexFormatError(f"expected action_dim {len(ACTIONS)}, found {entry.action_dim}")
     folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
-    if not re.fullmatch(rf"{folder}-\d{{5}}-of-\d{{5}}\.h5", entry.shard):
+    if not re.fullmatch(rf"{folder}-[0-9]{{5}}-of-[0-9]{{5}}\.h5", entry.shard):
         raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
     if entry.episodes > entry.T:
         raise IndexFormatError(f"{entry.episodes} episodes in {entry.T} steps")

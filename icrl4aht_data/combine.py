@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,12 @@ import numpy as np
 
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import parse_json, read_text
-from icrl4aht_data.release import NewHistory, NewTask, checkpoint_files, file_hash, write_release
+from icrl4aht_data.files import read_text
+from icrl4aht_data.manifest import file_hash, inside
+from icrl4aht_data.release import CARD, NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
-from icrl4aht_data.tasks import Task, named_task, read_tasks
+from icrl4aht_data.tasks import Task, named_task, read_provenance, read_tasks
 
 
 def combine_releases(
@@ -45,7 +47,7 @@ def combine_releases(
     owners: dict[str, str] = {}
     new = []
     for dataset in datasets:
-        provenance = parse_json(read_text(dataset.root / PROVENANCE))
+        provenance = read_provenance(dataset.origin.file(PROVENANCE))
         for task in release_tasks(dataset):
             if task.task_id in owners:
                 raise OptionError(f"{dataset.origin}: task {task.task_id} is also in {owners[task.task_id]}")
@@ -88,7 +90,7 @@ def _one_version(datasets: Sequence[Dataset]) -> str:
 def release_tasks(dataset: Dataset) -> list[Task]:
     """The tasks of a selection's release; of a release whose tasks were not given, those of the selection, by name."""
     if dataset.knows_tasks:
-        return read_tasks(dataset.root / TASKS)
+        return read_tasks(dataset.origin.file(TASKS))
     return list({entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}.values())
 
 
@@ -109,7 +111,8 @@ def stored_task(
             taken()
 
     dataset.origin.below(f"{TEAMMATES}/")
-    return NewTask(task, provenance, len(dataset), load, checkpoint_files(dataset.root / TEAMMATES, task))
+    files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
+    return NewTask(task, provenance, len(dataset), load, files)
 
 
 class Deferred(Mapping[str, np.ndarray]):
@@ -136,10 +139,15 @@ class Deferred(Mapping[str, np.ndarray]):
 def _card(datasets: Sequence[Dataset]) -> str:
     parts = "\n".join(
         f"* {dataset.root.name}: data version {dataset.info['data_version']}, {len(dataset):,} histories, "
-        f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
+        f"SHA-256 of its manifest {file_hash(inside(dataset.root, MANIFEST))}"
         for dataset in datasets
     )
-    cards = "\n".join(read_text(dataset.origin.file("README.md")) for dataset in datasets)
+    cards = "\n".join(_text_of_card(read_text(dataset.origin.file(CARD))) for dataset in datasets)
     return (
         f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
     )
+
+
+def _text_of_card(card: str) -> str:
+    """Without YAML, which may stand only at a file's beginning, and pictures, which do not go along."""
+    return re.sub(r"\A---\n(?s:.*?)\n---\n|^!\[.*\n\n?", "", card, flags=re.MULTILINE)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,8 @@ from icrl4aht_data.combine import Deferred, release_tasks, stored_task
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.draws import whole
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
-from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
+from icrl4aht_data.files import file_in_place_of, parse_json, read_lines, write_json
+from icrl4aht_data.manifest import inside
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
 from icrl4aht_data.release import NewHistory, NewTask, write_release
@@ -35,10 +37,11 @@ from icrl4aht_data.schema import (
     PROVENANCE,
     TASKS,
     Kind,
+    check_value,
     episode_ends,
     held_fields,
 )
-from icrl4aht_data.tasks import Task, named_task, read_tasks, write_tasks
+from icrl4aht_data.tasks import Task, named_task, read_provenance, read_tasks, write_tasks
 
 if TYPE_CHECKING:
     import h5py
@@ -99,7 +102,7 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
     if target.resolve() == dataset.root.resolve():
         raise OptionError(f"{target}: the release itself; give another folder")
     given = {task.task_id: task for task in release_tasks(dataset)}
-    provenance = _read_json(dataset.root / PROVENANCE)
+    provenance = read_provenance(dataset.origin.file(PROVENANCE))
     by_task: dict[str, list[int]] = {}
     for entry in dataset.entries:
         by_task.setdefault(entry.task_id, []).append(entry.history_id)
@@ -116,16 +119,19 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance =
         kind,
         tasks,
         data_version=dataset.info["data_version"],
-        card=read_text(dataset.origin.file("README.md")),
         kept_steps=dataset.info["environment"]["kept_steps"],
     )
 
 
-def _read_json(path: Path) -> Any:
+@contextmanager
+def _errors_as(what: str) -> Iterator[None]:
+    """What h5py raises for a file of others, which may be anything, as ours."""
     try:
-        return parse_json(read_text(path))
-    except Icrl4ahtError as error:
-        raise PublishedFormatError(f"{path}: {error}") from error
+        yield
+    except Icrl4ahtError:
+        raise
+    except Exception as error:
+        raise PublishedFormatError(f"{what}: {error}") from error
 
 
 def to_published(
@@ -162,10 +168,10 @@ def to_published(
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
         wanted = {entry.task_id for entry in dataset.entries}
-        tasks = [task for task in read_tasks(dataset.root / TASKS) if task.task_id in wanted]
+        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in wanted]
         if tasks:
             write_tasks(partial / "tasks.jsonl", tasks)
-        provenance = _read_json(dataset.root / PROVENANCE)
+        provenance = read_provenance(dataset.origin.file(PROVENANCE))
         write_json(partial / "provenance.json", {name: value for name, value in provenance.items() if name in wanted})
         if target.exists():
             target.rmdir()
@@ -216,15 +222,13 @@ def from_published(
     import h5py
 
     kept_steps = whole("kept_steps", kept_steps, 1)
-    lines = _read_index(source / HISTORIES_INDEX)
-    noted = source / "provenance.json"
-    provenance = _read_json(noted) if noted.is_file() else {}
+    lines = _read_index(inside(source, HISTORIES_INDEX))
+    noted = inside(source, "provenance.json")
+    provenance = read_provenance(noted) if noted.is_file() else {}
     done = iter(range(1, len(lines) + 1))
-    path = source / HISTORIES_H5
-    try:
+    path = inside(source, HISTORIES_H5)
+    with _errors_as(f"{path}: cannot be opened as HDF5"):
         file = h5py.File(path, "r")
-    except OSError as error:
-        raise PublishedFormatError(f"{path}: cannot be opened as HDF5: {error}") from error
 
     def load(members: list[_Group]) -> Iterator[NewHistory]:
         for group in members:
@@ -238,20 +242,17 @@ def from_published(
             NewTask(task, provenance.get(task.task_id, {}), len(members), lambda members=members: load(members))
             for task, members in _tasks_of(groups, source, tasks, made)
         ]
-        card = f"# Converted from {HISTORIES_H5}\n"
-        if made == OBSERVATIONS:
-            card += (
-                "\nObservations only: no state records, so nothing can be replayed or drawn. The files do not name the "
-                "recipes that were cooked; those in `meta/info.json` are the layouts' usual ones.\n"
-            )
-        write_release(target, made, new, data_version=data_version, card=card, kept_steps=kept_steps)
+        write_release(target, made, new, data_version=data_version, kept_steps=kept_steps)
     return made
 
 
 def _kind_of(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
     """Lite if every group has states, observations if none has."""
-    groups = [line["h5_group"] for line in lines if line["h5_group"] in file]
-    lacking = [group for group in groups if f"{group}/state" not in file]
+    from icrl4aht_data.hdf5 import exists
+
+    with _errors_as(f"{file.filename}: cannot be read"):
+        groups = [line["h5_group"] for line in lines if exists(file, line["h5_group"])]
+        lacking = [group for group in groups if not exists(file, f"{group}/state")]
     if 0 < len(lacking) < len(groups):
         raise PublishedFormatError(
             f"{file.filename}, group {lacking[0]}: lacks state, which other groups have; leave them all out with "
@@ -265,7 +266,7 @@ def _tasks_of(groups: list[_Group], source: Path, path: Path | None, kind: Kind)
     by_task: dict[str, list[_Group]] = {}
     for group in groups:
         by_task.setdefault(group.line["task_id"], []).append(group)
-    found = path or source / "tasks.jsonl"
+    found = path or inside(source, "tasks.jsonl")
     if found.is_file():
         known = {task.task_id: task for task in read_tasks(found)}
     elif kind == OBSERVATIONS and path is None:
@@ -288,15 +289,14 @@ def _tasks_of(groups: list[_Group], source: Path, path: Path | None, kind: Kind)
 
 def _read_index(path: Path) -> list[dict[str, Any]]:
     lines = []
-    for number, text in enumerate(read_text(path).splitlines(), start=1):
+    for number, text in enumerate(read_lines(path), start=1):
         try:
             line = parse_json(text)
             missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
             if missing:
                 raise PublishedFormatError(f"lacks the fields {sorted(missing)}")
             for name in PUBLISHED_FIELDS:
-                if type(line[name]) not in JSON_TYPES[name]:
-                    raise PublishedFormatError(f"field {name!r}: found {line[name]!r}")
+                check_value(name, line[name])
             named_task(line)
         except Icrl4ahtError as error:
             raise PublishedFormatError(f"{path}, line {number}: {error}") from error
@@ -315,14 +315,18 @@ class _Group:
         Raises:
             PublishedFormatError: if one that a release of that kind takes is missing.
         """
+        from icrl4aht_data import hdf5
+
         self._file, self.line, self._kept_steps = file, line, kept_steps
         self._layout = get_layout(line["layout"])
         self._where = f"{file.filename}, group {line['h5_group']}"
-        group: Any = file.get(line["h5_group"])
+        with _errors_as(f"{self._where}: cannot be read"):
+            group = hdf5.member(file, line["h5_group"]) if hdf5.exists(file, line["h5_group"]) else None
+            here = set() if group is None else {name for name in ("obs", *FIELDS) if hdf5.exists(group, name)}
         if not hasattr(group, "keys"):
             raise PublishedFormatError(f"{self._where}: missing, but the index names it")
         self.names = [f.name for f in held_fields(kind) if kind not in f.optional or line[f"has_{f.name}"]]
-        missing = [name for name in dict.fromkeys(("obs", *self.names)) if name not in group]
+        missing = [name for name in dict.fromkeys(("obs", *self.names)) if name not in here]
         if missing:
             remedy = "the index promises it; complete the file or mend the index"
             if "state" in missing:
@@ -338,19 +342,13 @@ class _Group:
         Raises:
             PublishedFormatError: names the array, and what was expected and found.
         """
+        from icrl4aht_data.hdf5 import member, read_dataset
+
         field, steps = FIELDS[name], self.line["T"]
         rows = steps if field.axis == "T" else steps // self._kept_steps
         expected = (rows, *field.held(self._layout).shape)
-        try:
-            dataset: Any = self._file[f"{self.line['h5_group']}/{name}"]
-            if dataset.shape != expected or dataset.dtype.kind not in "biuf":
-                raise PublishedFormatError(
-                    f"{self._where}: {name}: expected numbers of shape {expected} for {steps} steps on "
-                    f"{self._layout.name}, found {dataset.dtype} of shape {dataset.shape}"
-                )
-            found = dataset[()]
-        except (KeyError, OSError, AttributeError, TypeError, ValueError) as error:
-            raise PublishedFormatError(f"{self._where}: {name}: cannot be read: {error}") from error
+        with _errors_as(f"{self._where}: {name}: {steps} steps on {self._layout.name}"):
+            found = read_dataset(member(self._file, f"{self.line['h5_group']}/{name}"), expected)
         array = self._whole(name, found)
         if name in ACTION_FIELDS:
             return _FROM_PUBLISHED[array]
@@ -393,7 +391,9 @@ def to_parquet(dataset: Dataset, path: Path) -> Path:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise OptionError("Parquet needs pyarrow: pip install icrl4aht-data[hf]") from error
-    with_rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries])
+    types = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_(), list: pa.list_(pa.int64())}
+    columns = {name: next(types[kind] for kind in types if kind in kinds) for name, kinds in JSON_TYPES.items()}
+    rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], pa.schema(list(columns.items())))
     with file_in_place_of(path) as partial:
-        pq.write_table(with_rows, partial)
+        pq.write_table(rows, partial)
     return path

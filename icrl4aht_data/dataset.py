@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from icrl4aht_data.benchmark import unknown
+from icrl4aht_data.cache import new_array
 from icrl4aht_data.draws import Curriculum, Episodes, Weights, whole
 from icrl4aht_data.errors import (
     EmptySelectionError,
-    IndexFormatError,
     LabelsMissingError,
     NotStoredError,
     OptionError,
     UnknownNameError,
 )
-from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.paint import paint
@@ -30,7 +29,7 @@ from icrl4aht_data.remote import Root, open_root
 from icrl4aht_data.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry, Field, episode_returns
 from icrl4aht_data.shard import Shard, Shards
 from icrl4aht_data.store import CACHES, Cache, Choice, Source, choose, decoded_size, open_source
-from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.tasks import Task, read_provenance, read_tasks
 from icrl4aht_data.threads import usable_cores
 from icrl4aht_data.transport import Traffic
 
@@ -315,15 +314,11 @@ class Dataset:
 
     @cached_property
     def _tasks(self) -> dict[str, Task]:
-        return {task.task_id: task for task in read_tasks(self.root / TASKS)}
+        return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
     @cached_property
     def _provenance(self) -> dict[str, Any]:
-        path = self.root / PROVENANCE
-        try:
-            return parse_json(read_text(path))
-        except IndexFormatError as error:
-            raise IndexFormatError(f"{path}: {error}") from error
+        return read_provenance(self.origin.file(PROVENANCE))
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
         """What rebuilds the environment a history was made in: layout names, map, recipes, episode lengths."""
@@ -409,7 +404,8 @@ class History:
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def _painted(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
-        out = np.empty((stop - start, *self.entry.obs_shape), dtype)
+        what = f"{self._shard.path}: history {self.entry.history_id}: obs"
+        out = new_array((stop - start, *self.entry.obs_shape), dtype, what)
         return paint(self._shard.layout, self.read("state", start, stop), out)
 
     def _field(self, name: str) -> Field:

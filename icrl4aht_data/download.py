@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
-from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
+from icrl4aht_data.files import file_in_place_of, holds, parse_json, read_text, write_json
 from icrl4aht_data.index import Index, read_index
-from icrl4aht_data.manifest import file_hash, read_manifest
+from icrl4aht_data.manifest import file_hash, inside, read_manifest
 from icrl4aht_data.remote import HubRemote, Remote, Root, alone, is_address, open_root
 from icrl4aht_data.schema import MANIFEST
 from icrl4aht_data.shard import chunk_table_name
@@ -21,6 +22,9 @@ from icrl4aht_data.transport import Patience, Traffic
 
 ORIGIN = ".origin.json"
 """In a folder that `download` filled: where from, and which files it asked for. The one file that no manifest lists."""
+
+_PLAIN = re.compile(r"(hf|s3|https?)://[^:\s]+(:\d+)?(/[^:\s]*)?")
+"""Addresses that a note may send us to; fsspec knows others, of this machine's own files, or in chains."""
 
 Advance = Callable[[int], None]
 """Called with the bytes that have arrived since the last call."""
@@ -80,7 +84,7 @@ def plan_download(
         raise OptionError(f"{url}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
     root = open_root(url, to, patience)
     assert root.remote is not None
-    names = sorted(chosen_files(root, **wanted) & root.remote.manifest.keys())
+    names = sorted(chosen_files(root, **wanted))
     absent = [name for name in names if not root.is_here(name)]
     return Plan(root, root.remote.sizes(names), absent)
 
@@ -114,7 +118,7 @@ def chosen_files(root: Root, **wanted: str | Iterable[str] | None) -> set[str]:
     every = set(index.values("shard"))
     shards = _selected(index, **wanted) if any(wanted.values()) else every
     others = every - shards
-    chosen = set(listed) - others - {chunk_table_name(name) for name in others}
+    chosen = (set(listed) | shards) - others - {chunk_table_name(name) for name in others}
     if any(wanted.values()) or root.remote is not None or not (root.folder / ORIGIN).exists():
         return chosen
     asked = set(_noted(root.folder)["files"])
@@ -123,7 +127,7 @@ def chosen_files(root: Root, **wanted: str | Iterable[str] | None) -> set[str]:
 
 def _noted(folder: Path) -> dict[str, Any]:
     """What `ORIGIN` says; empty if there is none."""
-    path = folder / ORIGIN
+    path = inside(folder, ORIGIN)
     if not path.exists():
         return {}
     noted = parse_json(read_text(path))
@@ -167,7 +171,7 @@ def repair(
     before = remote.store.traffic
     names = set(damaged) & remote.manifest.keys()
     text = (there.folder / MANIFEST).read_bytes()
-    if folder != there.folder and not _has(folder / MANIFEST, text):
+    if folder != there.folder and not holds(folder / MANIFEST, text):
         bad = [name for name in remote.manifest if not _holds(remote, name)]
         if 2 * len(bad) > len(remote.manifest):
             raise OptionError(
@@ -190,16 +194,15 @@ def repair(
 def _source(root: str | Path, source: str | None) -> str:
     if source is None and is_address(root):
         return str(root)
-    url = source or (_noted(Path(root)).get("url") if Path(root).is_dir() else None) or default_remote()
+    noted = _noted(Path(root)).get("url") if Path(root).is_dir() else None
+    if source is None and noted and not _PLAIN.fullmatch(noted):
+        raise OptionError(f"{Path(root) / ORIGIN}: came from {noted[:200]!r}: give --from, if you trust that address")
+    url = source or noted or default_remote()
     if url is None or not is_address(url):
         raise OptionError(
             f"{root}: repairing needs the address of a whole copy, found {url!r}: give --from, or set ICRL4AHT_REMOTE"
         )
     return url
-
-
-def _has(path: Path, content: bytes) -> bool:
-    return path.exists() and path.read_bytes() == content
 
 
 def _holds(remote: Remote, name: str) -> bool:

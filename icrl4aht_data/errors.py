@@ -95,5 +95,9 @@ class UnsafePathError(ReleaseError):
     """A path in a release leads out of it."""
 
 
+class UploadError(Icrl4ahtError):
+    """A Hub repository did not take a release, or holds something else than it; names the repository."""
+
+
 class TaskFormatError(Icrl4ahtError, ValueError):
     """A task line is malformed."""

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from icrl4aht_data.benchmark import DOWN
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of
+from icrl4aht_data.headroom import HEURISTICS, Cell, has_headroom
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.render import draw_frame
+from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.schema import Entry
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_learning_curves(dataset: Dataset, path: Path) -> None:
@@ -18,18 +29,38 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    tasks: dict[str, list[np.ndarray]] = {}
-    titles = {}
+    _plot_histories(dataset, path, lambda e: (e.task_id, f"{e.layout} with {e.teammate_kind}"), lambda e: "mean")
+
+
+def plot_layout_curves(dataset: Dataset, path: Path) -> None:
+    """Return per episode on every layout in the selection, a curve for each split and kind of teammate, as above.
+
+    Raises:
+        OptionError: as above.
+    """
+    _plot_histories(dataset, path, lambda e: (e.layout, e.layout), lambda e: f"{e.split}, {e.teammate_kind}: mean")
+
+
+def _plot_histories(
+    dataset: Dataset, path: Path, panel: Callable[[Entry], tuple[str, str]], curve: Callable[[Entry], str]
+) -> None:
+    """Panels by key and title, in each a curve for each label."""
+    panels: dict[tuple[str, str], dict[str, list[np.ndarray]]] = {}
     for history in dataset:
-        entry = history.entry
-        tasks.setdefault(entry.task_id, []).append(history.returns())
-        titles[entry.task_id] = f"{entry.layout} with {entry.teammate_kind}"
-    panels = {}
-    for task_id, streams in tasks.items():
-        length = min(map(len, streams))
-        returns = np.stack([stream[:length] for stream in streams])
-        panels[task_id] = {f"mean of {len(streams)} streams": returns}
-    plot_curves(path, [(titles[task_id], curves) for task_id, curves in panels.items()])
+        panels.setdefault(panel(history.entry), {}).setdefault(curve(history.entry), []).append(history.returns())
+    plot_curves(
+        path,
+        [
+            (title, {f"{label} of {len(streams)} streams": _cut(streams) for label, streams in curves.items()})
+            for (_, title), curves in panels.items()
+        ],
+    )
+
+
+def _cut(streams: list[np.ndarray]) -> np.ndarray:
+    """(N, E): all of them as long as the shortest."""
+    length = min(map(len, streams))
+    return np.stack([stream[:length] for stream in streams])
 
 
 def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> None:
@@ -38,17 +69,8 @@ def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]])
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    if path.suffix not in (".png", ".svg", ".pdf"):
-        raise OptionError(f"{path}: expected a name that ends in .png, .svg or .pdf")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OptionError("drawing needs matplotlib: pip install icrl4aht-data[plot]") from error
-    columns = min(3, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(4.6 * columns, 3.3 * rows), layout="constrained")
-    for number, (title, curves) in enumerate(panels, start=1):
-        axes = figure.add_subplot(rows, columns, number)
+    figure, grid = _panels(path, len(panels), (4.6, 3.3))
+    for axes, (title, curves) in zip(grid, panels, strict=True):
         for label, returns in curves.items():
             episodes = np.arange(1, returns.shape[1] + 1)
             low, high = np.percentile(returns, (10, 90), axis=0)
@@ -59,5 +81,63 @@ def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]])
         axes.set_ylabel("return of the kept steps")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
+    _save(figure, path)
+
+
+def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
+    """The layouts as an episode may start: the agents where the map puts them, ego blue, teammate red.
+
+    Raises:
+        OptionError: if matplotlib or Pillow is not installed, or the path does not end in .png, .svg or .pdf.
+    """
+    figure, grid = _panels(path, len(layouts), (4.6, 3.3))
+    for axes, layout in zip(grid, layouts, strict=True):
+        positions = np.array([layout.agent_cells], np.uint8)
+        (record,) = start(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
+        axes.imshow(draw_frame(layout, record, view=False))
+        axes.set_title(f"{layout.name} ({layout.alias})", fontsize=9)
+        axes.set_axis_off()
+    _save(figure, path)
+
+
+def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path) -> None:
+    """By how much the oracle's mean return exceeds that of an ego that stays, for each test layout and family.
+
+    Args:
+        cells: see `headroom.read_headroom`.
+
+    Raises:
+        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
+    """
+    figure, (axes,) = _panels(path, 1, (3.4 + 0.9 * len(layouts), 3.3))
+    gains = np.array([[cells[n, f]["oracle"] - cells[n, f]["stay"] for n in layouts] for f in HEURISTICS])
+    brightest = max(10.0, gains.max())
+    axes.imshow(gains, cmap="viridis", vmin=0, vmax=brightest, aspect="auto")
+    for (row, family), (column, name) in product(enumerate(HEURISTICS), enumerate(layouts)):
+        text = f"{gains[row, column]:.1f}" if has_headroom(cells[name, family]) else "none"
+        colour = "white" if gains[row, column] < brightest / 2 else "black"
+        axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=9)
+    axes.set_xticks(range(len(layouts)), layouts, fontsize=8, rotation=20, ha="right")
+    axes.set_yticks(range(len(HEURISTICS)), HEURISTICS)
+    axes.set_ylabel("test teammates")
+    axes.set_title("Return of the oracle minus that of an ego that stays", fontsize=9)
+    _save(figure, path)
+
+
+def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, list[Any]]:
+    """A figure with that many axes of that many inches, to be saved at `path`."""
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise OptionError(f"{path}: expected a name that ends in .png, .svg or .pdf")
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OptionError("drawing needs matplotlib: pip install icrl4aht-data[plot]") from error
+    columns = 2 if count == 4 else min(3, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
+
+
+def _save(figure: Figure, path: Path) -> None:
     with file_in_place_of(path) as partial:
         figure.savefig(partial, dpi=120, format=path.suffix.removeprefix("."))

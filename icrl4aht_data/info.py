@@ -8,7 +8,7 @@ from typing import Any
 from icrl4aht_data.errors import FormatTooNewError, FormatTooOldError, IndexFormatError, RootNotFoundError
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.manifest import inside
-from icrl4aht_data.schema import ALL_KINDS, FORMAT_VERSION, INFO
+from icrl4aht_data.schema import ALL_KINDS, FORMAT_VERSION, INFO, is_name
 
 _INFO_TYPES: dict[str, type | tuple[type, ...]] = {
     "kind": str,
@@ -42,6 +42,8 @@ def read_info(root: Path) -> dict[str, Any]:
         raise FormatTooOldError(
             f"{path}: format version {version}, this package reads {FORMAT_VERSION}: rebuild or fetch the release again"
         )
+    if isinstance(info.get("data_version"), str) and not is_name(info["data_version"]):
+        raise IndexFormatError(f"{path}: malformed: data_version {info['data_version'][:100]!r}, expected a short name")
     wrong = [name for name, kind in _INFO_TYPES.items() if not isinstance(info.get(name), kind)]
     if wrong or info["kind"] not in ALL_KINDS or not _is_environment(info["environment"]) or not _are_sizes(info):
         what = ", ".join(wrong) or "kind, environment or shards"
@@ -51,7 +53,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 def _is_environment(value: dict[str, Any]) -> bool:
     steps = [value.get(name) for name in ("max_steps", "kept_steps")]
-    return len(value) == 2 and all(isinstance(n, int) and n > 0 for n in steps)
+    return len(value) == 2 and all(isinstance(n, int) and 0 < n < 2**31 for n in steps)
 
 
 def _are_sizes(info: dict[str, Any]) -> bool:

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+import stat
+import unicodedata
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
 from icrl4aht_data.files import file_in_place_of, read_text
 from icrl4aht_data.schema import MANIFEST
 
+LARGEST = 4 * 2**30
+"""Bytes that a file of a release may have, if it is no shard."""
+
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # a name that Windows keeps for itself
+_PART = 200  # bytes between two slashes: what is written beside a file has a longer name
 
 
 def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
@@ -20,7 +29,10 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         IndexFormatError: names the line.
         UnsafePathError: for a path that leads out of the release.
     """
+    if text and not text.endswith("\n"):
+        raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
     listed: dict[str, str] = {}
+    folded: dict[str, str] = {}  # as a disk sees names that does not tell upper from lower case
     for number, line in enumerate(text.splitlines(), start=1):
         match = _LINE.fullmatch(line)
         if match is None:
@@ -32,13 +44,21 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
             )
         if name in listed:
             raise IndexFormatError(f"{path}, line {number}: {name!r} stands twice")
+        twin = folded.setdefault(unicodedata.normalize("NFC", name).casefold(), name)
+        if twin != name:
+            raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
         listed[name] = digest
+    for key, name in folded.items():
+        ends = (place for place, character in enumerate(key) if character == "/")
+        if any(key[:end] in folded for end in ends):
+            raise IndexFormatError(f"{path}: {name!r} lies in what is a file by another line")
     return listed
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
     """The same of a release folder."""
-    return parse_manifest(read_text(folder / MANIFEST), folder / MANIFEST)
+    path = inside(folder, MANIFEST)
+    return parse_manifest(read_text(path), path)
 
 
 def write_manifest(root: Path) -> None:
@@ -55,15 +75,45 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
+    """Whether every file (path in the folder -> SHA-256) is as it was.
+
+    Raises:
+        OSError: if one cannot be read.
+    """
+    return all(file_hash(folder / name) == digest for name, digest in files.items())
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """The names of all that is in a folder, at any depth, but for folders; links are not followed."""
+    folders = [""]
+    while folders:
+        at = folders.pop()
+        try:
+            with os.scandir(folder / at) as found:
+                for entry in found:
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append(f"{at}{entry.name}/")
+                    else:
+                        yield at + entry.name
+        except OSError:
+            if at:
+                yield at
+
+
 def is_inside(name: str) -> bool:
     """Whether a relative path names a file below its root on every system: no "..", drive, backslash, control code."""
-    parts = name.split("/")
-    plain = all(part not in ("", ".", "..") for part in parts) and not PurePosixPath(name).is_absolute()
-    return plain and not re.search(r'[\\:*?"<>|\x00-\x1f\x7f]', name) and len(name) < 1024
+    if len(name) >= 1024 or PurePosixPath(name).is_absolute() or not name.isprintable():
+        return False
+    return not re.search(r'[\\:*?"<>|]', name) and all(map(_is_part, name.split("/")))
+
+
+def _is_part(part: str) -> bool:
+    return 0 < len(part.encode()) <= _PART and part[-1] not in ". " and not _DEVICE.fullmatch(part)
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The path of a release's file, if it is in the release, symbolic links followed.
+    """The path of a release's file, if it is in the release, symbolic links followed, and a file or a folder if it is.
 
     A folder of the Hub's cache holds links to the blobs beside its snapshots; these are followed as well.
 
@@ -71,10 +121,20 @@ def inside(folder: Path, name: str) -> Path:
         UnsafePathError: names both.
     """
     path = folder / name
+    if not is_inside(name):
+        raise UnsafePathError(f"{folder}: {name[:200]!r} leads out of the release; do not use this release")
     allowed = [folder.resolve()]
     if folder.parent.name == "snapshots" and (folder.parent.parent / "blobs").is_dir():
         allowed.append((folder.parent.parent / "blobs").resolve())
-    found = path.resolve()
-    if not is_inside(name) or not any(found.is_relative_to(root) for root in allowed):
-        raise UnsafePathError(f"{path}: leads out of the release, to {found}; do not use this release")
+    try:
+        found = path.resolve()
+        if not any(found.is_relative_to(root) for root in allowed):
+            raise UnsafePathError(f"{path}: leads out of the release, to {found}; do not use this release")
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return path
+    except (OSError, RuntimeError) as error:  # links in a circle, names that this disk does not take
+        raise UnsafePathError(f"{path}: cannot be followed: {error}") from error
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise UnsafePathError(f"{path}: neither a file nor a folder; do not use this release")
     return path

@@ -16,9 +16,10 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.dataset_card import dataset_card
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import write_json
-from icrl4aht_data.manifest import file_hash, write_manifest
+from icrl4aht_data.files import plain_size, write_json
+from icrl4aht_data.manifest import inside, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.schema import (
@@ -42,8 +43,14 @@ from icrl4aht_data.shard import stored_bytes, write_shard
 from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import NamedTask, Task, write_tasks
 
+CARD = "README.md"
+"""What a release is, for people."""
+
 SHARD_BYTES = 256 * 2**20
 """The size that shards should have, where there is data enough."""
+
+CHECKPOINT_BYTES = 64 * 2**20
+"""Of each file of a learned teammate: sixty times what the paper's network takes."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +97,23 @@ def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
     return folder / (theta["sha256"] if (folder / theta["sha256"]).is_dir() else theta["checkpoint"])
 
 
-def checkpoint_files(folder: Path, task: Task) -> dict[str, Path]:
+def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict[str, Path]:
     """The files of a task's learned teammate by their path in a release; none for a heuristic, or where there are none.
 
     Args:
         folder: see `checkpoint_folder`.
+        root: the release that the folder is in, out of which no link may lead.
+
+    Raises:
+        UnsafePathError, IndexFormatError: for what is none of the release's files, or too large for a checkpoint.
     """
     if task.teammate.get("kind") != "rl":
         return {}
     found = sorted(checkpoint_folder(folder, task.teammate).glob("policy.*"))
+    for path in found:
+        if root is not None:
+            inside(root, path.relative_to(root).as_posix())
+        plain_size(path, CHECKPOINT_BYTES)
     return {f"{TEAMMATES}/{task.teammate['theta']['sha256']}/{path.name}": path for path in found}
 
 
@@ -108,7 +123,7 @@ def write_release(
     tasks: Iterable[NewTask],
     *,
     data_version: str,
-    card: str,
+    card: str | None = None,
     kept_steps: int = KEPT_STEPS,
     shard_histories: int = 1024,
     shard_bytes: int = SHARD_BYTES,
@@ -122,7 +137,7 @@ def write_release(
             (no states; an unfinished episode may end a history).
         tasks: what to write; histories are numbered in this order.
         data_version: SemVer of the data.
-        card: README.md of the release.
+        card: README.md of the release; by default it is made of what the release says, see `dataset_card`.
         kept_steps: steps of every episode.
         shard_histories: at most this many histories a shard.
         shard_bytes: about how large a shard should be, judged by the first history of each layout.
@@ -192,7 +207,7 @@ def _fill(
     kind: Kind,
     tasks: list[NewTask],
     data_version: str,
-    card: str,
+    card: str | None,
     kept_steps: int,
     shard_limits: tuple[int, int],
     done: Callable[[Task], None],
@@ -228,7 +243,7 @@ def _fill(
     statistics = layout_statistics(root, entries, given, provenance, kept_steps)
     info = describe(kind, data_version, kept_steps, entries)
     write_json(root / INFO, info | {"shards": shard_sizes(root, entries), "statistics": statistics})
-    (root / "README.md").write_text(card, encoding="utf-8")
+    (root / CARD).write_text(dataset_card(root) if card is None else card, encoding="utf-8")
     write_manifest(root)
 
 
@@ -342,12 +357,3 @@ def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry
 def shard_sizes(root: Path, entries: Iterable[Entry]) -> dict[str, int]:
     """Bytes of every shard, in the order of the index."""
     return {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}
-
-
-def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
-    """Whether every file (path in the folder -> SHA-256) is as it was.
-
-    Raises:
-        OSError: if one cannot be read.
-    """
-    return all(file_hash(folder / name) == digest for name, digest in files.items())

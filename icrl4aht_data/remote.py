@@ -24,12 +24,19 @@ from filelock import FileLock
 
 from icrl4aht_data.blocks import PartialFile, whole_file
 from icrl4aht_data.cache import data_folder
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OfflineError, OptionError, RemoteError, RootNotFoundError
-from icrl4aht_data.files import file_in_place_of
+from icrl4aht_data.errors import (
+    Icrl4ahtError,
+    IndexFormatError,
+    OfflineError,
+    OptionError,
+    RemoteError,
+    RootNotFoundError,
+)
+from icrl4aht_data.files import file_in_place_of, holds, plain_size
 from icrl4aht_data.info import read_info
-from icrl4aht_data.manifest import file_hash, inside, parse_manifest
+from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, parse_manifest, read_manifest
 from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.transport import Patience, Store
+from icrl4aht_data.transport import HubStore, Patience, Store
 
 _OPENED = (INFO, HISTORIES, TASKS, PROVENANCE)
 """What opening a release reads."""
@@ -67,8 +74,7 @@ class Root:
     def below(self, prefix: str) -> list[str]:
         """The names of the release's files that begin so, fetched first if they are not here."""
         if self.remote is None:
-            found = (path for path in inside(self.folder, prefix.rstrip("/")).rglob("*") if path.is_file())
-            return sorted(path.relative_to(self.folder).as_posix() for path in found)
+            return sorted(prefix + name for name in files_below(inside(self.folder, prefix.rstrip("/"))))
         names = [name for name in self.remote.manifest if name.startswith(prefix)]
         self.remote.fetch(names)
         return names
@@ -174,7 +180,15 @@ class Remote:
         if name.startswith("data/") and name in self._sizes:
             return self._sizes[name]
         path = self.path(name)
-        return path.stat().st_size if path.exists() else self.store.size(name)
+        return path.stat().st_size if path.exists() else self._size_there(name)
+
+    def _size_there(self, name: str) -> int:
+        size = self.store.size(name)
+        if name.startswith("data/"):  # of which the chunk table has to account for every byte
+            return size
+        if not 0 <= size <= LARGEST:
+            raise RemoteError(f"{self.url}/{name}: expected at most {LARGEST:,} bytes, the remote says {size:,}")
+        return size
 
     def sizes(self, names: Sequence[str]) -> dict[str, int]:
         """The same of several files, asked at once."""
@@ -202,11 +216,11 @@ class Remote:
         target, chunks = self.path(name), self._chunks(name)
         if chunks is not None and target.exists():
             in_place = PartialFile(self.store, name, target)
-            whole_file(in_place, self.store.size(name), self.manifest[name], chunks, lambda size: None, keep=True)
+            whole_file(in_place, self._size_there(name), self.manifest[name], chunks, lambda size: None, keep=True)
             return
         part = self.part(name)
         part.path.unlink(missing_ok=True)
-        whole_file(part, self.store.size(name), self.manifest[name], chunks, lambda size: None)
+        whole_file(part, self._size_there(name), self.manifest[name], chunks, lambda size: None)
         target.parent.mkdir(parents=True, exist_ok=True)
         with file_in_place_of(target) as new:
             shutil.move(part.path, new)
@@ -227,6 +241,7 @@ class HubRemote(Remote):
 
     def _fetch_one(self, name: str, advance: Advance) -> None:
         expected, found = self.manifest[name], ""
+        most = self._sizes.get(name, LARGEST) if name.startswith("data/") else LARGEST
         for _ in range(2):
             arrived = 0
 
@@ -235,7 +250,9 @@ class HubRemote(Remote):
                 arrived += size
                 advance(size)
 
-            target = self.store.patiently(name, lambda count=count: _from_hub(self.url, name, self.revision, count))
+            target = self.store.patiently(
+                name, lambda count=count: _from_hub(self.url, name, self.revision, most, count)
+            )
             advance(target.stat().st_size - arrived)
             found = file_hash(target)
             if found == expected:
@@ -253,9 +270,8 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     match = _HUB.fullmatch(url)
     if match is None:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
-    store = Store(f"hf://datasets/{match['repo']}", patience)
     try:
-        path = store.patiently(MANIFEST, lambda: _manifest_from_hub(url, match["revision"]))
+        path = Store(url, patience).patiently(MANIFEST, lambda: _manifest_from_hub(url, match["revision"]))
     except RemoteError as error:
         if error.missing:
             raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
@@ -263,7 +279,7 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     folder, commit = path.parent, path.parent.name
     pinned = f"hf://datasets/{match['repo']}@{commit}"
     manifest = _checked_manifest(path.read_bytes(), pinned)
-    store = Store(pinned, patience)
+    store = HubStore(match["repo"], commit, patience)
     if to is not None:
         _write_once(to, path.read_bytes(), manifest, pinned)
         return Remote(pinned, commit, to, _beside(to), manifest, store)
@@ -271,8 +287,9 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
 
 
 def _manifest_from_hub(url: str, revision: str | None) -> Path:
-    """The same of the manifest, for which the Hub's cache alone vouches: a blob's name there is its hash."""
-    path = _from_hub(url, MANIFEST, revision)
+    """The manifest, for which the Hub's cache alone vouches: a blob's name there is its hash."""
+    path = _from_hub(url, MANIFEST, revision, _MANIFEST_BYTES)
+    plain_size(path, _MANIFEST_BYTES)
     data, blob = path.read_bytes(), path.resolve()
     git = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
     if len(blob.name) == len(git) and blob.name != git:
@@ -282,8 +299,8 @@ def _manifest_from_hub(url: str, revision: str | None) -> Path:
     return path
 
 
-def _from_hub(url: str, name: str, revision: str | None, advance: Advance = lambda size: None) -> Path:
-    """A file of a repository in the Hub's cache."""
+def _from_hub(url: str, name: str, revision: str | None, most: int, advance: Advance = lambda size: None) -> Path:
+    """A file of a repository in the Hub's cache, which takes at most so many bytes."""
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import LocalEntryNotFoundError
     from tqdm import tqdm
@@ -293,9 +310,14 @@ def _from_hub(url: str, name: str, revision: str | None, advance: Advance = lamb
             super().__init__(*args, **options | {"disable": True})
 
         def update(self, n: float | None = 1) -> bool | None:
+            nonlocal arrived
+            arrived += int(n or 0)
+            if arrived > most:
+                raise RemoteError(f"{url}/{name}: expected at most {most:,} bytes, and more came")
             advance(int(n or 0))
             return super().update(n)
 
+    arrived = 0
     match = _HUB.fullmatch(url)
     assert match is not None
     where: dict[str, Any] = {"repo_type": "dataset", "revision": revision, "local_files_only": offline()}
@@ -335,8 +357,9 @@ def _asked_manifest(url: str, store: Store) -> bytes:
 
 def _kept_manifest(url: str, folder: Path) -> bytes:
     try:
+        plain_size(folder / MANIFEST, _MANIFEST_BYTES)
         return (folder / MANIFEST).read_bytes()
-    except OSError as error:
+    except (OSError, IndexFormatError) as error:
         raise OfflineError(f"{url}: offline, and nothing of this release is here; go online to fetch it") from error
 
 
@@ -354,12 +377,13 @@ def _checked_manifest(text: bytes, url: str) -> dict[str, str]:
 def _write_once(folder: Path, text: bytes, manifest: dict[str, str], url: str) -> None:
     """The manifest into the mirror, which holds files of this manifest alone."""
     path = folder / MANIFEST
-    here = path.read_bytes() if path.exists() else None
-    if here not in (None, text) and not _fits(folder, here, manifest):
-        raise OptionError(f"{folder}: holds another release or version than {url} now; give another folder")
-    if here != text:
+    if holds(path, text):
+        return
+    with alone(_beside(folder)):
+        if path.exists() and not holds(path, text) and not _fits(folder, manifest):
+            raise OptionError(f"{folder}: holds another release or version than {url} now; give another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        with alone(_beside(folder)), file_in_place_of(path) as partial:
+        with file_in_place_of(path) as partial:
             partial.write_bytes(text)
 
 
@@ -373,11 +397,11 @@ def alone(folder: Path) -> FileLock:
     return FileLock(folder / ".lock")
 
 
-def _fits(folder: Path, here: bytes, manifest: dict[str, str]) -> bool:
+def _fits(folder: Path, manifest: dict[str, str]) -> bool:
     """Whether all that is here is of another manifest as well: then the one here, or that one, had come damaged."""
     try:
-        listed = parse_manifest(here.decode(), folder / MANIFEST)
-    except (Icrl4ahtError, UnicodeDecodeError):
+        listed = read_manifest(folder)
+    except Icrl4ahtError:
         return False
     return all(manifest.get(name) == digest for name, digest in listed.items() if (folder / name).exists())
 

@@ -113,6 +113,10 @@ def held_fields(kind: Kind) -> tuple[Field, ...]:
     return tuple(field for field in FIELDS.values() if stored not in field.absent)
 
 
+LONGEST = 2**40
+"""No history has as many steps, so that sums of steps fit into 64 bits."""
+
+
 def record_field(kind: Kind) -> Field:
     """The field that is held of each step to show what the ego saw: the state record, or the observation itself."""
     return FIELDS["state" if kind in KINDS else "obs"]
@@ -174,18 +178,15 @@ class Entry:
         missing, extra = JSON_TYPES.keys() - line.keys(), line.keys() - JSON_TYPES.keys()
         if missing or extra:
             raise IndexFormatError(f"missing fields {sorted(missing)}, unknown fields {sorted(extra)}")
-        for name, types in JSON_TYPES.items():
-            value = line[name]
-            if type(value) not in types:
-                expected = " or ".join(sorted(t.__name__ for t in types))
-                raise IndexFormatError(f"field {name!r}: expected {expected}, found {value!r}")
-            if type(value) is int and not -(2**63) <= value < 2**63:
-                raise IndexFormatError(f"field {name!r}: expected at most 64 bits, found {value}")
+        for name in JSON_TYPES:
+            check_value(name, line[name])
         shape = line["obs_shape"]
         if len(shape) != 3 or not all(isinstance(n, int) for n in shape):
             raise IndexFormatError(f"field 'obs_shape': expected three integers, found {shape!r}")
         if line["T"] <= 0 or line["episodes"] <= 0:
             raise IndexFormatError(f"T = {line['T']} and episodes = {line['episodes']}: expected positive numbers")
+        if line["T"] >= LONGEST:
+            raise IndexFormatError(f"T = {line['T']}: expected less than {LONGEST}")
         values: dict[str, Any] = {**line, "obs_shape": tuple(shape)}
         return cls(**values)
 
@@ -202,6 +203,33 @@ JSON_TYPES: dict[str, set[type]] = {
     for field in fields(Entry)
 }
 """The types that a JSON parser may give for each field of an index line."""
+
+_NAME = 512  # characters: names are stored side by side, each as wide as the longest
+FINITE = 1e15
+"""What numbers of the index stay below: neither infinite nor anything that a sum would make so."""
+
+
+def is_name(text: str) -> bool:
+    """Whether a text may name something: short, and without what a terminal or UTF-8 takes otherwise."""
+    return len(text) <= _NAME and text.isprintable()
+
+
+def check_value(name: str, value: Any) -> None:
+    """Whether a field of an index line has its type, and a value that can be stored.
+
+    Raises:
+        IndexFormatError: names the field.
+    """
+    types = JSON_TYPES[name]
+    if type(value) not in types:
+        expected = " or ".join(sorted(t.__name__ for t in types))
+        raise IndexFormatError(f"field {name!r}: expected {expected}, found {value!r:.200}")
+    if type(value) is int and not -(2**63) <= value < 2**63:
+        raise IndexFormatError(f"field {name!r}: expected at most 64 bits, found {value}")
+    if types == {float, int} and not abs(value) < FINITE:
+        raise IndexFormatError(f"field {name!r}: expected a number below {FINITE:g}, found {value}")
+    if type(value) is str and not is_name(value):
+        raise IndexFormatError(f"field {name!r}: expected at most {_NAME} printable characters, found {value[:100]!r}")
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.blocks import bring
+from icrl4aht_data.cache import new_array
 from icrl4aht_data.errors import (
     ChunkTableError,
     OptionError,
@@ -41,6 +42,12 @@ _DEFLATE_LEVEL = 6
 _BETWEEN = 2048  # bytes: what a fault between the chunks costs to repair
 _BLOCK = 2000  # steps: a chunk of scalars, two of records
 _CACHE_BYTES = 256 * 2**20
+
+DEFLATE_RATIO = 1100
+"""No deflated bytes become as many times as much."""
+
+_TABLE_BYTES = 256 * 2**20  # a thousand times that of a shard of the usual size
+_LINE_BYTES = 16 * 2**20  # what a line of it may cover, thirty times our largest chunk
 
 
 def chunk_table_name(shard: str) -> str:
@@ -292,6 +299,7 @@ class Shard:
     def _check_rows(self, entries: Sequence[Entry]) -> None:
         """Whether the chunk table has the rows that the index says."""
         total = 0
+        counts, sizes = [], []
         for entry in entries:
             for field in entry.stored_fields(self.kind):
                 self._first[entry.history_id, field.name] = total
@@ -303,6 +311,15 @@ class Shard:
                         f"chunk table says {found}; fetch meta/ and the shard again"
                     )
                 total += chunks
+                counts.append(chunks)
+                sizes.append(min(field.chunk, expected) * self._element(field)[2])
+        raw, stored = np.repeat(sizes, counts), self._table["size"][:total].astype(np.int64)
+        wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))
+        if len(wrong):
+            raise ShardMismatchError(
+                f"{self.path}: {self.describe(int(wrong[0]))} cannot be {raw[wrong[0]]} bytes deflated; "
+                f"fetch meta/ and the shard again"
+            )
 
     def _check_size(self) -> None:
         """Whether the file is long enough for every chunk."""
@@ -313,6 +330,8 @@ class Shard:
                 raise self._missing() from error
             size = self._remote.size(self.name)
         offset, length = self._table["offset"], self._table["size"]
+        if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
+            raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
             raise ShardTruncatedError(
@@ -346,7 +365,8 @@ class Shard:
         Raises:
             ShardCorruptError: names the chunk whose checksum or size is wrong.
         """
-        rows = np.empty((stop - start, *self._element(field)[1]), field.dtype)
+        what = f"{self.path}: history {history_id}: {field.name}"
+        rows = new_array((stop - start, *self._element(field)[1]), field.dtype, what)
         self.read_into(history_id, field, start, rows)
         return rows
 
@@ -474,25 +494,38 @@ class Shard:
                 if values and not faults:
                     faults = self._value_faults(file)
                 return faults
-        except (OSError, KeyError, RuntimeError, ValueError, AttributeError, TypeError) as error:
+        except Exception as error:  # a damaged file makes h5py raise anything
             return [f"not an HDF5 file as the index describes it: {error}"]
 
     def _structure_faults(self, file: h5py.File) -> list[str]:
+        from icrl4aht_data import hdf5
+
         faults = []
-        attributes = {"format_version": FORMAT_VERSION, "layout": self.layout.name}
-        if dict(file.attrs) != attributes:
-            faults.append(f"attributes: expected {attributes}, found {dict(file.attrs)}")
+        expected, found = {"format_version": FORMAT_VERSION, "layout": self.layout.name}, hdf5.attributes(file)
+        if found != expected:
+            faults.append(f"attributes: expected {expected}, found {found}")
         groups = Counter(entry.h5_group for entry in self._entries.values())
         if {f"/{name}" for name in file} != set(groups):
             faults.append(f"groups: expected {sorted(groups)}, found {sorted(f'/{name}' for name in file)}")
             return faults
+        for group, entry in {entry.h5_group: entry for entry in self._entries.values()}.items():
+            names = sorted(field.name for field in entry.stored_fields(self.kind))
+            if sorted(hdf5.member(file, group)) != names:
+                faults.append(f"{group}: expected {names}, found {sorted(hdf5.member(file, group))}")
+                return faults
         places: list[tuple[int, int, int]] = []
         for entry in self._entries.values():
             for field in entry.stored_fields(self.kind):
-                dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+                dataset = hdf5.member(file, f"{entry.h5_group}/{field.name}")
+                used = hdf5.filters(dataset)
                 rows = entry.rows(field)
                 shape = (rows,) if entry.h5_row is None else (groups[entry.h5_group], rows)
                 element = field.element(self.layout, self.kind)
+                shuffled = [hdf5.SHUFFLE] if element.itemsize > 1 else []
+                if used != [*shuffled, hdf5.DEFLATE]:
+                    faults.append(f"{dataset.name}: filters {used}, expected {[*shuffled, hdf5.DEFLATE]}")
+                elif dataset.chunks != (*(1 for _ in shape[1:]), min(field.chunk, rows)):
+                    faults.append(f"{dataset.name}: chunks {dataset.chunks}, expected {min(field.chunk, rows)} rows")
                 if dataset.shape != shape or dataset.dtype != element:
                     faults.append(
                         f"{dataset.name}: expected {shape} of {element}, found {dataset.shape} of {dataset.dtype}"
@@ -510,11 +543,11 @@ class Shard:
         for entry in self._entries.values():
             for field in entry.stored_fields(self.kind):
                 dataset: Any = file[f"{entry.h5_group}/{field.name}"]
-                theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
                 try:
                     ours = self.read(entry.history_id, field, 0, entry.rows(field))
                 except ShardCorruptError:
-                    continue  # reported chunk by chunk
+                    continue  # reported chunk by chunk, and nothing for libhdf5 to inflate
+                theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
                 if not np.array_equal(theirs, ours):
                     faults.append(f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do")
         return faults
@@ -547,11 +580,15 @@ def read_table(path: Path) -> np.ndarray:
         ChunkTableError: if it is missing, or no chunk table.
     """
     try:
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
+        if path.stat().st_size > _TABLE_BYTES:
+            raise ValueError(f"more than {_TABLE_BYTES:,} bytes")
+        table = np.lib.format.open_memmap(path, mode="r")  # other than `np.load` it takes no archives, either
     except FileNotFoundError as error:
         raise ChunkTableError(f"{path}: the chunk table is missing") from error
     except Exception as error:  # a damaged header makes NumPy's parser raise anything
         raise ChunkTableError(f"{path}: not a chunk table: {error!r}") from error
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:
         raise ChunkTableError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
+    if (table["size"] > _LINE_BYTES).any():
+        raise ChunkTableError(f"{path}: a line covers more than {_LINE_BYTES:,} bytes")
     return table

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from operator import mul
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +54,10 @@ def _of_layout(
     lengths = {entry.task_id: entry.T for entry in entries}
     steps = [entry.T for entry in entries]
     streams = [provenance.get(task_id, {}).get(STREAMS_RECORDED) for task_id in lengths]
+    known = all(type(number) is int and 0 <= number < 2**31 for number in streams)
     teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
     return {
-        "original_transitions": None if None in streams else int(np.dot(streams, list(lengths.values()))),
+        "original_transitions": sum(map(mul, streams, lengths.values())) if known else None,
         "filtered_transitions": sum(steps),
         "history_length": [min(steps), max(steps)],
         "teammates": len(teammates) or None,
@@ -67,14 +69,22 @@ def _of_layout(
     }
 
 
+def statistics_rows(statistics: dict[str, dict[str, Any]]) -> list[list[str]]:
+    """The table in words: a row per property, which names it and has a cell per layout."""
+    return [
+        [label, *(_in_words(name, of_layout[name]) for of_layout in statistics.values())]
+        for name, label in _ROWS.items()
+    ]
+
+
 def print_statistics(info: dict[str, Any], console: Console) -> None:
     """The table of a release's meta/info.json: a row per property, a column per layout."""
     statistics = info["statistics"]
     table = Table("property", box=box.MARKDOWN, title=f"{info['kind']} release {info['data_version']}")
     for layout in statistics:
         table.add_column(layout, justify="right")
-    for name, label in _ROWS.items():
-        table.add_row(label, *(_in_words(name, of_layout[name]) for of_layout in statistics.values()))
+    for row in statistics_rows(statistics):
+        table.add_row(*row)
     console.print(table, width=max(console.width, 30 + 16 * len(statistics)), crop=False)
 
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.benchmark import (
@@ -25,8 +26,9 @@ from icrl4aht_data.benchmark import (
     check_place,
     unknown,
 )
-from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError
-from icrl4aht_data.files import parse_json, read_text
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, TaskFormatError
+from icrl4aht_data.files import parse_json, read_lines, read_text
+from icrl4aht_data.manifest import is_inside
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _FIELDS = ("task_id", "track", "split", "layout_name", "seed", "teammate")
@@ -137,7 +139,7 @@ def read_tasks(path: Path) -> list[Task]:
         TaskFormatError: names the file and the line.
     """
     tasks: dict[str, Task] = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         try:
             task = _parse(line)
             if task.task_id in tasks:
@@ -146,6 +148,23 @@ def read_tasks(path: Path) -> list[Task]:
             raise TaskFormatError(f"{path}, line {number}: {error}") from error
         tasks[task.task_id] = task
     return list(tasks.values())
+
+
+def read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+    """How the histories of each task were made, by task_id; what it says of a teammate is an object, too.
+
+    Raises:
+        IndexFormatError: names the file.
+    """
+    text = read_text(path)
+    try:
+        content = parse_json(text)
+    except IndexFormatError as error:
+        raise IndexFormatError(f"{path}: {error}") from error
+    notes = content.values() if isinstance(content, dict) else [content]
+    if not all(isinstance(note, dict) and isinstance(note.get("teammate", {}), dict) for note in notes):
+        raise IndexFormatError(f"{path}: expected an object of objects, one for each task")
+    return content
 
 
 def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
@@ -161,6 +180,8 @@ def _parse(line: str) -> Task:
     for name, kind in (("task_id", str), ("layout_name", str), ("seed", int), ("teammate", dict)):
         if not isinstance(fields[name], kind):
             raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
+    if abs(fields["seed"]) >= 2**63:
+        raise TaskFormatError(f"seed: expected at most 64 bits, found {fields['seed']}")
     check_place(fields["track"], fields["split"], get_layout(fields["layout_name"]).name)
     teammate = fields["teammate"]
     if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
@@ -188,6 +209,9 @@ def _check_teammate(teammate: dict[str, Any]) -> None:
     if teammate["kind"] == "rl":
         if set(theta) != {"checkpoint", "sha256"} or not all(isinstance(value, str) for value in theta.values()):
             raise TaskFormatError(f"teammate.theta: expected the strings checkpoint and sha256, found {theta!r}")
-        path = PurePosixPath(theta["checkpoint"])
-        if path.is_absolute() or ".." in path.parts:
-            raise TaskFormatError(f"teammate.theta.checkpoint: expected a path within the suite, found {str(path)!r}")
+        if not is_inside(theta["checkpoint"]):
+            raise TaskFormatError(
+                f"teammate.theta.checkpoint: expected a path within the suite, found {theta['checkpoint'][:200]!r}"
+            )
+        if not re.fullmatch("[0-9a-f]{64}", theta["sha256"]):
+            raise TaskFormatError(f"teammate.theta.sha256: expected 64 digits, found {theta['sha256'][:200]!r}")

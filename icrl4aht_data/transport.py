@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from functools import cached_property
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, RemoteError
 
@@ -20,6 +22,8 @@ T = TypeVar("T")
 _PASSING = {408, 425, 429, 500, 502, 503, 504}
 _LASTING = (FileNotFoundError, PermissionError, Icrl4ahtError, ImportError, NotImplementedError, MemoryError, TypeError)
 _TIMEOUT = 30  # seconds without a byte, or until a connection
+_TOTAL = 300  # seconds for a request, of a server that sends a byte now and then
+_WHOLE = 64 * 2**20  # bytes taken from a server that gives all of a file instead of a range
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Store:
     """Files below an address. May be shared between threads, pickled, and used after a fork.
 
     Args:
-        url: of a folder: https://, s3://, hf://datasets/<org>/<repo>@<revision>, or any other that fsspec opens.
+        url: of a folder: https://, s3://, or any other that fsspec opens; for the Hub see `HubStore`.
         patience: see there.
     """
 
@@ -84,30 +88,32 @@ class Store:
     def size(self, name: str) -> int:
         """Of a file, in bytes."""
 
-        def ask() -> int:
-            size = self._files.info(self._address(name))["size"]
-            if size is None:
-                raise WrongLengthError("the server does not say how long the file is")
-            return int(size)
+        return self.patiently(name, lambda: self._size(name))
 
-        return self.patiently(name, ask)
+    def _size(self, name: str) -> int:
+        size = self._files.info(f"{self.url}/{name}")["size"]
+        if size is None:
+            raise WrongLengthError("the server does not say how long the file is")
+        return int(size)
 
     def _range(self, name: str, start: int, stop: int) -> bytes:
-        # cache_type: the Hub's file system would read five megabytes ahead
-        hub = {"cache_type": "none"} if self.url.startswith("hf://") else {}
-        data = self._files.cat_file(self._address(name), start=start, end=stop, **hub)
+        return self._counted(name, start, stop, self._files.cat_file(f"{self.url}/{name}", start=start, end=stop))
+
+    def _counted(self, name: str, start: int, stop: int, data: bytes) -> bytes:
+        """What a request has given, if it is what was asked for, or a whole file."""
         with self._lock:
             self._traffic.requests += 1
             self._traffic.bytes += len(data)
         if len(data) != stop - start:
-            whole = len(data) >= stop and len(data) == self._files.info(self._address(name))["size"]
-            if not whole:
+            if len(data) < stop or len(data) != self._size(name):
                 raise WrongLengthError(f"asked for bytes {start}..{stop}, got {len(data)} bytes")
             data = data[start:stop]  # a server without ranges
         return data
 
-    def _address(self, name: str) -> str:
-        return f"{self.url}/{name}" if name else self.url
+    @property
+    def _opens(self) -> str:
+        """An address of the kind that the file system is for."""
+        return self.url
 
     @property
     def _files(self) -> Any:
@@ -120,20 +126,19 @@ class Store:
     def _opened(self) -> tuple[int, Any]:
         import fsspec
 
-        scheme = self.url.partition("://")[0]
+        url = self._opens
+        scheme = url.partition("://")[0]
         options: dict[str, Any] = {"skip_instance_cache": True, "use_listings_cache": False}
         if scheme in ("http", "https"):
             import aiohttp
 
-            timeout = aiohttp.ClientTimeout(total=None, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
-            options["client_kwargs"] = {"timeout": timeout}
+            timeout = aiohttp.ClientTimeout(total=_TOTAL, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
+            options["client_kwargs"] = {"timeout": timeout, "response_class": _bounded_response()}
         elif scheme == "s3":
-            options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT}
-            options["config_kwargs"]["retries"] = {"total_max_attempts": 1}  # `Patience` is enough
-        elif scheme == "hf":
-            options = {"skip_instance_cache": True}
+            once = {"total_max_attempts": 1}  # `Patience` is enough
+            options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT, "retries": once}
         try:
-            files = fsspec.url_to_fs(self.url, **options)[0]
+            files = fsspec.url_to_fs(url, **options)[0]
         except ImportError as error:
             extra = {"s3": "s3"}.get(scheme)
             remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
@@ -141,7 +146,7 @@ class Store:
         except ValueError as error:
             raise OptionError(f"{self.url}: not an address that fsspec opens: {error}") from error
         if scheme == "s3":
-            files.retries = 1
+            files.retries = 1  # as above
         return os.getpid(), files
 
     def patiently(self, name: str, ask: Callable[[], T]) -> T:
@@ -163,16 +168,14 @@ class Store:
             return retrying(ask)
         except (Icrl4ahtError, MemoryError):
             raise
-        except Exception as raised:  # every file system has errors of its own
-            error = _behind(raised)
+        except Exception as error:  # every file system has errors of its own
             if _is_of_disk(error):
                 raise
-            if not isinstance(error, FileNotFoundError) and _status(error) != 404:
+            if not isinstance(_cause(error), FileNotFoundError) and _status(error) != 404:
                 tried = f" ({self.patience.attempts} attempts)" if _passes(error) else ""
-                raise RemoteError(
-                    f"{self._address(name)}: {_in_words(error)}{tried}; what has arrived is kept: try again to go on"
-                ) from error
-            raise RemoteError(f"{self._address(name)}: the remote has no such file", missing=True) from error
+                what = f"{_in_words(_cause(error))}{tried}"
+                raise RemoteError(f"{self.url}/{name}: {what}; what has arrived is kept: try again to go on") from error
+            raise RemoteError(f"{self.url}/{name}: the remote has no such file", missing=True) from error
 
     def _wait(self, state: Any) -> float:
         error = state.outcome.exception()
@@ -180,20 +183,98 @@ class Store:
         return min(max(doubled, _retry_after(error)), self.patience.longest)
 
 
+class HubStore(Store):
+    """Files of a dataset repository of the Hub at one commit.
+
+    The Hub answers for a large file with the place where it lies; that is asked for once and then read by ranges, which
+    is one request each.
+
+    Args:
+        repo: <org>/<repo>.
+        commit: all 40 digits.
+        patience: see `Patience`.
+    """
+
+    def __init__(self, repo: str, commit: str, patience: Patience | None = None) -> None:
+        super().__init__(f"hf://datasets/{repo}@{commit}", patience)
+        self._repo, self._commit = repo, commit
+        self._places: dict[str, Any] = {}
+
+    def __getstate__(self) -> tuple:
+        return self._repo, self._commit, self.patience
+
+    def __setstate__(self, state: tuple) -> None:
+        self.__init__(*state)
+
+    @property
+    def _opens(self) -> str:
+        return "https://"
+
+    def _place(self, name: str) -> Any:
+        """The Hub's metadata of a file: `location` and `size`."""
+        from huggingface_hub import get_hf_file_metadata, hf_hub_url
+
+        if name not in self._places:
+            url = hf_hub_url(self._repo, name, repo_type="dataset", revision=self._commit)
+            self._places[name] = get_hf_file_metadata(url)
+        return self._places[name]
+
+    def _size(self, name: str) -> int:
+        size = self._place(name).size
+        if size is None:
+            raise WrongLengthError("the Hub does not say how long the file is")
+        return int(size)
+
+    def _range(self, name: str, start: int, stop: int) -> bytes:
+        from huggingface_hub import constants
+        from huggingface_hub.utils import build_hf_headers
+
+        place = self._place(name).location
+        of_hub = urlsplit(place).netloc == urlsplit(constants.ENDPOINT).netloc
+        headers = build_hf_headers() if of_hub else {}  # the token is nobody else's business
+        try:
+            data = self._files.cat_file(place, start=start, end=stop, headers=headers)
+        except Exception as error:
+            if _status(error) in (401, 403, 404, 410) and not of_hub:  # the place is lent for a while
+                self._places.pop(name, None)
+                raise ConnectionError(f"{name}: its place at the Hub has changed") from None
+            raise
+        return self._counted(name, start, stop, data)
+
+
+def _bounded_response() -> type:
+    """aiohttp's response, but that it takes no longer body than was asked for: a hostile server's has no end."""
+    from aiohttp import ClientResponse
+
+    class BoundedResponse(ClientResponse):
+        async def read(self) -> bytes:
+            if self._body is None:
+                asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.request_info.headers.get("Range", ""))
+                most = int(asked[2]) - int(asked[1]) + 1 if asked and self.status == 206 else _WHOLE
+                body = bytearray()
+                async for part in self.content.iter_any():
+                    body += part
+                    if len(body) > most:
+                        self.close()
+                        raise WrongLengthError(f"expected at most {most:,} bytes, and more came")
+                self._body = bytes(body)
+            return self._body
+
+    return BoundedResponse
+
+
 def _passes(error: BaseException) -> bool:
     """Whether the same request may succeed a moment later."""
-    error = _behind(error)
     status = _status(error)
     if status is not None:
         return status in _PASSING
-    return isinstance(error, Exception) and not isinstance(error, _LASTING) and not _is_of_disk(error)
+    return isinstance(error, Exception) and not isinstance(_cause(error), _LASTING) and not _is_of_disk(error)
 
 
-def _behind(error: BaseException) -> BaseException:
-    """What went wrong: fsspec says "not found" of whatever keeps it from asking for a file's length."""
-    status = _status(error)
-    if isinstance(error, FileNotFoundError) and error.__cause__ and (status is None or status in _PASSING):
-        return error.__cause__
+def _cause(error: BaseException) -> BaseException:
+    """What is behind a FileNotFoundError: fsspec makes one of any failure to learn a file's size."""
+    while isinstance(error, FileNotFoundError) and error.__cause__ is not None:
+        error = error.__cause__
     return error
 
 

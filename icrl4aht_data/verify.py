@@ -9,18 +9,19 @@ import hashlib
 import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, EGO
+from icrl4aht_data.cache import free_memory
 from icrl4aht_data.dataset import MINI, History, Names
 from icrl4aht_data.download import ORIGIN, chosen_files
-from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError, UnsafePathError
-from icrl4aht_data.files import parse_json, read_text
+from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError
 from icrl4aht_data.index import Index, read_index
-from icrl4aht_data.manifest import file_hash, inside, read_manifest
+from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, read_manifest
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import step
@@ -43,10 +44,18 @@ from icrl4aht_data.schema import (
     record_field,
     stream_score,
 )
-from icrl4aht_data.shard import Shard
+from icrl4aht_data.shard import Shard, chunk_table_name, read_table
 from icrl4aht_data.statistics import layout_statistics
-from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.tasks import Task, read_provenance, read_tasks
 from icrl4aht_data.transport import Traffic
+
+_OF_THE_HUB = (".gitattributes", ".cache/huggingface/")
+"""What its own tools put beside a repository's files."""
+
+_FINDINGS = 100_000
+_LOST = 100  # shards of one set that are named
+_COPIES = 4  # of a history that checking it takes
+_LONG = 2000  # characters of a finding
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,16 @@ class Report:
         return {"ok": self.ok, **asdict(self)}
 
     def add(self, file: str, problem: str) -> None:
-        self.findings.append(Finding(file, problem))
+        if len(self.findings) < _FINDINGS:
+            self.findings.append(Finding(_plain(file), _plain(problem)))
+        elif len(self.findings) == _FINDINGS:
+            self.findings.append(Finding(".", "and more: mend these first, then verify again"))
+
+
+def _plain(text: str) -> str:
+    """Without what a terminal would obey, or cannot show."""
+    text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
+    return text if text.isprintable() else text.encode("unicode_escape").decode()
 
 
 Advance = Callable[[str, int, int], None]
@@ -130,7 +148,7 @@ def verify_release(
     report.root = str(origin)
     try:
         _verify(origin, report, advance, wanted)
-    except Icrl4ahtError as error:
+    except (Icrl4ahtError, OSError) as error:
         report.add("meta", str(error))
     if origin.remote is not None:
         traffic = origin.remote.store.traffic - before
@@ -140,18 +158,20 @@ def verify_release(
 
 def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Names]) -> None:
     listed = _manifest(origin, report)
-    chosen: set[str] | None = None
+    chosen, unreadable = set(listed), None
     try:
         chosen = chosen_files(origin, **wanted)
     except (EmptySelectionError, UnknownNameError):
         raise
     except Icrl4ahtError as error:
-        report.add("meta", str(error))
-    expected = listed.keys() if chosen is None else listed.keys() & chosen
+        unreadable = error
     if origin.remote is not None and not report.quick:
-        _fetch(origin.remote, sorted(expected), report, advance)
-    _check_files(origin, {name: listed[name] for name in expected}, listed.keys(), report, advance)
-    if chosen is None:
+        _fetch(origin.remote, sorted(chosen), report, advance)
+    _check_files(
+        origin, {name: digest for name, digest in listed.items() if name in chosen}, listed.keys(), report, advance
+    )
+    if unreadable is not None:
+        report.add("meta", str(unreadable))
         return
     index = read_index(origin)
     tasks = read_tasks(inside(origin.folder, TASKS))
@@ -210,7 +230,8 @@ def _check_index(index: Index, tasks: list[Task], chosen: set[str], report: Repo
     info = index.info
     kept_steps = info["environment"]["kept_steps"]
     expected = describe(info["kind"], info["data_version"], kept_steps, list(index.entries))
-    if report.ok and chosen.issuperset(index.values("shard")) and not report.quick:
+    here = all(name in chosen and (index.root / name).is_file() for name in index.values("shard"))
+    if report.ok and here and not report.quick:
         expected["shards"] = shard_sizes(index.root, index.entries)  # else what they are made of is at fault, or away
         expected["statistics"] = _statistics(index, tasks)
     elif info["shards"].keys() != set(index.values("shard")):
@@ -221,8 +242,8 @@ def _check_index(index: Index, tasks: list[Task], chosen: set[str], report: Repo
     shards = {entry.shard for entry in index.entries}
     for shard in shards:
         stem, count = shard.removesuffix(".h5").split("-")[0], int(shard.removesuffix(".h5").split("-")[-1])
-        missing = {f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count)} - shards
-        for name in sorted(missing):
+        names = (f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count))
+        for name in islice((name for name in names if name not in shards), _LOST):
             report.add(name, f"the name of {shard} promises this shard, the index has no history in it")
 
 
@@ -240,7 +261,7 @@ def _check_apart(tasks: list[Task], report: Report) -> None:
 def _check_sizes(index: Index, shards: list[str], report: Report) -> None:
     """Whether every shard is as long as the release says, where it is."""
     for name in shards:
-        expected, found = index.info["shards"][name], None
+        expected, found = index.info["shards"].get(name), None
         remote, path = index.origin.remote, inside(index.root, name)
         if path.exists():
             found = path.stat().st_size
@@ -258,7 +279,11 @@ def _check_teammates(root: Path, tasks: list[Task], report: Report) -> None:
     """Whether the weights of learned teammates are those that the tasks name. A release need not have them."""
     without = 0
     for task in tasks:
-        files = checkpoint_files(root / TEAMMATES, task)
+        try:
+            files = checkpoint_files(root / TEAMMATES, task, root)
+        except Icrl4ahtError as error:
+            report.add(f"{TEAMMATES}/{task.teammate['theta']['sha256']}", str(error))
+            continue
         without += task.teammate_family == "rl" and not files
         for name, path in files.items():
             found = file_hash(path)
@@ -271,10 +296,10 @@ def _check_teammates(root: Path, tasks: list[Task], report: Report) -> None:
 
 def _statistics(index: Index, tasks: list[Task]) -> Any:
     try:
-        provenance = parse_json(read_text(index.root / PROVENANCE))
+        provenance = read_provenance(inside(index.root, PROVENANCE))
         kept_steps = index.info["environment"]["kept_steps"]
         return layout_statistics(index.root, index.entries, tasks, provenance, kept_steps)
-    except (Icrl4ahtError, OSError, AttributeError, TypeError) as error:
+    except (Icrl4ahtError, OSError) as error:
         return f"what {PROVENANCE} and the shards give: {error}"
 
 
@@ -296,24 +321,36 @@ def _check_files(
         listed: all files of the manifest.
     """
     root = origin.folder
-    present = {p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file() or p.is_symlink()}
+    present = set(files_below(root))
     if not report.quick or origin.remote is None:
         for name in sorted(expected.keys() - present):
             report.add(name, "listed in the manifest, but missing")
     for name in sorted(present - set(listed) - {MANIFEST, ORIGIN}):
-        report.add(name, "not listed in the manifest")
+        if not name.startswith(_OF_THE_HUB):
+            report.add(name, "not listed in the manifest")
     both = sorted(expected.keys() & present)
     for number, name in enumerate(both, start=1):
         try:
             path = inside(root, name)
+            if path.stat().st_size > LARGEST and not _is_covered(root, name):
+                report.add(name, f"expected at most {LARGEST:,} bytes, found {path.stat().st_size:,}")
+                continue
             found = expected[name] if report.quick else file_hash(path)
-        except (UnsafePathError, OSError) as error:
+        except (Icrl4ahtError, OSError) as error:
             report.add(name, str(error))
             continue
         if found != expected[name]:
             report.add(name, f"sha256: expected {expected[name]}, found {found}")
         report.files += 1
         advance("files", number, len(both))
+
+
+def _is_covered(root: Path, name: str) -> bool:
+    """Whether a file is a shard of which the chunk table accounts for every byte: a hole is not worth hashing."""
+    if not name.startswith("data/"):
+        return False
+    table = read_table(inside(root, chunk_table_name(name)))
+    return int(table["size"].sum(dtype=np.int64)) == (root / name).stat().st_size
 
 
 def _check_shards(index: Index, shards: list[str], report: Report, advance: Advance) -> None:
@@ -332,17 +369,28 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Adva
         seen: dict[tuple[str, bytes], int] = {}
         for entry in entries:
             if entry.history_id not in damaged:
-                history = History(entry, shard, "uint8")
-                for problem in _history_problems(history, index.info["environment"]["kept_steps"], report.deep):
-                    report.add(name, f"history {entry.history_id}: {problem}")
-                seen_and_done = (record_field(shard.kind).name, "actions")
-                content = hashlib.sha256(b"".join(history.read(part).tobytes() for part in seen_and_done)).digest()
-                twin = seen.setdefault((entry.task_id, content), entry.history_id)
-                if twin != entry.history_id:
-                    report.add(name, f"history {entry.history_id}: the same as history {twin}")
-                report.transitions += entry.T
+                try:
+                    _check_history(History(entry, shard, "uint8"), index, seen, report)
+                except (Icrl4ahtError, MemoryError) as error:
+                    report.add(name, f"history {entry.history_id}: could not be checked: {error!r}")
             report.histories += 1
             advance("histories", report.histories, total)
+
+
+def _check_history(history: History, index: Index, seen: dict[tuple[str, bytes], int], report: Report) -> None:
+    entry, kind = history.entry, index.info["kind"]
+    layout = get_layout(entry.layout)
+    bytes_a_step = sum(part.element(layout, kind).itemsize for part in entry.stored_fields(kind))
+    if (size := _COPIES * entry.T * bytes_a_step) > free_memory():
+        raise OptionError(f"takes {size / 1e9:.3g} GB of memory, more than is free")
+    for problem in _history_problems(history, index.info["environment"]["kept_steps"], report.deep):
+        report.add(entry.shard, f"history {entry.history_id}: {problem}")
+    seen_and_done = (record_field(kind).name, "actions")
+    content = hashlib.sha256(b"".join(history.read(part).tobytes() for part in seen_and_done)).digest()
+    twin = seen.setdefault((entry.task_id, content), entry.history_id)
+    if twin != entry.history_id:
+        report.add(entry.shard, f"history {entry.history_id}: the same as history {twin}")
+    report.transitions += entry.T
 
 
 def _check_chunks(shard: Shard, report: Report) -> set[int]:

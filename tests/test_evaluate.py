@@ -14,11 +14,12 @@ from baselines.agents import Percept, from_host, get_agent, random, stay
 from baselines.cli import cli
 from baselines.evaluate import PROTOCOLS, evaluate, get_protocol, play_tasks, read_result
 from baselines.headroom import write_cards
-from baselines.report import Run, as_run, csv_text, interval, markdown, normalised, read_headroom, read_run
+from baselines.report import Run, as_run, csv_text, interval, markdown, normalised, read_run
 from generation.teammates.base import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.headroom import read_headroom
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step

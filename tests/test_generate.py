@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -30,10 +29,9 @@ from icrl4aht_data.benchmark import TEAMMATE
 from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.convert import to_release
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.release import NewTask, write_manifest
-from icrl4aht_data.tasks import read_tasks
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
@@ -287,23 +285,19 @@ def test_a_population_that_another_process_trains_is_waited_for(learned, monkeyp
     assert {selection.algorithm for selection in selections} == {"brdiv", "fcp"}
 
 
-def test_the_card_of_both_kinds_of_teammates_and_of_one_that_is_missing(learned):
-    profile = replace(load_profile(str(learned / "learned.toml")), presets=("default",))
-    tasks = [*profile.heuristic_tasks(), *read_tasks(learned / "lite/meta/tasks.jsonl")[:1]]
-    after = {"return_start": 1.0, "return_end": 2.0}
-    card = package._card(profile, [NewTask(task, {"filter": {"after": after}}, 3, list) for task in tasks])
-    assert "H4 is also a family of the benchmark's test side" in card
-    assert "too few checkpoints passed the filter of brdiv on demo_wide (0 of 1)." in card
-    assert "learned for 4,000 steps, egos for 16,000" in card
-    paper = load_profile("paper")
-    assert "The paper's scale" not in package._card(paper, [])
-
-
 def test_the_card_says_who_the_teammates_are(learned):
     card = (learned / "lite" / "README.md").read_text()
-    assert "checkpoints of fcp, brdiv populations of 2 (4,000 steps a member)" in card
-    assert "| demo_wide | brdiv 0 |" in card
-    assert "H4" not in card
+    assert "populations of 2 by fcp, brdiv, 4,000 steps a member" in card
+    assert "| demo_wide | train | brdiv | 1 | 3 |" in card
+    assert "Here egos for 16,000, teammates for 4,000." in card
+    assert "policies learned by fcp, brdiv" in card
+    assert "fewer training teammates" not in card
+    assert "stand in for the learned ones" not in card
+
+
+def test_the_card_says_which_teammates_are_missing(learned, tmp_path):
+    part = to_release(load_icrl4aht(learned / "lite", teammate_kind="fcp"), tmp_path / "part", "lite")
+    assert "than its profile wanted of brdiv on demo_wide (0 of 1)." in (part / "README.md").read_text()
 
 
 def test_a_second_rebuild_trains_nothing(learned, monkeypatch):

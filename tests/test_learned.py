@@ -19,9 +19,9 @@ from generation.learners.rollout import policy_player
 from generation.teammates import learned, registry
 from icrl4aht_data.benchmark import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.errors import OptionError, TaskFormatError
+from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.release import file_hash
 
 FAST = {"xla_backend_optimization_level": 0}  # small programs: compiling is their cost
 

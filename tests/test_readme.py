@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from servers import hub_server, uploads
 
 from baselines.cli import cli as baselines_cli
 from generation.cli import cli as generation_cli
@@ -40,11 +41,24 @@ def test_python_snippets(snippet):
     exec(compile(snippet, "README.md", "exec"), {})
 
 
-@pytest.mark.parametrize("arguments", commands("icrl4aht-data"), ids=" ".join)
+@pytest.mark.parametrize(
+    "arguments", [a for a in commands("icrl4aht-data") if a[0] not in ("release", "upload")], ids=" ".join
+)
 def test_reader_commands(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
+
+
+@uploads
+def test_publishing_commands(tmp_path, monkeypatch):
+    """One after the other, to a hub of the test's own."""
+    monkeypatch.chdir(tmp_path)
+    with hub_server(tmp_path / "hub") as hub:
+        for arguments in (a for a in commands("icrl4aht-data") if a[0] in ("release", "upload")):
+            result = CliRunner().invoke(cli, arguments)
+            assert result.exit_code == 0, result.output
+        assert "README.md" in hub.files("you/icrl4aht")
 
 
 @pytest.mark.parametrize("arguments", commands("python -m generation"), ids=" ".join)

@@ -33,8 +33,8 @@ from generation.teammates import learned
 from generation.teammates.base import stacked
 from icrl4aht_data.benchmark import ALGORITHMS, EGO, TEAMMATE
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.release import file_hash
 from icrl4aht_data.tasks import read_tasks, write_tasks
 
 LAYOUT = get_layout("cramped_up")

@@ -12,7 +12,8 @@ from plays import play, random_release
 
 from icrl4aht_data import verify_release
 from icrl4aht_data.cli import cli
-from icrl4aht_data.release import NewHistory, NewTask, write_manifest, write_release
+from icrl4aht_data.manifest import write_manifest
+from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import Kind
 from icrl4aht_data.shard import chunk_table_path
 
@@ -342,3 +343,9 @@ class TestCommand:
     def test_quiet(self, lite):
         result = CliRunner().invoke(cli, ["verify", "-q", str(lite[0])])
         assert (result.exit_code, result.output) == (0, "")
+
+
+def test_a_shard_that_neither_manifest_nor_folder_has(damaged):
+    (damaged / SHARD).unlink()
+    write_manifest(damaged)
+    assert any("the index names this shard" in problem for problem in problems(damaged))

@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
+from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from generation.learners.network import ActorCritic, Widths
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.files import parse_json, plain_size, read_text
+from icrl4aht_data.release import CHECKPOINT_BYTES
 
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
@@ -44,8 +47,8 @@ def load_card(folder: Path) -> dict[str, Any]:
         OptionError: if it is missing or not JSON.
     """
     try:
-        return json.loads((folder / CARD).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return parse_json(read_text(folder / CARD))
+    except IndexFormatError as error:
         raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
 
 
@@ -57,10 +60,11 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     """
     card = load_card(folder)
     try:
+        plain_size(folder / WEIGHTS, CHECKPOINT_BYTES)
         weights = load_file(folder / WEIGHTS)
         network = ActorCritic(Widths.from_table(card["widths"]), card["partners"])
         stated = card["shapes"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError, IndexFormatError) as error:
         raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
     shapes = {name: list(w.shape) for name, w in weights.items()}
     if shapes != stated:

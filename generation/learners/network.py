@@ -20,6 +20,7 @@ from icrl4aht_data.benchmark import ACTIONS
 from icrl4aht_data.overcooked.layouts import WINDOW
 
 _CELLS = WINDOW * WINDOW
+_WIDEST, _LAYERS = 2**13, 16  # beyond, a table is a mistake, or meant to exhaust us
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class Widths:
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
         for name, value in values.items():
             numbers = value if isinstance(value, tuple) else (value,)
-            if not numbers or not all(type(n) is int and n > 0 for n in numbers):
-                raise TypeError(f"widths.{name} = {value!r}: expected positive whole numbers")
+            if not 0 < len(numbers) <= _LAYERS or not all(type(n) is int and 0 < n <= _WIDEST for n in numbers):
+                raise TypeError(f"widths.{name} = {value!r:.200}: expected positive whole numbers up to {_WIDEST}")
         return cls(**values)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.learners.network import ActorCritic, Widths
 from generation.learners.rollout import Rollout, seen_from
-from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
@@ -27,7 +27,7 @@ from icrl4aht_data.overcooked.observe import observe
 class PPOConfig:
     """Hyper-parameters; the defaults are the paper's ego table (App. C.2.2)."""
 
-    total_steps: int = 60_000_000  # environment steps, over all environments
+    total_steps: int = PAPER_EGO_STEPS  # environment steps, over all environments
     environments: int = 1024
     rollout: int = 256  # steps of each environment between updates
     epochs: int = 4
@@ -40,7 +40,7 @@ class PPOConfig:
     entropy: float = 0.01
     value: float = 0.5
     max_grad_norm: float = 0.25
-    shaping_horizon: int = 60_000_000  # environment steps until shaped rewards count nothing
+    shaping_horizon: int = PAPER_EGO_STEPS  # environment steps until shaped rewards count nothing
     widths: Widths = field(default_factory=Widths)
 
     def __post_init__(self) -> None:

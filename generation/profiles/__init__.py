@@ -10,7 +10,7 @@ from typing import Any
 from generation.learners.network import Widths
 from generation.learners.ppo import PPOConfig
 from generation.teammates.registry import heuristic_teammate
-from icrl4aht_data.benchmark import ALGORITHMS, track_of, unknown
+from icrl4aht_data.benchmark import ALGORITHMS, PAPER_TEAMMATE_STEPS, PAPER_TEAMMATES, track_of, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import json_hash
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -32,11 +32,11 @@ class TeammateConfig:
     """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1)."""
 
     members: int = 10  # of each algorithm's population
-    train: int = 20  # teammates of each algorithm for the training tasks
+    train: int = PAPER_TEAMMATES  # teammates of each algorithm for the training tasks
     heldout: int = 5  # others, for the in-distribution check
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
-            total_steps=30_000_000, environments=256, warmup=0.05, shaping_horizon=15_000_000
+            total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000
         )
     )
 

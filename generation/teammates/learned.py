@@ -15,8 +15,9 @@ from generation.learners.checkpoint import WEIGHTS, load_policy
 from generation.learners.network import ActorCritic, Widths
 from generation.teammates.base import Policy
 from icrl4aht_data.errors import OptionError, TaskFormatError
+from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.release import checkpoint_folder, file_hash
+from icrl4aht_data.release import checkpoint_folder
 
 Action = Literal["greedy", "sampled"]
 """How a checkpoint acts: its likeliest action, as teammates of the dataset do, or a draw from its distribution."""

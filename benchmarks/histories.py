@@ -1,0 +1,37 @@
+"""As many histories as a benchmark wants, made from the bundled ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.release import NewHistory, NewTask, write_release
+from icrl4aht_data.schema import TASKS, held_fields
+from icrl4aht_data.tasks import read_tasks
+
+
+def write_many(folder: Path, layouts: Sequence[str], histories: int) -> Path:
+    """A lite release with that many histories of each layout; of the bundled ones, each shifted by whole episodes."""
+    source = load_icrl4aht()
+    first = {task.layout.name: task for task in reversed(read_tasks(source.root / TASKS))}
+    tasks = [
+        NewTask(first[name], {}, histories, partial(_shifted, source.filter(layout=name), histories))
+        for name in layouts
+    ]
+    return write_release(folder, "lite", tasks, data_version="0.0.0", card="# benchmark\n")
+
+
+def _shifted(source: Dataset, histories: int) -> Iterator[NewHistory]:
+    kept = source.info["environment"]["kept_steps"]
+    for number in range(histories):
+        history, episodes = source[number % len(source)], number // len(source)
+        arrays = {
+            field.name: np.roll(history.read(field.name), episodes * (kept if field.axis == "T" else 1), axis=0)
+            for field in held_fields("lite")
+        }
+        yield NewHistory(number, arrays)
