@@ -6,13 +6,16 @@ import errno
 import json
 import shutil
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
+from filelock import FileLock
 
 from benchmarks.bench_faults import FAMILIES, main, run
 from benchmarks.faults_here import small_files
 from benchmarks.faults_scene import LostError, Scene
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.cache import cached_arrays
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.files import file_in_place_of
 from icrl4aht_data.manifest import parse_manifest
@@ -78,6 +81,16 @@ def test_a_manifest_without_its_last_byte_is_cut_off(scene):
     text = (scene.small / "MANIFEST.sha256").read_text()
     with pytest.raises(IndexFormatError, match=r"MANIFEST: cut off: its last line has no end"):
         parse_manifest(text[:-1], "MANIFEST")
+
+
+def test_what_killed_builds_left_is_swept(tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path))
+    for name in (".one.partial", ".two.removed-1", ".building.partial"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.npy").write_bytes(bytes(100))
+    with FileLock(tmp_path / ".building.lock"):
+        cached_arrays("three", 8, lambda folder: np.save(folder / "b.npy", np.zeros(1)))
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {".building.partial", "three"}
 
 
 def test_an_error_of_the_disk_names_the_file(tmp_path):
