@@ -47,16 +47,16 @@ def bandit() -> SmallWorld:
     return SmallWorld(world, 0, jnp.int32(0), lambda state: jnp.ones(1), step)
 
 
-SIDE, MOVES = 7, np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [0, 0]])
+SIDE, MOVES = 5, np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [0, 0]])
 CELLS = SIDE * SIDE
 MIDDLE = CELLS // 2
-ROOM_STEPS = 15
+ROOM_STEPS = 10
 """Of an episode, which starts in the middle."""
 
 
 _ROWS, _COLUMNS = np.divmod(np.arange(CELLS), SIDE)
-SEEN = np.concatenate([np.eye(SIDE, dtype=np.uint8)[_ROWS], np.eye(SIDE, dtype=np.uint8)[_COLUMNS]], axis=1)
-"""uint8 (cells, 2 * SIDE): the observation, row and column one-hot."""
+SEEN = np.concatenate([np.tri(SIDE, SIDE - 1, -1, dtype=np.uint8)[line] for line in (_ROWS, _COLUMNS)], axis=1)
+"""uint8 (cells, 2 * (SIDE - 1)): the observation, row and column each as so many ones."""
 
 
 def _next_cells() -> np.ndarray:
@@ -73,7 +73,7 @@ def dark_room() -> SmallWorld:
         cell = table[cell, action]
         return cell, 1.0 * (cell == goal)
 
-    world = World(lambda dtype: FlatEncoder(32, dtype), (2 * SIDE,), plain_view, len(MOVES))
+    world = World(lambda dtype: FlatEncoder(32, dtype), (2 * (SIDE - 1),), plain_view, len(MOVES))
     return SmallWorld(world, ROOM_STEPS, jnp.int32(MIDDLE), lambda cell: jnp.asarray(SEEN)[cell], step)
 
 
