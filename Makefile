@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote clean
+.PHONY: help install demo generate teammates verify control test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote bench-faults clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -36,6 +36,9 @@ teammates: install ## train the suite of learned teammates: PROFILE=smoke|mini|p
 
 verify: install ## verify a release, every byte and the physics: ROOT=folder (default: the bundled mini release)
 	$(BIN)/icrl4aht-data verify --deep $(ROOT)
+
+control: install ## show that the models adapt in context where that is possible (about 10 minutes)
+	$(BIN)/python -m baselines control
 
 test: check ## lint, types and all tests
 	$(BIN)/python -m pytest
@@ -63,6 +66,9 @@ bench-learner: install ## self-play learning steps/s beside JaxMARL's IPPO: PEER
 
 bench-remote: install ## requests, bytes and seconds of remote releases over HTTP, S3 and the Hub's protocol, JSON lines
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.bench_remote
+
+bench-faults: install ## faults of remotes, disks, processes and files: tried, survived, lost, JSON lines
+	PYTHONPATH=tests $(BIN)/python -m benchmarks.bench_faults
 
 bench-collect: install ## collection: speed, memory, bytes a transition beside the paper's format, JSON lines
 	$(BIN)/python -m benchmarks.bench_collect

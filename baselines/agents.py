@@ -1,8 +1,9 @@
-"""Egos: the protocol, those that need no training, and the adapter for agents that run outside JAX."""
+"""Egos: the protocol, those that need no training, trained models, and the adapter for agents outside JAX."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -10,11 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import io_callback
 
+from baselines.context import step_of
+from baselines.method import Method
 from baselines.oracle import oracle
 from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import ACTIONS, STAY, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout
+
+Acting = Literal["cached", "exact"]
+ACTING: tuple[Acting, ...] = ("cached", "exact")
+"""How a model remembers: what it computed of each step is kept, or everything is computed anew from the window. The
+same while the window is not full; from then on what is kept bears traces of steps that have left it."""
 
 
 class Percept(NamedTuple):
@@ -96,8 +104,39 @@ def random(layout: Layout) -> Policy:
     return Policy((), lambda params, key: (), act, "observation")
 
 
+def learned(
+    method: Method, params: Any, context: int, acting: Acting = "cached", greedy: bool = True
+) -> Callable[[], Policy]:
+    """The ego of a trained model; its memory lives through the task.
+
+    Args:
+        method: as it was trained.
+        params: float32.
+        context: K, the steps or transitions that it remembers.
+        acting: see `ACTING`.
+        greedy: the likeliest action, as published; otherwise one drawn from the policy.
+    """
+    if acting not in ACTING:
+        raise unknown("acting", acting, ACTING)
+
+    def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
+        logits, memory = method.act(params, step_of(percept), percept.prev_done, memory)
+        action = logits.argmax() if greedy else jax.random.categorical(key, logits)
+        return action.astype(jnp.int32), memory
+
+    return lambda: Policy(params, lambda params, key: method.start(context, acting == "cached"), act, "percept")
+
+
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
 """Name -> maker of the ego for a layout."""
+
+
+class Agent(NamedTuple):
+    """An ego by name."""
+
+    name: str  # as tables show it
+    make: Callable[[Layout], Policy]
+    details: dict[str, Any] | None = None  # what results depend on beside the name
 
 
 def get_agent(name: str) -> Callable[[Layout], Policy]:
@@ -109,3 +148,32 @@ def get_agent(name: str) -> Callable[[Layout], Policy]:
     if name not in AGENTS:
         raise unknown("agent", name, AGENTS)
     return AGENTS[name]
+
+
+def find_agent(name: str, acting: Acting = "cached") -> Agent:
+    """The ego of that name, or of that run folder, which `python -m baselines train` made.
+
+    Raises:
+        UnknownNameError: for what is neither.
+        OptionError: if the run is of another format or has no checkpoint; from `make`, if it does not fit the layout.
+    """
+    if name not in AGENTS and Path(name).is_dir():
+        return _of_run(Path(name), acting)
+    return Agent(name, get_agent(name))
+
+
+def _of_run(folder: Path, acting: Acting) -> Agent:
+    from baselines.histories import read_run
+
+    run = read_run(folder)
+    policy = learned(run.method, run.params, run.context, acting)()
+
+    def make(layout: Layout) -> Policy:
+        if layout.obs_shape != run.obs_shape:
+            raise OptionError(
+                f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "
+                f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts"
+            )
+        return policy
+
+    return Agent(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -11,6 +13,8 @@ from rich.progress import Progress
 from baselines.evaluate import PROTOCOLS
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.cli import run
+from icrl4aht_data.errors import EmptySelectionError
+from icrl4aht_data.overcooked.layouts import get_layout
 
 console = Console(soft_wrap=True)
 
@@ -18,13 +22,15 @@ console = Console(soft_wrap=True)
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="icrl4aht-data")
 def cli() -> None:
-    """Evaluate agents on the ICRL4AHT benchmark."""
+    """Train reference learners and evaluate agents on the ICRL4AHT benchmark."""
 
 
 @cli.command()
-@click.option("--agent", required=True, help="stay, random or oracle.")
+@click.option("--agent", required=True, help="stay, random, oracle, or a folder that `train` has made.")
+@click.option("--acting", default="cached", show_default=True, help="Of a trained model: cached, or exact and slower.")
 @click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
 @click.option("--track", multiple=True, default=tuple(TRACKS), show_default=True)
+@click.option("--layout", multiple=True, help="Only the tasks on these layouts.")
 @click.option(
     "--manifest", type=click.Path(path_type=Path, exists=True), help="Tasks of a file instead of the tracks'."
 )
@@ -33,31 +39,40 @@ def cli() -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for one JSON per task.")
 def evaluate(
     agent: str,
+    acting: Any,
     protocol: str,
     track: tuple[str, ...],
+    layout: tuple[str, ...],
     manifest: Path | None,
     suite: Path | None,
     seeds: int,
     out: Path,
 ) -> None:
     """Evaluate an agent; goes on where a stopped run of the same settings ended."""
-    from baselines.agents import get_agent
+    from baselines.agents import find_agent
     from baselines.evaluate import evaluate as evaluate_tasks
     from baselines.evaluate import get_protocol
     from icrl4aht_data.tasks import manifest_path, read_tasks
 
     paths = [manifest] if manifest else [manifest_path(name, "test") for name in track]
-    tasks = [task for path in paths for task in read_tasks(path)]
+    ego = find_agent(agent, acting)
+    wanted = {get_layout(name).name for name in layout}
+    tasks = [task for path in paths for task in read_tasks(path) if not wanted or task.layout.name in wanted]
+    if not tasks:
+        raise EmptySelectionError(f"no task on {', '.join(sorted(wanted))} in {', '.join(map(str, paths))}")
+    for name in {task.layout.name for task in tasks}:
+        ego.make(get_layout(name))  # a model that does not fit fails before any work
     with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task(f"{agent}, {protocol}", total=len(tasks))
+        bar = bars.add_task(f"{ego.name}, {protocol}", total=len(tasks))
         evaluate_tasks(
-            agent,
-            get_agent(agent),
+            ego.name,
+            ego.make,
             tasks,
             get_protocol(protocol),
             seeds=range(seeds),
             suite=suite,
             out=out,
+            details=ego.details,
             done=lambda n: bars.advance(bar, n),
         )
     console.print(f"{len(tasks)} results in {out}; `python -m baselines report {out}` shows them")
@@ -118,6 +133,91 @@ def headroom(out: Path, protocol: tuple[str, ...]) -> None:
         runs = measure(out, protocol, bars)
     for path in write_cards(runs):
         console.print(f"wrote {path}")
+
+
+@cli.command()
+@click.argument("method")
+@click.option(
+    "--layout", "layouts", multiple=True, required=True, help="To train on; several of one observation shape."
+)
+@click.option(
+    "--root", type=click.Path(path_type=Path, exists=True), help="A release; the bundled mini release if not given."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="The run folder; runs/METHOD by default.")
+@click.option("--size", default="small", show_default=True, help="small, medium or large: layers, width, steps.")
+@click.option("--steps", type=int, help="Training steps, instead of the size's.")
+@click.option("--context", type=int, default=500, show_default=True, help="K: steps of a window, or transitions.")
+@click.option("--batch-size", type=int, help="1024 as in the paper, or 32 where there is only a CPU.")
+@click.option("--accumulate", type=int, default=1, show_default=True, help="Compute a batch in so many parts.")
+@click.option("--learning-rate", type=float, default=1e-3, show_default=True)
+@click.option("--positions", default="none", show_default=True, help="none, as published, or rope.")
+@click.option("--order", default="contiguous", show_default=True, help="Of DPT's contexts: contiguous or random.")
+@click.option("--teammate-actions", "--ta", is_flag=True, help="+TA: the teammate's previous action as input.")
+@click.option("--next-obs", is_flag=True, help="+next_obs: an auxiliary loss.")
+@click.option("--bfloat16", is_flag=True, help="Compute in bfloat16.")
+@click.option("--remat", is_flag=True, help="Less memory, more computing.")
+@click.option("--obs", help="state, uint8 or float32: what batches hold; state records where there are any.")
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--save-every", type=int, default=1000, show_default=True, help="Steps between checkpoints.")
+@click.option("--coordinator", help="HOST:PORT of process 0, to train on several machines.")
+@click.option("--processes", type=int, default=1, show_default=True)
+@click.option("--process", type=int, default=0, show_default=True, help="Which one this is.")
+def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | None, **options: Any) -> None:
+    """Train METHOD (ad, dpt, hybrid_ad, amago_offline) on learning histories, or go on with a stopped run."""
+    import jax
+
+    if options["coordinator"]:
+        jax.distributed.initialize(options["coordinator"], options["processes"], options["process"])
+    from baselines.histories import HistoryOptions, prepare
+    from baselines.method import SIZES, ModelOptions
+    from baselines.trainer import TrainOptions
+    from baselines.trainer import train as run_training
+    from icrl4aht_data.benchmark import unknown
+
+    if options["size"] not in SIZES:
+        raise unknown("size", options["size"], SIZES)
+    layers, width, steps = SIZES[options["size"]]
+    names = ("positions", "teammate_actions", "next_obs", "bfloat16", "remat")
+    model = ModelOptions(layers, width, **{name: options[name] for name in names})
+    names = ("context", "accumulate", "learning_rate", "seed", "save_every")
+    training = TrainOptions(
+        steps=steps if options["steps"] is None else options["steps"],
+        batch_size=options["batch_size"] or (32 if jax.default_backend() == "cpu" else 1024),
+        **{name: options[name] for name in names},
+    )
+    histories = HistoryOptions(layouts, root and str(root), order=options["order"], obs=options["obs"])
+    job = prepare(method, model, training, histories)
+    folder = out or Path("runs") / method
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task(method, total=training.steps)
+
+        def done(step: int, loss: float) -> None:
+            bars.update(bar, completed=step, description=f"{method}, loss {loss:.3f}")
+
+        run_training(job.method, job.data, job.options, folder, job.about, done=done)
+    console.print(
+        f"{training.steps} steps in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
+    )
+
+
+@cli.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/control"), show_default=True)
+def control(out: Path) -> None:
+    """Show that the models adapt where adaptation is possible, and not with their context cut off; about 10 minutes."""
+    from baselines.control import run_control, table
+
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        running: dict[str, Any] = {}
+
+        def done(name: str, of: int, step: int, loss: float) -> None:
+            if name not in running:
+                running[name] = bars.add_task(name, total=of)
+            bars.update(running[name], completed=step, description=f"{name}, loss {loss:.3f}")
+
+        checks = run_control(out, done=done)
+    click.echo(table(checks))
+    if not all(check.passed for check in checks):
+        sys.exit(1)
 
 
 def main() -> None:

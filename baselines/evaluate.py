@@ -188,6 +188,7 @@ def evaluate(
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
     out: Path | None = None,
+    details: dict[str, Any] | None = None,
     done: Callable[[int], None] = lambda tasks: None,
 ) -> list[Result]:
     """Evaluate an ego.
@@ -200,6 +201,7 @@ def evaluate(
         seeds: each plays every task once, all in one batch.
         suite: the folder that learned teammates' checkpoints are in.
         out: a folder for one JSON per task; results of the same settings found there are taken instead of run again.
+        details: what else the ego's results depend on, part of the settings.
         done: called with the number of tasks finished, for progress.
 
     Returns:
@@ -216,7 +218,7 @@ def evaluate(
         "seeds": list(seeds),
         "protocol": asdict(protocol),
         "code_version": version("icrl4aht-data"),
-    }
+    } | ({"details": details} if details else {})
     results = {task.task_id: found for task in tasks if (found := _stored(out, task, settings))}
     done(len(results))
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)

@@ -19,6 +19,7 @@ import numpy as np
 
 from icrl4aht_data.cache import cache_limit, data_folder
 from icrl4aht_data.errors import ChunkTableError, RemoteError
+from icrl4aht_data.files import naming
 from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.schema import CHUNK_DTYPE
 from icrl4aht_data.transport import Store
@@ -69,7 +70,7 @@ class PartialFile:
                 with self.path.open("rb", buffering=0) as stream:
                     stream.seek(offset)
                     data = stream.read(size)
-            except FileNotFoundError:
+            except OSError:  # no such file, or a bad sector
                 return None
         return data if len(data) == size and zlib.crc32(data) == crc32 else None
 
@@ -82,19 +83,21 @@ class PartialFile:
         if not self.path.exists():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self.path.touch()
-        with self.path.open("r+b", buffering=0) as stream:
+        with naming(self.path), self.path.open("r+b") as stream:
             stream.seek(start)
             stream.write(data)
 
-    def keep(self, start: int, data: bytes) -> None:
+    def keep(self, piece: Piece, data: bytes) -> None:
         """The same for bytes that are only cached: in memory where the disk does not take them."""
         try:
-            self.put(start, data)
+            self.put(piece.start, data)
         except OSError:
             with self._lock:
-                self._overflow[start] = data
-                while sum(map(len, self._overflow.values())) > _OVERFLOW and len(self._overflow) > 1:
-                    self._overflow.popitem(last=False)
+                for offset, size, *_ in piece.chunks.tolist():
+                    self._overflow[offset] = data[offset - piece.start :][:size]
+                excess = sum(map(len, self._overflow.values())) - _OVERFLOW
+                while excess > 0 and len(self._overflow) > 1:
+                    excess -= len(self._overflow.popitem(last=False)[1])
 
     def chunk(self, offset: int, size: int, crc32: int) -> bytes:
         """A chunk, fetched if it is not here.
@@ -144,7 +147,7 @@ def _pieces(chunks: np.ndarray, gap: int = _GAP) -> list[Piece]:
     return pieces
 
 
-def _fetch(file: PartialFile, piece: Piece, write: Callable[[int, bytes], None]) -> bytes:
+def _fetch(file: PartialFile, piece: Piece, write: Callable[[Piece, bytes], None]) -> bytes:
     """Ask for a piece until every chunk in it is right, and write it."""
     wrong = 0, 0, 0
     for _ in range(_TRIES):
@@ -154,7 +157,7 @@ def _fetch(file: PartialFile, piece: Piece, write: Callable[[int, bytes], None])
                 wrong = offset, offset + size, crc
                 break
         else:
-            write(piece.start, data)
+            write(piece, data)
             return data
     raise RemoteError(
         f"{file.store.url}/{file.name}: bytes {wrong[0]}..{wrong[1]}: expected crc32 {wrong[2]:08x}, got others "
@@ -224,11 +227,11 @@ def _by_chunks(file: PartialFile, size: int, table: np.ndarray, advance: Callabl
     file.put(0, b"")
 
     def copy(piece: Piece) -> None:
-        _fetch(file, piece, file.put)
+        _fetch(file, piece, lambda piece, data: file.put(piece.start, data))
         advance(int(piece.chunks["size"].sum()))
 
     _at_once([lambda piece=piece: copy(piece) for piece in _pieces(missing, gap=0)])
-    with file.path.open("r+b") as stream:
+    with naming(file.path), file.path.open("r+b") as stream:
         stream.truncate(size)
 
 

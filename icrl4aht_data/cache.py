@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import OptionError
@@ -159,6 +159,7 @@ def _size(folder: Path) -> int:
 
 def _make_room(folder: Path, size: int) -> None:
     with FileLock(folder / ".room.lock"):
+        _sweep(folder)
         kept = _kept(folder)
         sizes = [_size(path) for path in kept]
         excess = sum(sizes) + size - cache_limit()
@@ -172,6 +173,15 @@ def _make_room(folder: Path, size: int) -> None:
                 continue
             shutil.rmtree(doomed, ignore_errors=True)
             excess -= bytes_
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes left: sets half built, which nobody holds the lock of, and half removed."""
+    for left in folder.glob(".*.partial"):
+        with suppress(Timeout), FileLock(left.with_suffix(".lock"), timeout=0):
+            shutil.rmtree(left, ignore_errors=True)
+    for left in folder.glob(".*.removed-*"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def content_hash(path: Path) -> str:

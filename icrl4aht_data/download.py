@@ -15,7 +15,7 @@ from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.files import file_in_place_of, holds, parse_json, read_text, write_json
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.manifest import file_hash, inside, read_manifest
-from icrl4aht_data.remote import HubRemote, Remote, Root, is_address, open_root
+from icrl4aht_data.remote import HubRemote, Remote, Root, alone, is_address, open_root
 from icrl4aht_data.schema import MANIFEST
 from icrl4aht_data.shard import chunk_table_name
 from icrl4aht_data.transport import Patience, Traffic
@@ -101,9 +101,10 @@ def fetch_planned(plan: Plan, advance: Advance = lambda size: None) -> Traffic:
     before = remote.store.traffic
     remote.fetch(plan.absent, advance)
     if not isinstance(remote, HubRemote):  # the Hub's cache is not ours to write notes into
-        files = {*plan.files, *_noted(remote.folder).get("files", [])}
-        with file_in_place_of(remote.folder / ORIGIN) as partial:
-            write_json(partial, {"url": remote.url, "files": sorted(files)})
+        with alone(remote.partial):
+            files = {*plan.files, *_noted(remote.folder).get("files", [])}
+            with file_in_place_of(remote.folder / ORIGIN) as partial:
+                write_json(partial, {"url": remote.url, "files": sorted(files)})
     return remote.store.traffic - before
 
 

@@ -112,12 +112,24 @@ def holds(path: Path, content: bytes) -> bool:
 
 
 @contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of the disk name the file: those of writing to an open one do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def file_in_place_of(path: Path) -> Iterator[Path]:
     """A name beside `path` to write to. At the end the file takes its place at once; after an error nothing changes."""
     partial = path.with_name(f".{path.name}.partial")
     partial.unlink(missing_ok=True)  # not to write through a link that somebody laid there
     try:
-        yield partial
+        with naming(path):
+            yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

@@ -30,6 +30,8 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         IndexFormatError: names the line.
         UnsafePathError: for a path that leads out of the release.
     """
+    if text and not text.endswith("\n"):
+        raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
     listed: dict[str, str] = {}
     folded: dict[str, str] = {}  # as a disk sees names that does not tell upper from lower case
     for number, line in enumerate(text.splitlines(), start=1):

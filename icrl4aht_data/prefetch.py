@@ -30,7 +30,7 @@ class Batches(Iterator[B], Generic[B]):
         stop: the number behind the last; None goes on without end.
         prefetch: how many batches may wait; 0 makes each one when it is asked for, without a thread.
         device: a jax.Device or Sharding: batches become JAX arrays there, the next one's transfer running while the
-            last one is used. Needs JAX.
+            last one is used. Where a sharding spans processes, each gives its share of the rows. Needs JAX.
         reuse: give the same few buffers again and again: a batch is valid until the next one is taken. New memory costs
             more than filling it. With a device, host buffers are always reused.
     """
@@ -218,8 +218,13 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
     except ImportError as error:
         raise OptionError("a device needs JAX: pip install icrl4aht-data[generation]") from error
 
+    def one(x: Any) -> Any:
+        if getattr(device, "is_fully_addressable", True):
+            return jnp.array(x, copy=True, device=device)
+        return jax.make_array_from_process_local_data(device, x.copy())
+
     def put(batch: Any) -> Any:
         # jax.device_put may keep using a host buffer, on a CPU for good; ours is filled again as soon as this returns.
-        return jax.block_until_ready(jax.tree.map(lambda x: jnp.array(x, copy=True, device=device), batch))
+        return jax.block_until_ready(jax.tree.map(one, batch))
 
     return put

@@ -9,7 +9,6 @@ unfinished file lies beside the mirror.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
@@ -24,12 +23,19 @@ from filelock import FileLock
 
 from icrl4aht_data.blocks import PartialFile, whole_file
 from icrl4aht_data.cache import data_folder
-from icrl4aht_data.errors import IndexFormatError, OfflineError, OptionError, RemoteError, RootNotFoundError
+from icrl4aht_data.errors import (
+    Icrl4ahtError,
+    IndexFormatError,
+    OfflineError,
+    OptionError,
+    RemoteError,
+    RootNotFoundError,
+)
 from icrl4aht_data.files import file_in_place_of, holds, plain_size
 from icrl4aht_data.info import read_info
-from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, parse_manifest
+from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, parse_manifest, read_manifest
 from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.transport import HubStore, Patience, Store
+from icrl4aht_data.transport import HubStore, Patience, Store, offline
 
 _OPENED = (INFO, HISTORIES, TASKS, PROVENANCE)
 """What opening a release reads."""
@@ -101,12 +107,6 @@ def open_root(root: str | Path, to: Path | None = None, patience: Patience | Non
 def is_address(root: str | Path | None) -> bool:
     """Whether a root is not a folder of this machine."""
     return isinstance(root, str) and "://" in root and not root.startswith("file://")
-
-
-def offline() -> bool:
-    """Whether nothing may be asked of the network: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE, read at each call."""
-    names = ("HF_HUB_OFFLINE", "ICRL4AHT_OFFLINE")
-    return any(os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE") for name in names)
 
 
 class Remote:
@@ -264,9 +264,7 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     if match is None:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
     try:
-        asking = Store(url, patience)
-        path = asking.patiently(MANIFEST, lambda: _from_hub(url, MANIFEST, match["revision"], _MANIFEST_BYTES))
-        plain_size(path, _MANIFEST_BYTES)
+        path = Store(url, patience).patiently(MANIFEST, lambda: _manifest_from_hub(url, match["revision"]))
     except RemoteError as error:
         if error.missing:
             raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
@@ -276,9 +274,22 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     manifest = _checked_manifest(path.read_bytes(), pinned)
     store = HubStore(match["repo"], commit, patience)
     if to is not None:
-        _write_once(to, path.read_bytes(), pinned)
+        _write_once(to, path.read_bytes(), manifest, pinned)
         return Remote(pinned, commit, to, _beside(to), manifest, store)
     return HubRemote(pinned, commit, folder, data_folder() / _slug(url) / f"{commit}.partial", manifest, store)
+
+
+def _manifest_from_hub(url: str, revision: str | None) -> Path:
+    """The manifest, for which the Hub's cache alone vouches: a blob's name there is its hash."""
+    path = _from_hub(url, MANIFEST, revision, _MANIFEST_BYTES)
+    plain_size(path, _MANIFEST_BYTES)
+    data, blob = path.read_bytes(), path.resolve()
+    git = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
+    if len(blob.name) == len(git) and blob.name != git:
+        blob.unlink()
+        path.unlink(missing_ok=True)
+        raise ConnectionError(f"came damaged: git's hash of it is {git}, expected {blob.name}")
+    return path
 
 
 def _from_hub(url: str, name: str, revision: str | None, most: int, advance: Advance = lambda size: None) -> Path:
@@ -318,9 +329,9 @@ def _open_address(url: str, to: Path | None, patience: Patience | None) -> Remot
     manifest = _checked_manifest(text, url)
     revision = hashlib.sha256(text).hexdigest()[:16]
     folder = to or base / revision
-    _write_once(folder, text, url)
-    if to is None:
-        with file_in_place_of(base / "latest") as partial:
+    _write_once(folder, text, manifest, url)
+    if to is None and _text(base / "latest") != revision:
+        with alone(base), file_in_place_of(base / "latest") as partial:
             partial.write_text(revision, encoding="utf-8")
     return Remote(url, revision, folder, _beside(folder), manifest, store)
 
@@ -356,15 +367,36 @@ def _checked_manifest(text: bytes, url: str) -> dict[str, str]:
         raise IndexFormatError(f"{url}/{MANIFEST}: not UTF-8 text: {error}") from error
 
 
-def _write_once(folder: Path, text: bytes, url: str) -> None:
+def _write_once(folder: Path, text: bytes, manifest: dict[str, str], url: str) -> None:
     """The manifest into the mirror, which holds files of this manifest alone."""
     path = folder / MANIFEST
-    if path.exists() and not holds(path, text):
-        raise OptionError(f"{folder}: holds another release or version than {url} now; give another folder")
-    if not path.exists():
+    if holds(path, text):
+        return
+    with alone(_beside(folder)):
+        if path.exists() and not holds(path, text) and not _fits(folder, manifest):
+            raise OptionError(f"{folder}: holds another release or version than {url} now; give another folder")
         folder.mkdir(parents=True, exist_ok=True)
         with file_in_place_of(path) as partial:
             partial.write_bytes(text)
+
+
+def alone(folder: Path) -> FileLock:
+    """Held while notes are written, which no two processes may do at once.
+
+    Args:
+        folder: beside them, for the lock.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / ".lock")
+
+
+def _fits(folder: Path, manifest: dict[str, str]) -> bool:
+    """Whether all that is here is of another manifest as well: then the one here, or that one, had come damaged."""
+    try:
+        listed = read_manifest(folder)
+    except Icrl4ahtError:
+        return False
+    return all(manifest.get(name) == digest for name, digest in listed.items() if (folder / name).exists())
 
 
 def _beside(folder: Path) -> Path:

@@ -93,7 +93,8 @@ class Sampler(Generic[B]):
         self.weights, self.episodes, self.curriculum = check_weights(weights, len(dataset)), episodes, curriculum
         self._lengths = dataset.column("T")
         self._kept: int = dataset.info["environment"]["kept_steps"]
-        if (self._lengths // self._kept != dataset.column("episodes")).any():
+        ended, cut = np.divmod(self._lengths, self._kept)  # only histories of observations may end within an episode
+        if (ended != dataset.column("episodes")).any() or (dataset.has_states and cut.any()):
             raise OptionError(f"some history's episodes have not {self._kept} steps; run `icrl4aht-data verify`")
         self._range = episode_range(episodes, dataset.column("episodes"))
 

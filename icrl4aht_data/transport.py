@@ -6,13 +6,16 @@ import errno
 import os
 import re
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from functools import cached_property
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, RemoteError
+from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
 
 T = TypeVar("T")
 
@@ -42,6 +45,12 @@ class Traffic:
 
     def __sub__(self, before: Traffic) -> Traffic:
         return Traffic(self.requests - before.requests, self.bytes - before.bytes)
+
+
+def offline() -> bool:
+    """Whether nothing may be asked of the network: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE, read at each call."""
+    names = ("HF_HUB_OFFLINE", "ICRL4AHT_OFFLINE")
+    return any(os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE") for name in names)
 
 
 class WrongLengthError(OSError):
@@ -79,13 +88,23 @@ class Store:
 
         Raises:
             RemoteError: names the address and what the last answer was.
+            OfflineError: if nothing may be asked.
         """
+        self._check_online(name)
         return self.patiently(name, lambda: self._range(name, start, stop))
 
     def size(self, name: str) -> int:
-        """Of a file, in bytes."""
+        """Of a file, in bytes.
 
+        Raises:
+            RemoteError, OfflineError: the same.
+        """
+        self._check_online(name)
         return self.patiently(name, lambda: self._size(name))
+
+    def _check_online(self, name: str) -> None:
+        if offline():
+            raise OfflineError(f"{self.url}: offline, and not here, or not all of it: {name}; go online to fetch it")
 
     def _size(self, name: str) -> int:
         size = self._files.info(f"{self.url}/{name}")["size"]
@@ -132,15 +151,19 @@ class Store:
             timeout = aiohttp.ClientTimeout(total=_TOTAL, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
             options["client_kwargs"] = {"timeout": timeout, "response_class": _bounded_response()}
         elif scheme == "s3":
-            options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT}
+            once = {"total_max_attempts": 1}  # `Patience` is enough
+            options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT, "retries": once}
         try:
-            return os.getpid(), fsspec.url_to_fs(url, **options)[0]
+            files = fsspec.url_to_fs(url, **options)[0]
         except ImportError as error:
             extra = {"s3": "s3"}.get(scheme)
             remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
             raise OptionError(f"{self.url}: {error}; {remedy}") from error
         except ValueError as error:
             raise OptionError(f"{self.url}: not an address that fsspec opens: {error}") from error
+        if scheme == "s3":
+            files.retries = 1  # as above
+        return os.getpid(), files
 
     def patiently(self, name: str, ask: Callable[[], T]) -> T:
         """What `ask` gives, asked again while its errors are of the passing kind.
@@ -298,11 +321,18 @@ def _retry_after(error: BaseException | None) -> float:
             headers = response.get("ResponseMetadata", {}).get("HTTPHeaders", {})
         asked = {str(key).lower(): value for key, value in dict(headers).items()}.get("retry-after")
         if asked is not None:
-            try:
-                return float(asked)
-            except ValueError:  # a date
-                return 0.0
+            return _seconds(asked)
         error = error.__cause__
+    return 0.0
+
+
+def _seconds(asked: str) -> float:
+    """From now, of a number or a date."""
+    try:
+        return float(asked)
+    except ValueError:
+        with suppress(ValueError):
+            return parsedate_to_datetime(asked).timestamp() - time.time()
     return 0.0
 
 

@@ -23,6 +23,14 @@ def compiled_once(tmp_path_factory) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
+@pytest.fixture(scope="module")
+def compiled_quickly():
+    """For small models: compile in half the time what then runs slower."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_this_run(tmp_path_factory) -> None:
     """What tests keep on disk does not outlive them, nor meets what earlier runs kept."""

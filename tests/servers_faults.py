@@ -68,9 +68,11 @@ class Long:
 
 @dataclass(frozen=True)
 class Flip:
-    """The right length; the byte at `position` of this body is inverted. Negative positions count from its end."""
+    """The right length; `bits` of the byte at `position` of this body are inverted. Negative positions count from its
+    end."""
 
     position: int = 0
+    bits: int = 0xFF
 
 
 @dataclass(frozen=True)

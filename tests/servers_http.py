@@ -178,14 +178,14 @@ class Handler(BaseHTTPRequestHandler):
     def _send_body(self, request: Request, file: BinaryIO, length: int, fault: Fault | None) -> None:
         pace = fault.bytes_per_second if isinstance(fault, Slow) else None
         most = BLOCK if pace is None else max(1, int(pace * PACE))
-        flipped = fault.position % length if isinstance(fault, Flip) and length else None
+        flipped, bits = (fault.position % length, fault.bits) if isinstance(fault, Flip) and length else (None, 0)
         end = min(length, fault.after) if isinstance(fault, Cut) else length
         self.close_connection |= isinstance(fault, Cut)
         while request.sent < end:
             count = min(most, end - request.sent)
             block = bytearray(file.read(count).ljust(count, b"\0"))
             if flipped is not None and 0 <= flipped - request.sent < count:
-                block[flipped - request.sent] ^= 0xFF
+                block[flipped - request.sent] ^= bits
             request.sent += count
             self.wfile.write(block)
             if pace is not None and self.owner.closing.wait(count / pace):

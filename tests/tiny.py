@@ -55,7 +55,7 @@ def artefact(out: Path, number: int = 0) -> Path:
     return sorted(path for path in (out / "artefacts").iterdir() if path.is_dir())[number]
 
 
-def start(*arguments: str) -> subprocess.Popen:
+def start(*arguments: str, **environment: str) -> subprocess.Popen:
     """A Python process that finds compiled what this one has compiled."""
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),  # type: ignore[attr-defined]
@@ -66,6 +66,6 @@ def start(*arguments: str) -> subprocess.Popen:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | cache,
+        env=os.environ | cache | environment,
         cwd=Path(__file__).parent.parent,
     )

@@ -18,13 +18,14 @@ class Policy(NamedTuple):
     """Anything that can sit at a table: one instance, unbatched; roll-outs vmap it.
 
     `params` is a pytree of arrays, apart from the functions, so that policies of one family share one compilation.
-    `sees` says what `act` is given: the state record uint8 (S,), or the observation uint8 (5, 5, C).
+    `sees` says what `act` is given: the state record uint8 (S,), the observation uint8 (5, 5, C), or, an ego only, the
+    observation with what the step before brought (`baselines.agents.Percept`).
     """
 
     params: Any
     init: Callable[[Any, Key[Array, ""]], Any]  # (params, episode key) -> carry
     act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]  # (params, carry, view, key)
-    sees: Literal["state", "observation"]
+    sees: Literal["state", "observation", "percept"]
 
 
 class Sampling(NamedTuple):

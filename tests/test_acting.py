@@ -1,0 +1,106 @@
+"""Trained models as egos of the evaluator, and the commands that make and play them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from test_models import drawn
+
+from baselines.agents import find_agent
+from baselines.cli import cli
+from baselines.evaluate import PROTOCOLS, evaluate
+from baselines.histories import HistoryOptions, prepare, read_run
+from baselines.method import SIZES, ModelOptions
+from baselines.runs import Checkpoints, open_run, versions
+from baselines.trainer import TrainOptions
+from generation.teammates.instances import published_tasks
+from icrl4aht_data.errors import OptionError, UnknownNameError
+
+SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2, steps=10)
+WIDE = [task for task in published_tasks("teammate") if (task.layout.name, task.teammate_family) == ("demo_wide", "H4")]
+MODEL = ModelOptions(layers=1, width=16, heads=2, teammate_actions=True)
+OPTIONS = TrainOptions(steps=2, batch_size=2, context=30)
+
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
+@pytest.fixture(scope="module")
+def runs(lite, tmp_path_factory) -> Path:
+    """Run folders ad and dpt, as training would leave them, of models that know nothing."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("ad", "dpt"):
+        job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
+        config = {**versions(), "method": name, **job.about, "train": dataclasses.asdict(OPTIONS)}
+        open_run(folder / name, config)
+        checkpoints = Checkpoints(folder / name)
+        checkpoints.save(2, drawn(job.method), {"step": np.int32(2)})
+        checkpoints.close()
+    return folder
+
+
+@pytest.mark.parametrize(("name", "label", "acting"), [("ad", "AD+TA", "exact"), ("dpt", "DPT+TA", "cached")])
+def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting):
+    agent = find_agent(str(runs / name), acting)
+    assert agent.name == label
+    (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
+    assert np.shape(result.returns) == (1, 2)
+    run = read_run(runs / name)
+    assert result.settings["details"] == {"run": run.hash, "step": 2, "context": 30, "acting": acting}
+    with pytest.raises(OptionError, match="holds a result of other settings"):
+        evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
+
+
+class TestBadRuns:
+    def test_a_layout_that_does_not_fit(self, runs, tmp_path):
+        arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
+        result = CliRunner().invoke(cli, arguments)
+        assert isinstance(result.exception, OptionError)
+        told = "trained on demo_wide with observations (5, 5, 45); coord_simple has (5, 5, 40)"
+        assert told in str(result.exception)
+
+    def test_folders_that_are_no_runs(self, runs, tmp_path):
+        with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle"):
+            find_agent("no/where")
+        with pytest.raises(OptionError, match=r"not a run: expected config\.json with run_format"):
+            find_agent(str(tmp_path))
+
+    def test_another_version_and_another_shape(self, runs, tmp_path):
+        def copy(name: str, **changes) -> str:
+            shutil.copytree(runs / "ad", tmp_path / name)
+            config = json.loads((tmp_path / name / "config.json").read_text())
+            (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
+            return str(tmp_path / name)
+
+        with pytest.raises(OptionError, match=r"run_format 99, expected 1: written by version .*; use that version"):
+            find_agent(copy("newer", run_format=99))
+        wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
+        with pytest.raises(OptionError, match=r"parameters of another model: .* has shape"):
+            find_agent(copy("wider", model=wide))
+        with pytest.raises(OptionError, match="not of a run on learning histories: KeyError"):
+            find_agent(copy("other", model={}, histories={}))
+        shutil.rmtree(Path(copy("early")) / "checkpoints")
+        with pytest.raises(OptionError, match="no checkpoint yet; train on"):
+            find_agent(str(tmp_path / "early"))
+
+
+def test_the_train_command(lite, tmp_path, monkeypatch):
+    monkeypatch.setitem(SIZES, "small", (1, 16, 5))
+    arguments = ["train", "ad", "--layout", "demo_wide", "--root", str(lite[0]), "--out", str(tmp_path / "run")]
+    small = ["--steps", "1", "--batch-size", "2", "--context", "4"]
+    result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "1 steps in" in result.output
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
+    assert config["histories"]["data_version"] == "0.0.1"
+    again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
+    assert "model.teammate_actions: the run has False, asked for True" in str(again.exception)
+    wrong = CliRunner().invoke(cli, [*arguments, "--size", "smal"])
+    assert "unknown size 'smal'" in str(wrong.exception)
