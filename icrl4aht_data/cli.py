@@ -113,7 +113,7 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
             returns,
             row["task_id"],
         )
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+    Console(width=None if sys.stdout.isatty() else 200, markup=False).print(table)
 
 
 @cli.command()

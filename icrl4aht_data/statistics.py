@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich import box, filesize
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from icrl4aht_data.benchmark import ACTIONS
@@ -80,7 +81,7 @@ def statistics_rows(statistics: dict[str, dict[str, Any]]) -> list[list[str]]:
 def print_statistics(info: dict[str, Any], console: Console) -> None:
     """The table of a release's meta/info.json: a row per property, a column per layout."""
     statistics = info["statistics"]
-    table = Table("property", box=box.MARKDOWN, title=f"{info['kind']} release {info['data_version']}")
+    table = Table("property", box=box.MARKDOWN, title=escape(f"{info['kind']} release {info['data_version']}"))
     for layout in statistics:
         table.add_column(layout, justify="right")
     for row in statistics_rows(statistics):

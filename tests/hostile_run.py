@@ -22,7 +22,8 @@ from typing import Any
 
 import h5py
 import numpy as np
-from hostile_folders import CASES, PUBLISHED_CASES, Spoil
+from hostile_folders import CASES, Spoil
+from hostile_published import PUBLISHED_CASES
 from hostile_served import SERVED
 from plays import make_tasks, play
 

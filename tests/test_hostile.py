@@ -15,11 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile_folders import CASES, PUBLISHED_CASES, TERABYTE
+from click.testing import CliRunner
+from hostile_folders import CASES, TERABYTE
+from hostile_published import PUBLISHED_CASES
 from hostile_served import SERVED
 from safetensors.numpy import save_file
 
 from generation.learners.checkpoint import CARD, WEIGHTS, load_policy
+from icrl4aht_data.cli import cli
 from icrl4aht_data.download import ORIGIN, repair
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.files import file_in_place_of, parse_json
@@ -148,6 +151,13 @@ def test_a_link_is_not_written_through(tmp_path):
     with file_in_place_of(tmp_path / "file") as partial:
         partial.write_text("new")
     assert ((tmp_path / "mine").read_text(), (tmp_path / "file").read_text()) == ("mine", "new")
+
+
+def test_names_are_no_markup(damaged):
+    path = damaged / "meta" / "histories.jsonl"
+    path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
+    result = CliRunner().invoke(cli, ["list", str(damaged)], catch_exceptions=False)
+    assert "[/b][link=file:///]" in result.output
 
 
 def test_depth_of_json():
