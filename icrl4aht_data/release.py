@@ -39,7 +39,7 @@ from icrl4aht_data.schema import (
     held_fields,
     stream_score,
 )
-from icrl4aht_data.shard import stored_bytes, write_shard
+from icrl4aht_data.shard_writer import stored_bytes, write_shard
 from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import NamedTask, Task, write_tasks
 

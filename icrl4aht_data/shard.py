@@ -1,4 +1,4 @@
-"""One HDF5 shard: written chunk by chunk, read by stored offsets with a checksum on every chunk.
+"""One HDF5 shard, read by stored offsets with a checksum on every chunk; `shard_writer` writes it.
 
 Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. Our own reads do not go through libhdf5:
 they take a chunk's bytes at the offset in the chunk table, check its crc32 and inflate it, which needs no global lock.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,29 +19,26 @@ from icrl4aht_data.blocks import bring
 from icrl4aht_data.cache import new_array
 from icrl4aht_data.errors import (
     ChunkTableError,
-    OptionError,
     ShardCorruptError,
     ShardMismatchError,
     ShardMissingError,
     ShardTruncatedError,
 )
 from icrl4aht_data.manifest import inside
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 
 if TYPE_CHECKING:
-    import h5py  # libhdf5 is needed to write and to check, not to read
+    import h5py  # libhdf5 is needed to check, not to read
 
     from icrl4aht_data.blocks import PartialFile
     from icrl4aht_data.index import Index
     from icrl4aht_data.remote import Root
 
-_Arrays = Mapping[str, np.ndarray]
-
-_DEFLATE_LEVEL = 6
-_BETWEEN = 2048  # bytes: what a fault between the chunks costs to repair
-_BLOCK = 2000  # steps: a chunk of scalars, two of records
 _CACHE_BYTES = 256 * 2**20
+
+BETWEEN = 2048
+"""Bytes between the chunks that one line of the chunk table covers: what a fault there costs to repair."""
 
 DEFLATE_RATIO = 1100
 """No deflated bytes become as many times as much."""
@@ -58,132 +55,6 @@ def chunk_table_name(shard: str) -> str:
 def chunk_table_path(root: Path, shard: str) -> Path:
     """Where it lies."""
     return root / chunk_table_name(shard)
-
-
-def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[_Arrays]) -> None:
-    """Write a shard and its chunk table into a folder that no reader has seen yet.
-
-    Args:
-        root: the release folder.
-        shard: path below it, as in every entry.
-        kind: of the release.
-        entries: the histories' index entries; `h5_group` and `h5_row` say where each one goes.
-        histories: for each entry, field name -> array in the field's dtype.
-
-    Raises:
-        OptionError: if a value does not survive the stored dtype, or an array has not the entry's length.
-    """
-    import h5py
-
-    path, table_path = root / shard, chunk_table_path(root, shard)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table_path.parent.mkdir(parents=True, exist_ok=True)
-    layout = get_layout(entries[0].layout)
-    checksums: list[int] = []
-    with h5py.File(path, "w", libver=("v110", "v110")) as file:
-        file.attrs["format_version"] = FORMAT_VERSION
-        file.attrs["layout"] = layout.name
-        for group in dict.fromkeys(entry.h5_group for entry in entries):
-            _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
-        for entry, arrays in zip(entries, histories, strict=True):
-            checksums += _write_history(file[entry.h5_group], layout, kind, entry, arrays)
-    with h5py.File(path, "r") as file:
-        table = np.zeros(len(checksums), CHUNK_DTYPE)
-        table["crc32"] = checksums
-        places = [place for entry in entries for place in _chunk_places(file, kind, entry)]
-        table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
-    np.save(table_path, np.concatenate([table, _between(path, table)]), allow_pickle=False)
-
-
-def _between(path: Path, chunks: np.ndarray) -> np.ndarray:
-    """Lines for what lies between a shard's chunks."""
-    ordered = np.sort(chunks, order="offset")
-    starts = [*ordered["offset"].tolist(), path.stat().st_size]
-    stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
-    lines = []
-    with path.open("rb") as stream:
-        for stop, start in zip(stops, starts, strict=True):
-            for low in range(stop, start, _BETWEEN):
-                stream.seek(low)
-                data = stream.read(min(_BETWEEN, start - low))
-                lines.append((low, len(data), 0, zlib.crc32(data)))
-    return np.array(lines, CHUNK_DTYPE)
-
-
-def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
-    """The empty datasets of a group: (T,) for one history, (histories, T) for stacked ones."""
-    first = entries[0]
-    group = file.create_group(first.h5_group)
-    for field in first.stored_fields(kind):
-        rows = first.rows(field)
-        chunk = min(field.chunk, rows)
-        stacked = first.h5_row is not None
-        element = field.element(layout, kind)
-        group.create_dataset(
-            field.name,
-            shape=(len(entries), rows) if stacked else (rows,),
-            chunks=(1, chunk) if stacked else (chunk,),
-            dtype=element,
-            shuffle=element.itemsize > 1,
-            compression="gzip",
-            compression_opts=_DEFLATE_LEVEL,
-        )
-
-
-def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> list[int]:
-    """Write every chunk of a history, by time; their checksums, in table order."""
-    encoded = list(_encoded(layout, kind, entry, arrays))
-    for field, start, data in sorted(encoded, key=lambda part: in_time(*part[:2])):
-        place = (start,) if entry.h5_row is None else (entry.h5_row, start)
-        group[field.name].id.write_direct_chunk(place, data)
-    return [zlib.crc32(data) for _, _, data in encoded]
-
-
-def in_time(field: Field, start: int) -> tuple[int, ...]:
-    """Sorts the chunks of a history as they stand in the file: what a window needs in one range of bytes.
-
-    That is by block of `_BLOCK` steps, and in a block the first records, what every window needs of scalars, the other
-    records, labels, observations.
-    """
-    if field.axis == "E":
-        return (1,)
-    order = ("actions", "rewards", "dones", "state", "teammate_actions", "expert_actions", "obs")
-    leads = field.name == "state" and start % _BLOCK == 0
-    return (0, start // _BLOCK, -1 if leads else order.index(field.name), start)
-
-
-def stored_bytes(kind: Kind, entry: Entry, arrays: _Arrays) -> int:
-    """What the chunks of a history take in a shard."""
-    return sum(len(data) for _, _, data in _encoded(get_layout(entry.layout), kind, entry, arrays))
-
-
-def _encoded(layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> Iterator[tuple[Field, int, bytes]]:
-    """Every chunk of a history as (field, first row, bytes), in table order."""
-    for field in entry.stored_fields(kind):
-        element = field.element(layout, kind)
-        stored = _as_stored(field, element, arrays[field.name], entry)
-        step = min(field.chunk, len(stored))
-        for start in range(0, len(stored), step):
-            yield field, start, encode_chunk(stored[start : start + step], step, element.itemsize)
-
-
-def _as_stored(field: Field, element: np.dtype, array: np.ndarray, entry: Entry) -> np.ndarray:
-    if len(array) != entry.rows(field):
-        raise OptionError(
-            f"history {entry.history_id}: field {field.name} has {len(array)} rows, expected {entry.rows(field)}"
-        )
-    stored = np.ascontiguousarray(array, element.base)
-    if not np.array_equal(stored, array):
-        raise OptionError(f"history {entry.history_id}: field {field.name} has values that {element.base} cannot hold")
-    return stored
-
-
-def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
-    """What HDF5's shuffle and deflate filters make of a chunk of `length` rows, the missing ones zero."""
-    raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
-    if itemsize > 1:
-        raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
-    return zlib.compress(raw, _DEFLATE_LEVEL)
 
 
 def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
@@ -204,7 +75,7 @@ def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
     return raw
 
 
-def _chunk_places(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
+def chunk_places(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
     """(offset, size, rows) of a history's chunks as HDF5 has them, in table order."""
     places = []
     for field in entry.stored_fields(kind):
@@ -471,7 +342,7 @@ class Shard:
         ordered = np.sort(self._table, order="offset")
         stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
         size = self.path.stat().st_size
-        most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // _BETWEEN  # lines that the writer would write
+        most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // BETWEEN  # lines that the writer would write
         if len(ordered) > most or [0, *stops] != [*starts, size]:
             return [f"the chunk table does not cover the file's {size} bytes, each once"]
         faults = []
@@ -533,7 +404,7 @@ class Shard:
                         f"{dataset.name}: expected {shape} of {element}, found {dataset.shape} of {dataset.dtype}"
                     )
             if not faults:
-                places += _chunk_places(file, self.kind, entry)
+                places += chunk_places(file, self.kind, entry)
         table = list(zip(*(self._table[name].tolist() for name in ("offset", "size", "rows")), strict=True))
         wrong = [row for row, (a, b) in enumerate(zip(places, table, strict=False)) if a != b]
         if wrong and not faults:

@@ -25,7 +25,8 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import FIELDS, episode_returns
-from icrl4aht_data.shard import decode_chunk, encode_chunk
+from icrl4aht_data.shard import decode_chunk
+from icrl4aht_data.shard_writer import encode_chunk
 
 
 def test_our_reader_gives_back_every_array(either):
