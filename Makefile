@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test check format bench-env bench-eval bench-learner bench-collect bench-loader clean
+.PHONY: help install demo generate teammates verify control test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-train clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -63,6 +63,9 @@ bench-loader: install ## batches/s of every way of holding data beside readers o
 
 bench-learner: install ## self-play learning steps/s beside JaxMARL's IPPO: PEER=ippo_rnn_overcooked_v2.py of its repository
 	$(BIN)/python -m benchmarks.bench_learner --peer $(PEER)
+
+bench-train: install ## training steps/s beside a reader of the published format, cached beside exact acting, JSON lines
+	$(BIN)/python -m benchmarks.bench_train $(OPTIONS)
 
 bench-collect: install ## collection: speed, memory, bytes a transition beside the paper's format, JSON lines
 	$(BIN)/python -m benchmarks.bench_collect

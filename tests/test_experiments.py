@@ -13,7 +13,8 @@ from plays import random_release
 
 from baselines import experiments
 from baselines.cli import cli
-from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Plan, held_out_tasks, run_experiment
+from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, Plan, held_out_tasks, run_experiment
+from baselines.method import ModelOptions
 from baselines.runs import Checkpoints
 from generation.learners.checkpoint import WEIGHTS, save_policy
 from generation.learners.network import ActorCritic, Widths
@@ -65,7 +66,7 @@ def killed(what: str):
 def swept(release, tmp_path_factory) -> tuple[Path, Plan]:
     """Killed twice, then run to its end."""
     out = tmp_path_factory.mktemp("swept")
-    plan = dataclasses.replace(SMALL, root=str(release), values=("K250", "K500"))
+    plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
     for what in ("K250 on demo_wide: training", "K250 on demo_wide: evaluation"):
         with pytest.raises(KeyboardInterrupt):
             run_experiment("sweep context", plan, out, killed(what))
@@ -81,42 +82,42 @@ def test_a_sweep_ends_in_a_report(swept):
     assert "Context length" in page
     assert "left out, the release has no training histories of them: test_wide" in page
     lines = (out / "report" / "report.csv").read_text().splitlines()
-    assert [line.split(",")[-1] for line in lines] == ["variant", "K = 250", "K = 500"]
-    assert all(line.startswith("AD,seeded,demo_wide,H4,1,2,") for line in lines[1:])
+    assert [line.split(",")[-1] for line in lines] == ["variant", "K = 250"]
+    assert lines[1].startswith("AD,seeded,demo_wide,H4,1,2,")
 
 
 def test_what_is_finished_is_not_done_again(swept, monkeypatch):
     out, plan = swept
     results = sorted(out.rglob("tasks/*.json"))
     before = [(path, path.stat().st_mtime_ns) for path in results]
-    assert len(results) == 2
+    assert len(results) == 1
     steps = []
     monkeypatch.setattr(experiments, "write_page_with_films", lambda *a, **k: out)
     run_experiment("sweep context", plan, out, lambda what, done, of: steps.append((what.split(": ")[1], done, of)))
     assert [(path, path.stat().st_mtime_ns) for path in results] == before
-    assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 1, 1)] * 2
+    assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 1, 1)]
     with pytest.raises(OptionError, match=r"train\.seed: the run has 0, asked for 3"):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
 
 
-def test_the_ablation_command_on_track_2(release, tmp_path, monkeypatch):
-    monkeypatch.setattr(experiments, "ModelOptions", lambda **own: experiments_model(**own))
-    arguments = ["ablate", "ta", "--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]
-    small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "1", "--family", "H4"]
-    result = CliRunner().invoke(cli, [*arguments, *small, "--no-films", "--out", str(tmp_path)], catch_exceptions=False)
+def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
+    asked = []
+
+    def note(name, plan, out, progress):
+        asked.append((name, plan, out))
+        return Done([tmp_path / "report.html"], ["left out: nothing"])
+
+    monkeypatch.setattr(experiments, "run_experiment", note)
+    small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-films"]
+    chosen = ["--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]
+    result = CliRunner().invoke(cli, ["ablate", "ta", *chosen, *small], catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    csv = (tmp_path / "report" / "report.csv").read_text().splitlines()
-    assert csv[1].startswith("AD+TA,seeded,cramped_down,H4,1,1,")
-    assert ",0.6,0.1," in csv[1], "the paper's number beside ours"
-    about = json.loads((tmp_path / "ad-ta" / "cramped_up" / "results" / "run.json").read_text())
-    assert about["config"]["histories"]["layouts"] == ["cramped_up"]
-    assert about["manifest_sha256"] == file_hash(release / "MANIFEST.sha256")
-
-
-def experiments_model(**own):
-    from baselines.method import ModelOptions
-
-    return ModelOptions(**{**own, **MODEL})
+    assert "left out: nothing" in result.output
+    ((name, plan, out),) = asked
+    assert (name, out) == ("ablate ta", Path("runs/ablate-ta"))
+    options = {"layouts": ("cramped_up",), "values": ("ta",), "train": {"steps": 1, "batch_size": 2}, "episodes": 3}
+    rest = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
+    assert plan == Plan(**options, **rest)
 
 
 # Held-out teammates.
@@ -137,13 +138,19 @@ def suite(tmp_path_factory) -> Path:
     return root
 
 
-def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path):
-    plan = dataclasses.replace(SMALL, root=str(release), suite=suite, layouts=("cramped_up",), families=("rl",))
-    plan = dataclasses.replace(plan, train=TRAIN | {"context": 8})
-    run_experiment("heldout-rl", plan, tmp_path)
+def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path, monkeypatch):
+    monkeypatch.setattr(experiments, "ModelOptions", lambda **own: ModelOptions(**(own | MODEL)))
+    arguments = ["heldout-rl", "--suite", str(suite), "--method", "ad", "--layout", "cramped_up"]
+    small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "2", "--no-films"]
+    command = [*arguments, *small, "--root", str(release), "--out", str(tmp_path)]
+    result = CliRunner().invoke(cli, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
     assert "AD,seeded,cramped_up,rl,1,2," in (tmp_path / "report" / "report.csv").read_text()
     assert "cramped_up, learned" in (tmp_path / "report" / "report.html").read_text()
     assert "| rl |" in (tmp_path / "report" / "report.md").read_text()
+    about = json.loads((tmp_path / "ad-plain" / "cramped_up" / "results" / "run.json").read_text())
+    assert about["config"]["histories"]["layouts"] == ["cramped_up"]
+    assert about["manifest_sha256"] == file_hash(release / "MANIFEST.sha256")
 
 
 def test_suites_without_held_out_teammates(release, suite, tmp_path):
