@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -25,8 +26,8 @@ from icrl4aht_data.tasks import make_task, read_tasks, write_tasks
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
-MODEL = {"layers": 1, "width": 8, "heads": 2}
-TRAIN = {"steps": 2, "batch_size": 2, "validation_batches": 1}
+MODEL: dict[str, Any] = {"layers": 1, "width": 8, "heads": 2}
+TRAIN: dict[str, Any] = {"steps": 2, "batch_size": 2, "validation_batches": 1}
 SMALL = Plan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, films=False)
 
 
@@ -115,8 +116,13 @@ def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
     assert "left out: nothing" in result.output
     ((name, plan, out),) = asked
     assert (name, out) == ("ablate ta", Path("runs/ablate-ta"))
-    options = {"layouts": ("cramped_up",), "values": ("ta",), "train": {"steps": 1, "batch_size": 2}, "episodes": 3}
-    rest = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
+    options: dict[str, Any] = {
+        "layouts": ("cramped_up",),
+        "values": ("ta",),
+        "train": {"steps": 1, "batch_size": 2},
+        "episodes": 3,
+    }
+    rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
     assert plan == Plan(**options, **rest)
 
 
