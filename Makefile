@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote bench-faults clean
+.PHONY: help install demo generate teammates verify control test check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote bench-faults bench-train clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -69,6 +69,9 @@ bench-remote: install ## requests, bytes and seconds of remote releases over HTT
 
 bench-faults: install ## faults of remotes, disks, processes and files: tried, survived, lost, JSON lines
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.bench_faults
+
+bench-train: install ## training steps/s beside a reader of the published format, cached beside exact acting, JSON lines
+	$(BIN)/python -m benchmarks.bench_train $(OPTIONS)
 
 bench-collect: install ## collection: speed, memory, bytes a transition beside the paper's format, JSON lines
 	$(BIN)/python -m benchmarks.bench_collect

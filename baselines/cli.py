@@ -13,7 +13,7 @@ from rich.progress import Progress
 from baselines.evaluate import PROTOCOLS
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.cli import run
-from icrl4aht_data.errors import EmptySelectionError
+from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 
 console = Console(soft_wrap=True)
@@ -52,6 +52,7 @@ def evaluate(
     from baselines.agents import find_agent
     from baselines.evaluate import evaluate as evaluate_tasks
     from baselines.evaluate import get_protocol
+    from baselines.provenance import note_results
     from icrl4aht_data.tasks import manifest_path, read_tasks
 
     paths = [manifest] if manifest else [manifest_path(name, "test") for name in track]
@@ -75,6 +76,7 @@ def evaluate(
             details=ego.details,
             done=lambda n: bars.advance(bar, n),
         )
+    note_results(out, agent if ego.details else None, tasks if manifest else ())
     console.print(f"{len(tasks)} results in {out}; `python -m baselines report {out}` shows them")
 
 
@@ -83,12 +85,21 @@ def evaluate(
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Folder of the report; RUN/report of the first by default."
 )
-def report(runs: tuple[Path, ...], out: Path | None) -> None:
-    """The paper's tables with the published numbers beside ours, as Markdown, CSV and curves."""
-    from baselines.report import markdown, read_run, write_report
+@click.option("--html", type=click.Path(path_type=Path, dir_okay=False), help="Also one self-contained page.")
+@click.option("--episodes/--no-episodes", default=True, show_default=True, help="A GIF per family on the page.")
+def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, episodes: bool) -> None:
+    """The paper's tables with the published numbers beside ours, as Markdown, CSV and curves, and as one page.
 
-    loaded = [read_run(run) for run in runs]
+    Results of one agent on different layouts are put together.
+    """
+    from baselines.report import markdown, merge, read_run, write_report
+
+    loaded = merge([read_run(run) for run in runs])
     paths = write_report(loaded, out or runs[0] / "report")
+    if html:
+        from baselines.page import write_page_with_films
+
+        paths.append(write_page_with_films(loaded, html, episodes=episodes))
     click.echo(markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")
@@ -97,29 +108,20 @@ def report(runs: tuple[Path, ...], out: Path | None) -> None:
 @cli.command()
 @click.option("--layout", required=True, help="Short or environment name.")
 @click.option("--teammate", default="H4/t0", show_default=True, help="Family and published instance, such as H3/t1.")
-@click.option("--ego", default="random", show_default=True, help="An agent's name.")
+@click.option("--ego", default="random", show_default=True, help="An agent's name, or a run folder.")
 @click.option("--protocol", default="seeded", show_default=True)
 @click.option("--seed", default=0, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The GIF to write.")
 def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
     """An episode to look at."""
-    import dataclasses
-
-    import numpy as np
-
-    from baselines.agents import get_agent
-    from baselines.evaluate import get_protocol, play_tasks
+    from baselines.agents import find_agent
+    from baselines.evaluate import get_protocol
+    from baselines.watching import film
     from generation.teammates.instances import named_task
-    from icrl4aht_data.overcooked.render import save_episode
 
     task = named_task(layout, teammate)
-    one = dataclasses.replace(get_protocol(protocol), episodes=1)
-    (played,) = play_tasks(get_agent(ego), [task], one, [seed])
-    record, reward = np.asarray(played.record[0]), np.asarray(played.reward[0])
-    save_episode(out, task.layout, record, reward)
-    console.print(
-        f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {reward.sum():g}; wrote {out}"
-    )
+    earned = film(out, task, find_agent(ego).make, get_protocol(protocol), seed=seed)
+    console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
 
 
 @cli.command()
@@ -198,6 +200,84 @@ def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | 
     console.print(
         f"{training.steps} steps in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
+
+
+def _experiment_options(command: Any) -> Any:
+    """What all experiments take."""
+    folder = click.Path(path_type=Path, exists=True)
+    options = [
+        click.option("--method", "methods", multiple=True, default=("ad", "dpt"), show_default=True),
+        click.option("--layout", "layouts", multiple=True, help="To train on; the paper's that the release has."),
+        click.option("--root", type=folder, help="A release; the bundled mini release if not given."),
+        click.option("--only", "values", multiple=True, help="Only these settings, such as K250, medium or ta."),
+        click.option("--steps", type=int, help="Training steps, instead of the paper's."),
+        click.option("--context", type=int, help="K, instead of 500; not in `sweep context`."),
+        click.option("--batch-size", type=int, help="1024 as in the paper, or 32 where there is only a CPU."),
+        click.option("--family", "families", multiple=True, help="Only these teammate families, such as H4."),
+        click.option("--tasks", type=int, help="At most so many teammates of each family and layout."),
+        click.option("--episodes", type=click.IntRange(1), help="Of a task, instead of 100."),
+        click.option("--seeds", default=1, show_default=True, type=click.IntRange(1), help="Play every task so often."),
+        click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}."),
+        click.option("--acting", default="cached", show_default=True, help="cached, or exact and slower."),
+        click.option("--films/--no-films", default=True, show_default=True, help="A GIF per family on the page."),
+        click.option("--out", type=click.Path(path_type=Path), help="runs/EXPERIMENT by default."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+@cli.command()
+@click.argument("what")
+@_experiment_options
+def sweep(what: str, **options: Any) -> None:
+    """Train, evaluate and report over WHAT: context (K of 250 to 10,000) or size (small, medium, large)."""
+    _experiment(f"sweep {what}", **options)
+
+
+@cli.command()
+@click.argument("what")
+@_experiment_options
+def ablate(what: str, **options: Any) -> None:
+    """Train, evaluate and report WHAT: ta (none, +TA, +next_obs, both)."""
+    _experiment(f"ablate {what}", **options)
+
+
+@cli.command("heldout-rl")
+@click.option("--suite", type=click.Path(path_type=Path), default=Path("build/suite"), show_default=True)
+@_experiment_options
+def heldout_rl(suite: Path, **options: Any) -> None:
+    """Train, evaluate beside a suite's learned teammates that are not in training, and report."""
+    _experiment("heldout-rl", suite=suite, **options)
+
+
+def _experiment(name: str, out: Path | None, root: Path | None, suite: Path | None = None, **options: Any) -> None:
+    import jax
+
+    from baselines.experiments import EXPERIMENTS, Plan, run_experiment
+    from icrl4aht_data.benchmark import unknown
+
+    if name not in EXPERIMENTS:
+        raise unknown("experiment", name, EXPERIMENTS)
+    given = {key: options.pop(key) for key in ("steps", "context", "batch_size")}
+    training = {key: value for key, value in given.items() if value is not None}
+    training.setdefault("batch_size", 32 if jax.default_backend() == "cpu" else 1024)
+    if name == "sweep context" and "context" in training:
+        raise OptionError(f"--context {training['context']}: `sweep context` varies it; choose by --only, such as K250")
+    plan = Plan(root=root and str(root), suite=suite, train=training, **options)
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        running: dict[str, Any] = {}
+
+        def progress(task: str, done: int, of: int) -> None:
+            if task not in running:
+                running[task] = bars.add_task(task, total=of)
+            bars.update(running[task], completed=done)
+
+        found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), progress)
+    for note in found.notes:
+        click.echo(note)
+    for path in found.report:
+        click.echo(f"wrote {path}")
 
 
 @cli.command()

@@ -24,7 +24,7 @@ from baselines.method import Method, ModelOptions
 from baselines.trainer import Data, State, TrainOptions, train
 
 MODEL = ModelOptions(layers=2, width=32, heads=2, dropout=0.0)
-ROOM_MODEL = replace(MODEL, dropout=0.1)  # there are few goals to train on
+ROOM_MODEL = replace(MODEL, width=64, heads=4)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Size:
     room_episodes: int = 20
     rows: int = 20_000  # histories, and tasks of DPT
     tasks: int = 200  # that are played
-    updates: tuple[int, int, int] = (1500, 1500, 600)  # DPT and AD on bandits, AD in Dark Room
+    updates: tuple[int, int, int] = (1500, 1500, 800)  # DPT and AD on bandits, AD in Dark Room
     batch_size: int = 32
 
 

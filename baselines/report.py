@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections import defaultdict
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from baselines.evaluate import Result, read_result
-from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.benchmark import FAMILIES, TRACKS
 from icrl4aht_data.cards import card_file
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.headroom import HEURISTICS, Cell, has_headroom, read_headroom
-from icrl4aht_data.tasks import manifest_path, read_tasks
+from icrl4aht_data.files import parse_json, read_text
+from icrl4aht_data.headroom import Cell, has_headroom, read_headroom
+from icrl4aht_data.tasks import Task, manifest_path, read_tasks
 
 LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
+_EVERY_LAYOUT = tuple(dict.fromkeys(name for s in TRACKS.values() for names in s.values() for name in names))
+TASKS, ABOUT = "tasks.jsonl", "run.json"
+"""Beside results: tasks that are not the published ones; what the evaluated model was trained on."""
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 _RESAMPLES = 10_000
+
+
+class Source(NamedTuple):
+    """Where results come from."""
+
+    folder: str
+    layouts: tuple[str, ...]
+    settings: dict[str, Any]
+    trained: dict[str, Any] | None  # of a trained model: see `provenance.note_run`
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +45,9 @@ class Run:
     agent: str
     protocol: str
     cells: dict[Cell, np.ndarray]  # (instances, episodes) team returns, means over the seeds
+    variant: tuple[str, Any] | None = None  # of a sweep: what is varied and this run's value, such as ("K", 250)
+    note: str = ""  # tells apart results of one agent on the same cells
+    sources: tuple[Source, ...] = ()
 
     def means(self, cell: Cell) -> np.ndarray:
         """float64 (instances,)."""
@@ -43,8 +59,14 @@ class Run:
         return float(returns[:, -_ENDS:].mean() - returns[:, :_ENDS].mean())
 
     @cached_property
+    def label(self) -> str:
+        """The agent, and what tells this run from its others."""
+        varied = "" if self.variant is None else ", {} = {}".format(*self.variant)
+        return self.agent + varied + (f" [{self.note}]" if self.note else "")
+
+    @cached_property
     def name(self) -> str:
-        return f"{self.agent} ({self.protocol})"
+        return f"{self.label} ({self.protocol})"
 
 
 def read_run(folder: Path) -> Run:
@@ -58,22 +80,58 @@ def read_run(folder: Path) -> Run:
         raise OptionError(
             f"{folder}: no results in {folder / 'tasks'}; run `python -m baselines evaluate --out {folder}`"
         )
-    return as_run(results, str(folder))
+    own = read_tasks(folder / TASKS) if (folder / TASKS).exists() else []
+    about = parse_json(read_text(folder / ABOUT)) if (folder / ABOUT).exists() else None
+    return as_run(results, str(folder), own, about)
 
 
-def as_run(results: list[Result], where: str = "results") -> Run:
-    """Results of one agent as a run."""
+def as_run(
+    results: Sequence[Result], where: str = "results", tasks: Sequence[Task] = (), trained: dict[str, Any] | None = None
+) -> Run:
+    """Results of one agent as a run; of the published tasks, and of those that are given."""
     settings = results[0].settings
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: results of different settings in one run")
-    known = {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))}
+    published = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
+    known = {task.task_id: task for task in (*published, *tasks)}
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
     for result in results:
         if result.task_id not in known:
-            raise OptionError(f"{where}: {result.task_id!r} is not one of the published test tasks")
+            raise OptionError(
+                f"{where}: {result.task_id!r} is not one of the published test tasks, and {TASKS} beside the results "
+                f"does not have it; evaluate again, or put the manifest there"
+            )
         task = known[result.task_id]
         cells[task.layout.name, task.teammate_family].append(np.mean(result.returns, axis=0))
-    return Run(settings["agent"], settings["protocol"]["name"], {cell: np.array(rows) for cell, rows in cells.items()})
+    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
+    arrays = {cell: np.array(cells[cell]) for cell in sorted(cells, key=_place)}
+    source = Source(where, tuple(dict.fromkeys(layout for layout, _ in arrays)), settings, trained)
+    return Run(settings["agent"], settings["protocol"]["name"], arrays, variant, sources=(source,))
+
+
+def _place(cell: Cell) -> tuple[int, int]:
+    return _EVERY_LAYOUT.index(cell[0]), FAMILIES.index(cell[1])
+
+
+def merge(runs: Sequence[Run]) -> list[Run]:
+    """One agent's results on different cells, of models trained on each layout, as one run; where the same cell was
+    played twice, runs stay apart and bear their folder's name."""
+    merged: list[Run] = []
+    for run in runs:
+        same = [k for k, other in enumerate(merged) if (other.name, _episodes(other)) == (run.name, _episodes(run))]
+        apart = [k for k in same if not merged[k].cells.keys() & run.cells.keys()]
+        if apart:
+            other = merged[apart[0]]
+            cells = other.cells | run.cells
+            ordered = {cell: cells[cell] for cell in sorted(cells, key=_place)}
+            merged[apart[0]] = replace(other, cells=ordered, sources=other.sources + run.sources)
+        else:
+            merged.append(replace(run, note=run.sources[0].folder) if same and run.sources else run)
+    return merged
+
+
+def _episodes(run: Run) -> set[int]:
+    return {returns.shape[1] for returns in run.cells.values()}
 
 
 def interval(means: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
@@ -85,42 +143,47 @@ def interval(means: np.ndarray, rng: np.random.Generator) -> tuple[float, float]
 
 def rows(run: Run) -> list[dict[str, Any]]:
     """One row per cell: ours, the published number of the same agent, interval, gain, and the normalised score."""
-    published, headroom = _published(run.agent), read_headroom(run.protocol)
+    published: dict[str, Any] = {} if run.variant else published_cells(run.agent)
+    headroom = read_headroom(run.protocol)
     rng = np.random.default_rng(0)
     table = []
-    for layout in LAYOUTS:
-        for family in HEURISTICS:
-            cell = (layout, family)
-            if cell not in run.cells:
-                continue
-            means = run.means(cell)
-            low, high = interval(means, rng)
-            theirs = published.get(layout, {}).get(family, (None, None))
-            table.append(
-                {
-                    "agent": run.agent,
-                    "protocol": run.protocol,
-                    "layout": layout,
-                    "family": family,
-                    "instances": len(means),
-                    "episodes": run.cells[cell].shape[1],
-                    "mean": float(means.mean()),
-                    "std": float(means.std()),
-                    "low": low,
-                    "high": high,
-                    "published_mean": theirs[0],
-                    "published_std": theirs[1],
-                    "gain": run.gain(cell),
-                    "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
-                    "normalised": normalised(float(means.mean()), headroom.get(cell)),
-                }
-            )
+    for cell in run.cells:
+        layout, family = cell
+        means = run.means(cell)
+        low, high = interval(means, rng)
+        theirs = published.get(layout, {}).get(family, (None, None))
+        table.append(
+            {
+                "agent": run.agent,
+                "protocol": run.protocol,
+                "layout": layout,
+                "family": family,
+                "instances": len(means),
+                "episodes": run.cells[cell].shape[1],
+                "mean": float(means.mean()),
+                "std": float(means.std()),
+                "low": low,
+                "high": high,
+                "published_mean": theirs[0],
+                "published_std": theirs[1],
+                "gain": run.gain(cell),
+                "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
+                "normalised": normalised(float(means.mean()), headroom.get(cell)),
+                "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
+            }
+        )
     return table
 
 
-def _published(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    content = json.loads(card_file("published.json").read_text(encoding="utf-8"))
-    return content["methods"].get(agent, {})
+@cache
+def read_published() -> dict[str, Any]:
+    """The paper's numbers, each part with its source: cards/published.json."""
+    return parse_json(read_text(card_file("published.json")))
+
+
+def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
+    """layout -> family or "Average" -> published mean and std; empty for an agent that the paper does not have."""
+    return read_published()["methods"].get(agent, {})
 
 
 def normalised(mean: float, references: dict[str, float] | None) -> float | None:
@@ -139,15 +202,22 @@ def markdown(runs: list[Run]) -> str:
     for run in runs:
         cells = {(row["layout"], row["family"]): row for row in rows(run)}
         for track, splits in TRACKS.items():
-            layouts = [layout for layout in splits["test"] if any((layout, family) in cells for family in HEURISTICS)]
+            of_track = dict.fromkeys((*splits["test"], *splits["train"]))
+            layouts = [layout for layout in of_track if any((layout, family) in cells for family in FAMILIES)]
             if layouts:
                 lines += ["", f"## {run.name}, track {track}", "", *_grid(cells, layouts)]
     return "\n".join(lines) + "\n"
 
 
+def families_of(cells: Iterable[Cell]) -> list[str]:
+    """Those that there are, in the paper's order."""
+    there = {family for _, family in cells}
+    return [family for family in FAMILIES if family in there]
+
+
 def _grid(cells: dict[Cell, dict[str, Any]], layouts: list[str]) -> list[str]:
     lines = [f"| family | {' | '.join(layouts)} |", f"|---|{'---|' * len(layouts)}"]
-    for family in HEURISTICS:
+    for family in families_of(cells):
         present = [cells.get((layout, family)) for layout in layouts]
         lines.append(f"| {family} | {' | '.join(_cell_text(row) for row in present)} |")
     return lines
@@ -181,10 +251,12 @@ def plot_curves(runs: list[Run], path: Path) -> None:
     """Return per episode for every cell: mean, and the range over instances as a band."""
     from matplotlib.figure import Figure
 
-    layouts = [layout for layout in LAYOUTS if any(cell[0] == layout for run in runs for cell in run.cells)]
-    figure = Figure(figsize=(2.5 * len(layouts) + 1, 2.1 * len(HEURISTICS) + 0.6), layout="constrained")
-    axes = figure.subplots(len(HEURISTICS), len(layouts), squeeze=False, sharex=True)
-    for i, family in enumerate(HEURISTICS):
+    every = [cell for run in runs for cell in run.cells]
+    layouts = [layout for layout in _EVERY_LAYOUT if any(cell[0] == layout for cell in every)]
+    families = families_of(every)
+    figure = Figure(figsize=(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6), layout="constrained")
+    axes = figure.subplots(len(families), len(layouts), squeeze=False, sharex=True)
+    for i, family in enumerate(families):
         for j, layout in enumerate(layouts):
             axis = axes[i, j]
             for run in runs:
@@ -195,11 +267,15 @@ def plot_curves(runs: list[Run], path: Path) -> None:
                 axis.set_title(layout, fontsize=9)
             if j == 0:
                 axis.set_ylabel(family)
-            if i == len(HEURISTICS) - 1:
+            if i == len(families) - 1:
                 axis.set_xlabel("episode", fontsize=8)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(runs), frameon=False)
-    figure.savefig(path, dpi=110)
+    entries = {
+        label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=min(len(entries), 5), frameon=False
+    )
+    figure.savefig(path, dpi=110, format="png")
 
 
 def _plot_cell(axis: Any, run: Run, cell: Cell, smooth: int = 10) -> None:
