@@ -269,7 +269,7 @@ def _verdict(report: Report) -> str:
     verdict = "whole" if report.ok else f"{len(report.findings)} problems"
     if report.quick:
         return f"{verdict}; checked names, sizes and the index of {report.files} files, no contents"
-    physics = " and their physics" if report.deep and not report.notes else ""
+    physics = " and their physics" if report.replayed else ""
     fetched = f"; fetched {report.fetched_bytes:,} bytes in {report.requests} requests" if report.requests else ""
     return (
         f"{verdict}; checked {report.files} files, {report.chunks} chunks, {report.histories} histories, "

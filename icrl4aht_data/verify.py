@@ -76,6 +76,7 @@ class Report:
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  # what was asked for but could not be checked, which is no fault
     repaired: list[str] = field(default_factory=list)
+    replayed: bool = False
     files: int = 0
     chunks: int = 0
     histories: int = 0
@@ -175,7 +176,8 @@ def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Na
         return
     index = read_index(origin)
     tasks = read_tasks(inside(origin.folder, TASKS))
-    if report.deep and index.info["kind"] not in KINDS:
+    report.replayed = report.deep and index.info["kind"] in KINDS
+    if report.deep and not report.replayed:
         report.notes.append(
             "nothing was replayed: without state records it cannot be said whether steps obey the rules"
         )
