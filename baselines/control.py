@@ -36,6 +36,7 @@ class Size:
     rows: int = 20_000  # histories, and tasks of DPT
     tasks: int = 200  # that are played
     updates: tuple[int, int, int] = (1500, 1500, 800)  # DPT and AD on bandits, AD in Dark Room
+    learning_rates: tuple[float, float, float] = (1e-3, 1e-3, 2e-3)
     batch_size: int = 32
 
 
@@ -172,7 +173,7 @@ def _train(
         steps=updates,
         batch_size=size.batch_size,
         context=rows[0][3].shape[1],
-        learning_rate=2e-3,
+        learning_rate=size.learning_rates[number],
         log_every=100,
         validate_every=max(1, updates // 4),
         save_every=updates,
