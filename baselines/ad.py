@@ -78,14 +78,7 @@ class StepModel(nn.Module):
 
 def step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
     """The model with that trunk and head."""
-    tokens = StepTokens(
-        world.encoder(options.dtype),
-        options.width,
-        world.actions,
-        options.teammate_actions,
-        options.dropout,
-        options.dtype,
-    )
+    tokens = options.tokens(StepTokens, world)
     return StepModel(tokens, trunk, head, next_obs_head(options, world))
 
 

@@ -90,8 +90,17 @@ def transitions_of(batch: DPTBatch, view: View) -> tuple[Transition, Array]:
     return Transition(obs, batch.context_actions, batch.context_rewards, following, mate), query  # type: ignore[arg-type]
 
 
-class StepTokens(nn.Module):
-    """Steps -> tokens: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2)."""
+class Tokens(nn.Module):
+    """What makes tokens has.
+
+    Args:
+        encoder: of observations.
+        width: of a token.
+        actions: how many there are.
+        teammate_actions: +TA.
+        dropout: rate, in training.
+        dtype: of the tokens.
+    """
 
     encoder: nn.Module
     width: int = 256
@@ -99,6 +108,10 @@ class StepTokens(nn.Module):
     teammate_actions: bool = False
     dropout: float = 0.1
     dtype: Any = jnp.float32
+
+
+class StepTokens(Tokens):
+    """Steps -> tokens: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2)."""
 
     @nn.compact
     def __call__(self, step: Step, deterministic: bool = True) -> Float[Array, "*B D"]:
@@ -110,16 +123,9 @@ class StepTokens(nn.Module):
         return nn.Dropout(self.dropout)(token, deterministic=deterministic)
 
 
-class TransitionTokens(nn.Module):
+class TransitionTokens(Tokens):
     """Transitions -> tokens: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected; a query is
     [Enc(o); zeros] through the same projection (paper, App. E.3)."""
-
-    encoder: nn.Module
-    width: int = 256
-    actions: int = len(ACTIONS)
-    teammate_actions: bool = False
-    dropout: float = 0.1
-    dtype: Any = jnp.float32
 
     def setup(self) -> None:
         self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)

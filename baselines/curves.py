@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from icrl4aht_data.files import file_in_place_of
+from icrl4aht_data.figures import save_figure
 
 _LEFT_OUT = ("step", "part")
 
@@ -35,5 +35,4 @@ def plot_run(metrics: Path, path: Path, title: str) -> None:
     figure.suptitle(title, fontsize=10)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(parts), frameon=False)
-    with file_in_place_of(path) as partial:
-        figure.savefig(partial, dpi=110, format=path.suffix.removeprefix("."))
+    save_figure(figure, path)

@@ -125,14 +125,7 @@ class DPT(nn.Module):
 
 def dpt(options: ModelOptions, world: World, whole_episodes: bool = True) -> Method:
     """3,285,022 parameters at C = 40."""
-    tokens = TransitionTokens(
-        world.encoder(options.dtype),
-        options.width,
-        world.actions,
-        options.teammate_actions,
-        options.dropout,
-        options.dtype,
-    )
+    tokens = options.tokens(TransitionTokens, world)
     head, next_obs = nn.Dense(world.actions), next_obs_head(options, world)
     model = DPT(tokens, options.transformer(), head, world.obs_shape, next_obs, whole_episodes)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import flax.linen as nn
 import jax
@@ -16,7 +16,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from baselines.context import Step, View
+from baselines.context import Step, Tokens, View
 from baselines.transformer import POSITIONS, Positions, Transformer
 from icrl4aht_data.benchmark import ACTIONS, unknown
 from icrl4aht_data.errors import OptionError
@@ -26,6 +26,9 @@ Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
 
 SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 768, 100_000)}
 """Name -> layers, width, training steps (paper, Sec. 4.4, "Model Scale and Training Budget")."""
+
+
+T = TypeVar("T", bound=Tokens)
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,11 @@ class ModelOptions:
     def transformer(self) -> Transformer:
         """The transformer of this size."""
         return Transformer(self.layers, self.width, self.heads, self.dropout, self.positions, self.remat)
+
+    def tokens(self, kind: type[T], world: World) -> T:
+        """What makes tokens of that kind."""
+        encoder = world.encoder(self.dtype)
+        return kind(encoder, self.width, world.actions, self.teammate_actions, self.dropout, self.dtype)
 
 
 class World(NamedTuple):

@@ -13,6 +13,7 @@ from baselines.report import Run
 from baselines.tables import Point
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.figures import save_figure
 from icrl4aht_data.headroom import HEURISTICS
 
 
@@ -37,7 +38,7 @@ def plot_sweep(panels: Mapping[str, Mapping[str, Sequence[Point]]], what: str, p
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("mean return over families")
     _legend(figure)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_gain(runs: Sequence[Run], path: Path) -> None:
@@ -64,7 +65,7 @@ def plot_gain(runs: Sequence[Run], path: Path) -> None:
     axis.set_ylabel("last 20 - first 20 episodes")
     axis.grid(alpha=0.3, axis="y")
     _legend(figure)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _legend(figure: Figure) -> None:
@@ -75,7 +76,3 @@ def _legend(figure: Figure) -> None:
         figure.legend(
             entries.values(), entries.keys(), loc="outside lower center", ncols=min(4, len(entries)), frameon=False
         )
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=110, format="png")

@@ -17,6 +17,7 @@ from baselines.evaluate import Result, read_result
 from icrl4aht_data.benchmark import FAMILIES, TRACKS
 from icrl4aht_data.cards import card_file
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.figures import save_figure
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.headroom import Cell, has_headroom, read_headroom
 from icrl4aht_data.tasks import Task, manifest_path, read_tasks
@@ -275,7 +276,7 @@ def plot_curves(runs: list[Run], path: Path) -> None:
     figure.legend(
         entries.values(), entries.keys(), loc="outside lower center", ncols=min(len(entries), 5), frameon=False
     )
-    figure.savefig(path, dpi=110, format="png")
+    save_figure(figure, path)
 
 
 def _plot_cell(axis: Any, run: Run, cell: Cell, smooth: int = 10) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from icrl4aht_data.files import file_in_place_of
+from icrl4aht_data.figures import save_figure
 
 
 def plot_training(metrics: Path, path: Path, title: str) -> None:
@@ -28,7 +28,7 @@ def plot_training(metrics: Path, path: Path, title: str) -> None:
     axes.set(title=title, xlabel="environment steps of each member", ylabel="return of an episode (400 steps)")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_matrix(
@@ -49,9 +49,4 @@ def plot_matrix(
     axes.set_xlabel(labels[1])
     axes.set_title(title, fontsize=10)
     figure.colorbar(image)
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with file_in_place_of(path) as partial:
-        figure.savefig(partial, dpi=110, format=path.suffix.removeprefix("."))
+    save_figure(figure, path)

@@ -129,6 +129,8 @@ def bring(wanted: Iterable[tuple[PartialFile, np.ndarray]]) -> None:
         RemoteError: if bytes cannot be had, or come wrong again and again.
     """
     pieces = [(file, piece) for file, chunks in wanted for piece in _pieces(file.missing(chunks))]
+    if not pieces:
+        return
     _at_once([lambda file=file, piece=piece: _fetch(file, piece, file.keep) for file, piece in pieces])
     disk = sum(piece.stop // _DISK_BLOCK - piece.start // _DISK_BLOCK + 1 for _, piece in pieces) * _DISK_BLOCK
     _bound({file.path for file, _ in pieces}, disk)
@@ -255,7 +257,7 @@ def _bound(used: set[Path], written: int) -> None:
     global _unlooked
     _unlooked += written
     limit = cache_limit()
-    if not written or _unlooked < min(_CHECKED, limit // 4):
+    if _unlooked < min(_CHECKED, limit // 4):
         return
     _unlooked = 0
     kept = []

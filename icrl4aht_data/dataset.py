@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from icrl4aht_data.benchmark import unknown
+from icrl4aht_data.blocks import bring
 from icrl4aht_data.cache import new_array
 from icrl4aht_data.draws import Curriculum, Episodes, Weights, whole
 from icrl4aht_data.errors import (
@@ -401,6 +402,8 @@ class History:
         stop = max(start, stop)
         if self._shard.kind in field.absent:
             return self._painted(start, stop, np.uint8)
+        if self._shard.is_remote:
+            bring(self._shard.lacking(self._shard.needed(self.entry.history_id, field, start, stop)))
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def _painted(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:

@@ -81,7 +81,7 @@ def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]])
         axes.set_ylabel("return of the kept steps")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
-    _save(figure, path)
+    save_figure(figure, path, dpi=120)
 
 
 def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
@@ -97,7 +97,7 @@ def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
         axes.imshow(draw_frame(layout, record, view=False))
         axes.set_title(f"{layout.name} ({layout.alias})", fontsize=9)
         axes.set_axis_off()
-    _save(figure, path)
+    save_figure(figure, path, dpi=120)
 
 
 def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path) -> None:
@@ -121,7 +121,7 @@ def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[s
     axes.set_yticks(range(len(HEURISTICS)), HEURISTICS)
     axes.set_ylabel("test teammates")
     axes.set_title("Return of the oracle minus that of an ego that stays", fontsize=9)
-    _save(figure, path)
+    save_figure(figure, path, dpi=120)
 
 
 def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, list[Any]]:
@@ -138,6 +138,7 @@ def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, 
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
+    """Write a figure, in the format that the path's suffix names."""
     with file_in_place_of(path) as partial:
-        figure.savefig(partial, dpi=120, format=path.suffix.removeprefix("."))
+        figure.savefig(partial, dpi=dpi, format=path.suffix.removeprefix("."))

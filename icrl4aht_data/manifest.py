@@ -76,6 +76,11 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def git_hash(content: bytes) -> str:
+    """Git's name for a file's content, hexadecimal: the Hub's for what it keeps in git itself."""
+    return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+
+
 def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
     """Whether every file (path in the folder -> SHA-256) is as it was.
 

@@ -33,7 +33,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.files import file_in_place_of, holds, plain_size
 from icrl4aht_data.info import read_info
-from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, parse_manifest, read_manifest
+from icrl4aht_data.manifest import LARGEST, file_hash, git_hash, inside, parse_manifest, read_manifest
 from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.transport import HubStore, Patience, Store, offline
 
@@ -70,13 +70,10 @@ class Root:
             self.remote.fetch([name])
         return path
 
-    def below(self, prefix: str) -> list[str]:
-        """The names of the release's files that begin so, fetched first if they are not here."""
-        if self.remote is None:
-            return sorted(prefix + name for name in files_below(inside(self.folder, prefix.rstrip("/"))))
-        names = [name for name in self.remote.manifest if name.startswith(prefix)]
-        self.remote.fetch(names)
-        return names
+    def fetch_below(self, prefix: str) -> None:
+        """Fetch the release's files whose names begin so, if they are not here."""
+        if self.remote is not None:
+            self.remote.fetch(name for name in self.remote.manifest if name.startswith(prefix))
 
     def is_here(self, name: str) -> bool:
         """Whether a file needs no fetching."""
@@ -264,32 +261,32 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
     if match is None:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
     try:
-        path = Store(url, patience).patiently(MANIFEST, lambda: _manifest_from_hub(url, match["revision"]))
+        path, text = Store(url, patience).patiently(MANIFEST, lambda: _manifest_from_hub(url, match["revision"]))
     except RemoteError as error:
         if error.missing:
             raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
         raise
     folder, commit = path.parent, path.parent.name
     pinned = f"hf://datasets/{match['repo']}@{commit}"
-    manifest = _checked_manifest(path.read_bytes(), pinned)
+    manifest = _checked_manifest(text, pinned)
     store = HubStore(match["repo"], commit, patience)
     if to is not None:
-        _write_once(to, path.read_bytes(), manifest, pinned)
+        _write_once(to, text, manifest, pinned)
         return Remote(pinned, commit, to, _beside(to), manifest, store)
     return HubRemote(pinned, commit, folder, data_folder() / _slug(url) / f"{commit}.partial", manifest, store)
 
 
-def _manifest_from_hub(url: str, revision: str | None) -> Path:
-    """The manifest, for which the Hub's cache alone vouches: a blob's name there is its hash."""
+def _manifest_from_hub(url: str, revision: str | None) -> tuple[Path, bytes]:
+    """The manifest's place and text, for which the Hub's cache alone vouches: a blob's name there is its hash."""
     path = _from_hub(url, MANIFEST, revision, _MANIFEST_BYTES)
     plain_size(path, _MANIFEST_BYTES)
-    data, blob = path.read_bytes(), path.resolve()
-    git = hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
+    text, blob = path.read_bytes(), path.resolve()
+    git = git_hash(text)
     if len(blob.name) == len(git) and blob.name != git:
         blob.unlink()
         path.unlink(missing_ok=True)
         raise ConnectionError(f"came damaged: git's hash of it is {git}, expected {blob.name}")
-    return path
+    return path, text
 
 
 def _from_hub(url: str, name: str, revision: str | None, most: int, advance: Advance = lambda size: None) -> Path:

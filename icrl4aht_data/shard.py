@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrl4aht_data.blocks import bring
 from icrl4aht_data.cache import new_array
 from icrl4aht_data.errors import (
     ChunkTableError,
@@ -245,8 +244,6 @@ class Shard:
         """The same for the rows from `start` that fill `out`, cast to its dtype."""
         first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
         stop = start + len(out)
-        if self._remote is not None:
-            bring(self.lacking(self.needed(history_id, field, start, stop)))
         for number in range(start // chunk, -(-stop // chunk)):
             rows = self._cache.get((self.name, first + number))
             if rows is None:

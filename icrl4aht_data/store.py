@@ -200,6 +200,7 @@ class Streamed:
 
     def __init__(self, layout: Layout, entries: Sequence[Entry], shards: Sequence[Shard]) -> None:
         self._entries, self._shards, self._layout = entries, shards, layout
+        self._remote = {id(shard): shard for shard in shards if shard.is_remote}
 
     @cached_property
     def _lengths(self) -> list[int]:
@@ -234,13 +235,12 @@ class Streamed:
         return out
 
     def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
-        shards = {id(shard): shard for shard in self._shards if shard.is_remote}
-        if not shards:
+        if not self._remote:
             return []
-        rows: dict[int, list[int]] = {key: [] for key in shards}
+        rows: dict[int, list[int]] = {key: [] for key in self._remote}
         for position, first, last in zip(which.tolist(), low.tolist(), high.tolist(), strict=True):
             entry, shard = self._entries[position], self._shards[position]
             for field in map(FIELDS.__getitem__, fields):
                 stop = min(last, entry.rows(field))
                 rows[id(shard)].extend(shard.needed(entry.history_id, field, max(first, 0), stop))
-        return [part for key, some in rows.items() for part in shards[key].lacking(some)]
+        return [part for key, some in rows.items() for part in self._remote[key].lacking(some)]

@@ -7,7 +7,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
@@ -299,30 +299,32 @@ def _is_of_disk(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
-def _status(error: BaseException | None) -> int | None:
-    """The HTTP status in an error of aiohttp, httpx or botocore, or in what caused it."""
+def _answers(error: BaseException | None) -> Iterator[tuple[Any, Any]]:
+    """(HTTP status, headers) in an error of aiohttp, httpx or botocore, and in what caused it; None for neither."""
     while error is not None:
         response = getattr(error, "response", None)
-        found = getattr(error, "status", None) or getattr(response, "status_code", None)
-        if found is None and isinstance(response, dict):
-            found = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
-        if isinstance(found, int):
-            return found
+        if isinstance(response, dict):
+            answer = response.get("ResponseMetadata", {})
+            yield answer.get("HTTPStatusCode"), answer.get("HTTPHeaders")
+        else:
+            yield (
+                getattr(error, "status", None) or getattr(response, "status_code", None),
+                getattr(error, "headers", None) or getattr(response, "headers", None),
+            )
         error = error.__cause__
-    return None
+
+
+def _status(error: BaseException | None) -> int | None:
+    """The status that the server answered with, if it did."""
+    return next((status for status, _ in _answers(error) if isinstance(status, int)), None)
 
 
 def _retry_after(error: BaseException | None) -> float:
     """Seconds that a server asked to wait; 0 if it did not."""
-    while error is not None:
-        response = getattr(error, "response", None)
-        headers = getattr(error, "headers", None) or getattr(response, "headers", None) or {}
-        if isinstance(response, dict):
-            headers = response.get("ResponseMetadata", {}).get("HTTPHeaders", {})
-        asked = {str(key).lower(): value for key, value in dict(headers).items()}.get("retry-after")
-        if asked is not None:
-            return _seconds(asked)
-        error = error.__cause__
+    for _, headers in _answers(error):
+        for name, value in dict(headers or {}).items():
+            if str(name).lower() == "retry-after":
+                return _seconds(value)
     return 0.0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, UploadError
 from icrl4aht_data.index import read_info
-from icrl4aht_data.manifest import file_hash, read_manifest
+from icrl4aht_data.manifest import file_hash, git_hash, read_manifest
 from icrl4aht_data.publish import check_whole
 from icrl4aht_data.schema import MANIFEST
 from icrl4aht_data.verify import Advance
@@ -214,7 +213,7 @@ class _Uploading:
                 found.append(f"{name}: expected {file.size} bytes, found {there.size}")
             elif there.lfs is not None and there.lfs.sha256 != file.sha256:
                 found.append(f"{name}: expected sha256 {file.sha256}, found {there.lfs.sha256}")
-            elif there.lfs is None and there.blob_id != (blob := _blob_id(self.folder / name)):
+            elif there.lfs is None and there.blob_id != (blob := git_hash((self.folder / name).read_bytes())):
                 found.append(f"{name}: expected git's blob {blob}, found {there.blob_id}")
         return found
 
@@ -224,12 +223,6 @@ def _repo_of(address: str) -> str:
     if found is None:
         raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the revision is the data version's tag")
     return found[1]
-
-
-def _blob_id(path: Path) -> str:
-    """Git's name for the content of a file that the Hub keeps in git itself."""
-    content = path.read_bytes()
-    return hashlib.sha1(f"blob {len(content)}\0".encode() + content).hexdigest()
 
 
 def _some(differences: list[str]) -> str:

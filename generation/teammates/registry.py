@@ -122,7 +122,7 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
     """
     entry = dataset.recover_teammate(history_id)
     if entry["kind"] == "rl":
-        dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}/")
+        dataset.origin.fetch_below(f"{TEAMMATES}/{entry['theta']['sha256']}/")
     if entry["kind"] == "rl" and not checkpoint_folder(dataset.root / TEAMMATES, entry).is_dir():
         raise OptionError(
             f"{dataset.root / TEAMMATES}: lacks checkpoint {entry['theta']['sha256']}, the teammate of history "
