@@ -110,8 +110,7 @@ def stored_task(
             yield NewHistory(history.entry.env_idx, Deferred(names, history.read))
             taken()
 
-    dataset.origin.fetch_below(f"{TEAMMATES}/")
-    files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
+    files = checkpoint_files(dataset.origin.below(TEAMMATES), task, dataset.root)
     return NewTask(task, provenance, len(dataset), load, files)
 
 

@@ -70,10 +70,17 @@ class Root:
             self.remote.fetch([name])
         return path
 
-    def fetch_below(self, prefix: str) -> None:
-        """Fetch the release's files whose names begin so, if they are not here."""
+    def below(self, name: str) -> Path:
+        """The path of a folder with all its files, fetched first if they are not here; it need not exist.
+
+        Raises:
+            UnsafePathError: if it leads out of the release.
+            RemoteError, OfflineError: if a file cannot be had.
+        """
+        path = inside(self.folder, name)
         if self.remote is not None:
-            self.remote.fetch(name for name in self.remote.manifest if name.startswith(prefix))
+            self.remote.fetch(known for known in self.remote.manifest if known.startswith(f"{name}/"))
+        return path
 
     def is_here(self, name: str) -> bool:
         """Whether a file needs no fetching."""

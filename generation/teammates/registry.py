@@ -18,7 +18,6 @@ from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.release import checkpoint_folder
 from icrl4aht_data.schema import TEAMMATES
 
 _FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
@@ -121,9 +120,7 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
         OptionError: if the release does not hold the teammate's checkpoint.
     """
     entry = dataset.recover_teammate(history_id)
-    if entry["kind"] == "rl":
-        dataset.origin.fetch_below(f"{TEAMMATES}/{entry['theta']['sha256']}/")
-    if entry["kind"] == "rl" and not checkpoint_folder(dataset.root / TEAMMATES, entry).is_dir():
+    if entry["kind"] == "rl" and not dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
         raise OptionError(
             f"{dataset.root / TEAMMATES}: lacks checkpoint {entry['theta']['sha256']}, the teammate of history "
             f"{history_id}: this release came without it; take it from the release that it was made of"
