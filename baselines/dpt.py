@@ -115,7 +115,7 @@ class DPT(nn.Module):
 
     def _recall(self, token: Array, query: Array, memory: Memory, written: Array, complete: Array) -> tuple:
         """The answer from what was kept of the context."""
-        slots = len(memory.held[0].keys) - 1  # type: ignore[index]
+        slots = memory.held[0].slots - 1  # type: ignore[union-attr]
         context, now = slots - KEPT_STEPS, memory.written
         own = jnp.append(visible_slots(slots, now + 1, context, now + 1), False)
         _, held = self.trunk.step(token, memory.held, now % slots, now, own)  # type: ignore[arg-type]

@@ -11,11 +11,12 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
+from threading import Event
 from typing import Any, NamedTuple
 
 import jax
@@ -225,11 +226,20 @@ def evaluate(
     for task in tasks:
         if task.task_id not in results:
             groups[task.layout_name, task.teammate_kind].append(task)
-    for members, game in compiled_games(list(groups.values()), make_ego, protocol, seeds, suite):
-        for result in _run_group(members, game, protocol, len(seeds), settings):
+
+    layouts = {group[0].layout.name: group[0].layout for group in groups.values()}
+    egos = {name: make_ego(layout) for name, layout in layouts.items()}
+    outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
+
+    def run(group: list[Task], stopped: Event) -> list[Result]:
+        game = set_up(lambda layout: egos[layout.name], group, protocol, seeds, suite)
+        return _run_group(group, game, len(seeds), settings, stopped)
+
+    for found in _side_by_side(run, list(groups.values()), threads=1 if outside else min(4, usable_cores())):
+        for result in found:
             results[result.task_id] = result
             _store(out, result)
-        done(len(members))
+        done(len(found))
     return [results[task.task_id] for task in tasks]
 
 
@@ -244,34 +254,28 @@ def _check_teammate(task: Task, suite: Path | None) -> None:
         raise type(error)(f"task {task.task_id}: {error}") from error
 
 
-def compiled_games(
-    groups: Sequence[list[Task]], make_ego, protocol: Protocol, seeds: Sequence[int], suite: Path | None
-) -> Iterator[tuple[list[Task], Game]]:
-    """Every group with its compiled game. Those after the first are compiled ahead on threads, unless the ego runs
-    outside JAX: its `reset` must come right before its game."""
+def _side_by_side(
+    run: Callable[[list[Task], Event], list[Result]], groups: Sequence[list[Task]], threads: int
+) -> Iterator[list[Result]]:
+    """The groups' results as they come: one compiles while another plays, and a game alone does not fill a machine.
 
-    def ready(group: list[Task]) -> Game:
-        return set_up(make_ego, group, protocol, seeds, suite)
-
-    if not groups:
-        return
-    first = ready(groups[0])
-    if isinstance(first.rollout.ego, HostPolicy):
-        yield groups[0], first
-        yield from ((group, ready(group)) for group in groups[1:])
-        return
-    with ThreadPoolExecutor(max_workers=min(4, usable_cores())) as pool:
+    An ego outside JAX gets one thread: its `reset` must come right before its game.
+    """
+    stopped = Event()
+    with ThreadPoolExecutor(threads) as pool:
         try:
-            others = [pool.submit(ready, group) for group in groups[1:]]
-            yield groups[0], first
-            yield from ((group, game.result()) for group, game in zip(groups[1:], others, strict=True))
+            for future in as_completed([pool.submit(run, group, stopped) for group in groups]):
+                yield future.result()
         finally:
+            stopped.set()
             pool.shutdown(cancel_futures=True)
 
 
-def _run_group(tasks: list[Task], game: Game, protocol: Protocol, seeds: int, settings: dict[str, Any]) -> list[Result]:
+def _run_group(tasks: list[Task], game: Game, seeds: int, settings: dict[str, Any], stopped: Event) -> list[Result]:
     returns = []
-    for played in play(game, protocol.episodes):
+    for played in play(game, game.rollout.protocol.episodes):
+        if stopped.is_set():
+            return []
         ego = played.actions[..., EGO]
         low, high = int(ego.min()), int(ego.max())
         if low < 0 or high >= len(ACTIONS):

@@ -3,7 +3,7 @@
     train     steps/s and transitions/s on state records rendered in the step, beside the same model and trainer fed
               float32 observations that a reader of the published format makes; in turn, the ratio within each round
     act       the evaluator's steps/s with `cached` beside `exact` acting, in turn
-    all       what all 160 test tasks take with `cached`: from one layout's measured part, or, with --whole, measured
+    all       what all 160 test tasks take with `cached`, compiling included
 
 One JSON line each. Models are untrained: speed does not depend on what they know.
 """
@@ -14,7 +14,6 @@ import dataclasses
 import json
 import statistics
 import time
-from collections import defaultdict
 from collections.abc import Generator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,10 +26,11 @@ import numpy as np
 
 from baselines.agents import Acting, learned
 from baselines.context import plain_view
-from baselines.evaluate import PROTOCOLS, Game, Protocol, compiled_games, play, set_up
+from baselines.evaluate import PROTOCOLS, Game, Protocol, evaluate, play, set_up
 from baselines.method import Method, ModelOptions
 from baselines.methods import get_method, kitchen
 from baselines.trainer import Trainer, TrainOptions
+from generation.teammates.base import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS, TRACKS, track_of
@@ -38,7 +38,6 @@ from icrl4aht_data.convert import HISTORIES_H5, to_published
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling import ADBatch, ADSampler
-from icrl4aht_data.tasks import Task
 
 _OUR_ACTIONS = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
 _TARGET_RATIO, _TARGET_MINUTES = 20, 30
@@ -123,20 +122,11 @@ def untrained(layout: Layout, model: ModelOptions) -> tuple[Method, Any]:
     return method, method.init(jax.random.key(0))
 
 
-def tasks_of(layout: Layout) -> dict[str, list[Task]]:
-    """The published test tasks on a layout, by family."""
-    groups: dict[str, list[Task]] = defaultdict(list)
-    for task in published_tasks(track_of(layout.name)):
-        if task.layout == layout:
-            groups[task.teammate_family].append(task)
-    return groups
-
-
 def compare_acting(layout: Layout, model: ModelOptions, context: int, steps: int, rounds: int, most: int) -> None:
-    """One family's tasks of a layout, some steps of each way in every round. Both ways compute over all K places,
+    """Tasks of a layout's first family, some steps of each way in every round. Both ways compute over all K places,
     however many of them are filled."""
     method, params = untrained(layout, model)
-    tasks = tasks_of(layout)["H4"][:most]
+    tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
     ways: dict[Acting, int] = {"cached": 10 * steps, "exact": steps}  # an episode's own cost must not weigh
     games = [
         set_up(
@@ -174,47 +164,21 @@ def _seconds_per_episode(game: Game, episodes: int) -> float:
     return (time.perf_counter() - started) / episodes
 
 
-def estimate(layout: Layout, model: ModelOptions, context: int, protocol: Protocol, measured: int, most: int) -> None:
-    """Every family on one layout, compiled and played for some episodes, times layouts and episodes."""
-    method, params = untrained(layout, model)
-    compiling, playing = 0.0, 0.0
-    groups = tasks_of(layout)
-    for tasks in groups.values():
-        started = time.perf_counter()
-        game = set_up(_ego(method, params, context, "cached"), tasks[:most], protocol)
-        compiling += time.perf_counter() - started
-        playing += _seconds_per_episode(game, measured) * protocol.episodes
-    layouts = sum(len(track["test"]) for track in TRACKS.values())
-    say(
-        part="all",
-        context=context,
-        measured_episodes=measured,
-        tasks=layouts * sum(len(tasks[:most]) for tasks in groups.values()),
-        compile_minutes=round(layouts * compiling / 60, 2),
-        play_minutes=round(layouts * playing / 60, 2),
-        minutes=round(layouts * (compiling + playing) / 60, 2),
-        estimated=True,
-        target_minutes=_TARGET_MINUTES,
-    )
-
-
 def whole_benchmark(model: ModelOptions, context: int, protocol: Protocol) -> None:
-    """All 160 tasks, an untrained AD for each layout, as the evaluator plays them."""
-    layouts = [get_layout(name) for track in TRACKS.values() for name in track["test"]]
-    groups = [tasks for layout in layouts for tasks in tasks_of(layout).values()]
-    egos = {layout.name: _ego(*untrained(layout, model), context, "cached")(layout) for layout in layouts}
+    """All 160 tasks, an untrained AD for each layout, as the evaluator plays them, compiling included."""
+    tasks = [task for track in TRACKS for task in published_tasks(track)]
+
+    def make(layout: Layout) -> Policy:
+        return _ego(*untrained(layout, model), context, "cached")(layout)
+
     started = time.perf_counter()
-    for _, game in compiled_games(groups, lambda layout: egos[layout.name], protocol, [0], None):
-        for played in play(game, protocol.episodes):
-            jax.block_until_ready(played)
-    minutes = (time.perf_counter() - started) / 60
-    tasks = sum(map(len, groups))
+    evaluate("AD", make, tasks, protocol)
     say(
         part="all",
         context=context,
-        tasks=tasks,
-        minutes=round(minutes, 2),
-        estimated=False,
+        tasks=len(tasks),
+        episodes=protocol.episodes,
+        minutes=round((time.perf_counter() - started) / 60, 2),
         target_minutes=_TARGET_MINUTES,
     )
 
@@ -230,12 +194,11 @@ PARTS = ("train", "act", "all")
 @click.option("--length", default=500, show_default=True, help="L, and the K of acting.")
 @click.option("--steps", default=2, show_default=True, help="Training steps of each way in a round.")
 @click.option("--acting-steps", default=10, show_default=True, help="Exact steps in a round; ten times as many cached.")
-@click.option("--episodes", default=3, show_default=True, help="Played for the estimate.")
-@click.option("--tasks", default=5, show_default=True, help="Of each family.")
+@click.option("--episodes", default=100, show_default=True, help="Of each of the 160 tasks.")
+@click.option("--tasks", default=5, show_default=True, help="Of a family, to compare acting on.")
 @click.option("--rounds", default=3, show_default=True)
 @click.option("--layers", default=4, show_default=True)
 @click.option("--width", default=256, show_default=True)
-@click.option("--whole", is_flag=True, help="Play all 160 tasks instead of estimating.")
 def main(
     parts: tuple[str, ...],
     layout_name: str,
@@ -249,7 +212,6 @@ def main(
     rounds: int,
     layers: int,
     width: int,
-    whole: bool,
 ) -> None:
     """Training beside a reader of the published format, cached beside exact acting, all 160 tasks; JSON lines."""
     layout, model = get_layout(layout_name), ModelOptions(layers, width)
@@ -259,10 +221,8 @@ def main(
         compare_training(dataset.select(dataset.ids[:histories]), model, options, steps, rounds)
     if "act" in parts:
         compare_acting(layout, model, length, acting_steps, rounds, tasks)
-    if "all" in parts and whole:
-        whole_benchmark(model, length, PROTOCOLS["seeded"])
-    elif "all" in parts:
-        estimate(layout, model, length, PROTOCOLS["seeded"], episodes, tasks)
+    if "all" in parts:
+        whole_benchmark(model, length, dataclasses.replace(PROTOCOLS["seeded"], episodes=episodes))
 
 
 if __name__ == "__main__":

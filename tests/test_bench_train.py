@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from benchmarks import bench_train
 from benchmarks.bench_train import main, published_batches
+from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.convert import to_published
 
@@ -28,8 +29,8 @@ def test_the_peer_is_fed_the_same_batches(lite, tmp_path):
 
 
 def test_all_parts(monkeypatch):
-    every_family = bench_train.tasks_of
-    monkeypatch.setattr(bench_train, "tasks_of", lambda layout: {"H4": every_family(layout)["H4"]})
+    tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
+    monkeypatch.setattr(bench_train, "published_tasks", lambda track: tasks)
     small = ["--histories", "1", "--batch", "2", "--length", "6", "--steps", "1", "--acting-steps", "2"]
     tiny = ["--episodes", "1", "--tasks", "1", "--rounds", "1", "--layers", "1", "--width", "8"]
     result = CliRunner().invoke(main, [*small, *tiny], catch_exceptions=False)
@@ -38,5 +39,5 @@ def test_all_parts(monkeypatch):
     assert train["transitions_per_second"] == pytest.approx(12 * train["steps_per_second"], rel=0.01)
     assert train["ratio"] > 0
     assert act["ratio"] > 0
-    assert (every["tasks"], every["estimated"]) == (8, True)
-    assert every["minutes"] == pytest.approx(every["compile_minutes"] + every["play_minutes"], abs=0.02)
+    assert (every["tasks"], every["episodes"]) == (2, 1)
+    assert every["minutes"] > 0
