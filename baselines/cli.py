@@ -138,6 +138,40 @@ def headroom(out: Path, protocol: tuple[str, ...]) -> None:
 
 
 @cli.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--layout", help="Short or environment name; the first that the model was trained on if not given.")
+@click.option("--family", default="H4", show_default=True, help="Of teammates.")
+@click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
+@click.option("--episodes", type=click.IntRange(1), help="As many as fill the window three times if not given.")
+def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
+    """Measure how far cached acting drifts from exact acting once the window is full: a model's RUN folder."""
+    import dataclasses
+
+    from baselines.agents import find_agent
+    from baselines.drift import measure
+    from baselines.evaluate import get_protocol
+    from baselines.histories import read_run
+    from generation.teammates.instances import INSTANCES, named_task
+
+    trained, played = read_run(run), get_protocol(protocol)
+    full = -(-trained.context // played.steps)
+    played = dataclasses.replace(played, episodes=episodes or 3 * full)
+    name = get_layout(layout or trained.layouts[0]).name
+    find_agent(str(run)).make(get_layout(name))  # a model that does not fit fails before any work
+    tasks = [named_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
+    with Progress(console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task(f"{trained.label}, {family} on {name}", total=played.episodes)
+        found = []
+        for episode in measure(trained.method, trained.params, trained.context, tasks, played):
+            found.append(episode)
+            bars.advance(bar)
+    click.echo(f"{trained.label} on {name} beside {len(tasks)} teammates of {family}, K = {trained.context}")
+    click.echo("episode  same action  total variation: mean     largest")
+    for number, (distance, same) in enumerate(found):
+        click.echo(f"{number:>7}  {same.mean():>11.1%}  {distance.mean():>21.6f}  {distance.max():>10.6f}")
+
+
+@cli.command()
 @click.argument("method")
 @click.option(
     "--layout", "layouts", multiple=True, required=True, help="To train on; several of one observation shape."

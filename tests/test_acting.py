@@ -14,9 +14,11 @@ from test_models import drawn
 
 from baselines.agents import find_agent
 from baselines.cli import cli
+from baselines.drift import measure
 from baselines.evaluate import PROTOCOLS, evaluate
 from baselines.histories import HistoryOptions, prepare, read_run
 from baselines.method import SIZES, ModelOptions
+from baselines.methods import get_method, kitchen
 from baselines.runs import Checkpoints, open_run, versions
 from baselines.trainer import TrainOptions
 from generation.teammates.instances import published_tasks
@@ -55,6 +57,26 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
     assert result.settings["details"] == {"run": run.hash, "step": 2, "context": 30, "acting": acting}
     with pytest.raises(OptionError, match="holds a result of other settings"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
+
+
+def test_drift_is_nothing_before_the_window_is_full_and_something_after(runs, monkeypatch):
+    """With one layer there is none at all: what is kept of a step was computed of that step alone."""
+    kitchen_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), kitchen([WIDE[0].layout]))
+    params, found, protocol = drawn(kitchen_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
+
+    def two_layers(method, params_of_run, context, tasks, asked):
+        assert (context, len(tasks), asked.episodes) == (30, 5, 3)
+        found.extend(measure(kitchen_ad, params, context, WIDE[:1], protocol))
+        return found
+
+    monkeypatch.setattr("baselines.drift.measure", two_layers)
+    result = CliRunner().invoke(cli, ["drift", str(runs / "ad")], catch_exceptions=False)
+    assert "AD+TA on demo_wide beside 5 teammates of H4, K = 30" in result.output
+    (episode,) = found
+    assert f"{episode.distance.max():>10.6f}" in result.output
+    assert episode.distance.shape == (1, 60)
+    np.testing.assert_allclose(episode.distance[:, :30], 0, atol=1e-6)
+    assert episode.distance[:, 30:].max() > 1e-5
 
 
 class TestBadRuns:
