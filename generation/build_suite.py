@@ -20,6 +20,7 @@ from generation.teammates import learned
 from generation.teammates.instances import published_thetas
 from generation.teammates.registry import build
 from icrl4aht_data.benchmark import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of, unknown
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 
@@ -129,9 +130,15 @@ def report_diversity(
     """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
 
     Raises:
-        OptionError: if a population was not finished.
+        OptionError: if a population was not finished, or no layout has all of them.
     """
-    for name in _names(layouts) or [name for name in training_layouts() if _complete(suite, name)]:
+    names = _names(layouts) or [name for name in training_layouts() if _complete(suite, name)]
+    if not names:
+        raise OptionError(
+            f"{suite}: no layout has all its populations finished; `python -m generation teammates --suite {suite}` "
+            f"trains them, or name a --layout"
+        )
+    for name in names:
         layout = get_layout(name)
         for algorithm in algorithms or ALGORITHMS:
             _report_population(suite, layout, algorithm, greedy, console)

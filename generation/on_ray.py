@@ -6,6 +6,7 @@ A Ray that is started here listens on 127.0.0.1 only, without dashboard and usag
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +21,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.tasks import Task
 
 _POLL_SECONDS = 1.0
+_REACHED = 10  # seconds
 _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the disk; nothing large passes through Ray
 
 
@@ -69,6 +71,19 @@ def _outcome(ray: Any, reference: Any, task: Task, options: Options) -> Outcome:
         return Outcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
 
 
+def _check_reachable(address: str | None) -> None:
+    """Whether something listens at HOST:PORT, for which Ray would wait for minutes."""
+    host, _, port = (address or "").rpartition(":")
+    if not host or "/" in host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_REACHED).close()
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise OptionError(
+            f"Ray at {address} cannot be reached: {error}; check the address, and `ray status`"
+        ) from error
+
+
 @contextmanager
 def _connected(options: Options) -> Iterator[Any]:
     if options.address is None:
@@ -81,7 +96,8 @@ def _connected(options: Options) -> Iterator[Any]:
     try:
         import ray
     except ImportError as error:
-        raise OptionError("the executor ray needs Ray: pip install icrl4aht-data[cluster]") from error
+        raise OptionError("the executor ray needs Ray: pip install 'icrl4aht-data[cluster]'") from error
+    _check_reachable(options.address)
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     try:
         if options.address is None:

@@ -12,6 +12,7 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import TEXT_BYTES, plain_size, read_text
+from icrl4aht_data.info import check_version
 from icrl4aht_data.manifest import file_hash, inside
 from icrl4aht_data.release import CARD, NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
@@ -34,9 +35,12 @@ def combine_releases(
         done: called when a task's histories have been taken.
 
     Raises:
-        OptionError: if the releases do not go together; names both, and what they disagree on.
+        OptionError: if the releases do not go together; names both, and what they disagree on; if `data_version` is
+            not of the form of SemVer.
         ReleaseError: if one of them cannot be read.
     """
+    if data_version is not None:
+        check_version(data_version)
     if not roots:
         raise OptionError("expected at least one release to combine")
     datasets = [load_icrl4aht(root) for root in roots]
@@ -50,7 +54,9 @@ def combine_releases(
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
         for task in release_tasks(dataset):
             if task.task_id in owners:
-                raise OptionError(f"{dataset.origin}: task {task.task_id} is also in {owners[task.task_id]}")
+                raise OptionError(
+                    f"{dataset.origin}: task {task.task_id} is also in {owners[task.task_id]}; leave one of them out"
+                )
             owners[task.task_id] = str(dataset.origin)
             ids = dataset.index.query(task_id=task.task_id)
             new.append(stored_task(dataset.select(ids), task, provenance.get(task.task_id, {}), dataset.info["kind"]))

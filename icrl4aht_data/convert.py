@@ -390,7 +390,7 @@ def to_parquet(dataset: Dataset, path: Path) -> Path:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
-        raise OptionError("Parquet needs pyarrow: pip install icrl4aht-data[hf]") from error
+        raise OptionError("Parquet needs pyarrow: pip install 'icrl4aht-data[hf]'") from error
     types = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_(), list: pa.list_(pa.int64())}
     columns = {name: next(types[kind] for kind in types if kind in kinds) for name, kinds in JSON_TYPES.items()}
     rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], pa.schema(list(columns.items())))

@@ -305,7 +305,10 @@ class Dataset:
         chosen = np.array([operator.index(i) for i in ids])
         absent = chosen[~np.isin(chosen, self.ids)]
         if len(absent):
-            raise UnknownNameError(f"{self.root}: this selection has no history {absent.tolist()}; it is {self!r}")
+            within = f"{self.ids.min()}..{self.ids.max()}"
+            raise UnknownNameError(
+                f"{self.root}: this selection has no history {absent.tolist()}, ids are within {within}; it is {self!r}"
+            )
         return self._with(chosen)
 
     def history(self, history_id: int) -> History:

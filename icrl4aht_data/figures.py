@@ -22,6 +22,9 @@ from icrl4aht_data.schema import Entry
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PICTURES = (".png", ".svg", ".pdf")
+"""What the name of a picture may end in."""
+
 
 def plot_learning_curves(dataset: Dataset, path: Path) -> None:
     """Return per episode of every task in the selection: mean over streams, band between the 10th and 90th percentile.
@@ -126,12 +129,12 @@ def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[s
 
 def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, list[Any]]:
     """A figure with that many axes of that many inches, to be saved at `path`."""
-    if path.suffix not in (".png", ".svg", ".pdf"):
-        raise OptionError(f"{path}: expected a name that ends in .png, .svg or .pdf")
+    if path.suffix not in PICTURES:
+        raise OptionError(f"{path}: expected a name that ends in {', '.join(PICTURES)}")
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise OptionError("drawing needs matplotlib: pip install icrl4aht-data[plot]") from error
+        raise OptionError("drawing needs matplotlib: pip install 'icrl4aht-data[plot]'") from error
     columns = 2 if count == 4 else min(3, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
-from icrl4aht_data.errors import FormatTooNewError, FormatTooOldError, IndexFormatError, RootNotFoundError
+from icrl4aht_data.errors import (
+    FormatTooNewError,
+    FormatTooOldError,
+    IndexFormatError,
+    OptionError,
+    RootNotFoundError,
+)
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.manifest import inside
 from icrl4aht_data.schema import ALL_KINDS, FORMAT_VERSION, INFO, is_name
+
+_SEMVER = re.compile(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?")
 
 _INFO_TYPES: dict[str, type | tuple[type, ...]] = {
     "kind": str,
@@ -24,9 +33,7 @@ def read_info(root: Path) -> dict[str, Any]:
     """meta/info.json of a release whose format this package reads."""
     path = inside(root, INFO)
     if not path.is_file():
-        raise RootNotFoundError(
-            f"{root}: no release here, expected {INFO} in it; give a release folder, or make one with `make generate`"
-        )
+        raise RootNotFoundError(f"{root}: no release here, expected {INFO} in it; {_instead(root)}")
     try:
         info = parse_json(read_text(path))
     except IndexFormatError as error:
@@ -49,6 +56,29 @@ def read_info(root: Path) -> dict[str, Any]:
         what = ", ".join(wrong) or "kind, environment or shards"
         raise IndexFormatError(f"{path}: malformed: {what} not as expected")
     return info
+
+
+def _instead(root: Path) -> str:
+    """What to give in place of a folder that is no release."""
+    if root.is_dir():
+        below = sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}"))
+        if below:
+            return f"did you mean {' or '.join(below[:3])}?"
+    return (
+        f"{'give the folder of a release' if root.is_dir() else 'there is no such folder: check the path'}, fetch one "
+        f"with `icrl4aht-data download`, or give none for the bundled one"
+    )
+
+
+def check_version(version: str) -> str:
+    """A data version, if it is one.
+
+    Raises:
+        OptionError: if it is not of the form of SemVer.
+    """
+    if not _SEMVER.fullmatch(version):
+        raise OptionError(f"data version {version!r}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
+    return version
 
 
 def _is_environment(value: dict[str, Any]) -> bool:

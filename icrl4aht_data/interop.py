@@ -53,7 +53,7 @@ def torch_loader(
     try:
         from torch.utils.data import DataLoader
     except ImportError as error:
-        raise OptionError("a DataLoader needs PyTorch: pip install icrl4aht-data[torch]") from error
+        raise OptionError("a DataLoader needs PyTorch: pip install 'icrl4aht-data[torch]'") from error
     numbers = range(whole("start", start, 0), len(sampler) if stop is None else whole("stop", stop, 0))
     if workers and sampler.dataset.cache.cache != "stream":
         _ = sampler.dataset.holding  # decoded here once: mapped by the workers, or inherited by forked ones
@@ -142,5 +142,5 @@ def _datasets() -> Any:
     try:
         import datasets
     except ImportError as error:
-        raise OptionError("Hugging Face datasets are needed: pip install icrl4aht-data[hf]") from error
+        raise OptionError("Hugging Face datasets are needed: pip install 'icrl4aht-data[hf]'") from error
     return datasets

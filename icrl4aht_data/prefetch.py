@@ -216,7 +216,7 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
         import jax
         import jax.numpy as jnp
     except ImportError as error:
-        raise OptionError("a device needs JAX: pip install icrl4aht-data[generation]") from error
+        raise OptionError("a device needs JAX: pip install 'icrl4aht-data[generation]'") from error
 
     def one(x: Any) -> Any:
         if getattr(device, "is_fully_addressable", True):

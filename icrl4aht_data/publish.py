@@ -27,10 +27,11 @@ from icrl4aht_data.dataset_card import (
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, ReleaseError
 from icrl4aht_data.files import parse_json, read_text, write_json
 from icrl4aht_data.headroom import read_headroom
+from icrl4aht_data.info import read_info
 from icrl4aht_data.manifest import file_hash, read_manifest, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.release import CARD, folder_in_place_of
-from icrl4aht_data.schema import TEAMMATES
+from icrl4aht_data.schema import INFO, TEAMMATES
 from icrl4aht_data.verify import Advance, verify_release
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
@@ -64,7 +65,7 @@ def build_release(
         raise OptionError(f"{target}: the release itself; give another folder")
     missing = [name for name in ("matplotlib", "PIL", "pyarrow") if find_spec(name) is None]
     if missing:
-        raise OptionError(f"building a release needs {', '.join(missing)}: pip install icrl4aht-data[plot,hf]")
+        raise OptionError(f"building a release needs {', '.join(missing)}: pip install 'icrl4aht-data[plot,hf]'")
     check_whole(source, advance)
     kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
     with folder_in_place_of(target) as root:
@@ -94,6 +95,8 @@ def check_whole(root: Path, advance: Advance = lambda what, done, total: None) -
     Raises:
         ReleaseError: if anything is wrong; names the first problems.
     """
+    if not (root / INFO).exists():
+        read_info(root)  # says what to give instead
     report = verify_release(root, advance=advance)
     if not report.ok:
         first = "; ".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:3])

@@ -92,15 +92,13 @@ def upload_release(
 
     Raises:
         ReleaseError: if the release is not whole.
-        OptionError: if the address is none, or huggingface_hub is not installed.
+        OptionError: if the address is none.
         UploadError: if the Hub refuses or cannot be reached, the tag has other content, the repository has files that
             are no release's, or what it holds in the end differs from the manifest.
     """
     repo = _repo_of(address)
-    try:
-        from huggingface_hub import HfApi
-    except ImportError as error:
-        raise OptionError("uploading needs huggingface_hub: pip install icrl4aht-data[hf]") from error
+    from huggingface_hub import HfApi
+
     check_whole(folder, advance)
     manifest = read_manifest(folder) | {MANIFEST: file_hash(folder / MANIFEST)}
     files = {name: _File((folder / name).stat().st_size, digest) for name, digest in manifest.items()}

@@ -133,6 +133,9 @@ def verify_release(
         advance: progress.
         wanted: check the shards of these histories alone; see `load_icrl4aht`. A folder that `download` filled with a
             part of a release has to have that part.
+
+    Raises:
+        UnknownNameError, EmptySelectionError: if there is nothing of what is `wanted`.
     """
     if deep and quick:
         raise OptionError("deep and quick: give one of them")
@@ -143,13 +146,15 @@ def verify_release(
         report.add(".", str(error))
         return report
     if not origin.folder.is_dir():
-        report.add(".", f"no such folder: {origin.folder}")
+        report.add(".", f"{origin.folder}: no such folder; give the folder or the address of a release")
         return report
     before = origin.remote.store.traffic if origin.remote else Traffic()
     report.root = str(origin)
     try:
         _verify(origin, report, advance, wanted)
     except (Icrl4ahtError, OSError) as error:
+        if isinstance(error, (EmptySelectionError, UnknownNameError)) and any(wanted.values()):
+            raise  # nothing is wrong with the release
         report.add("meta", str(error))
     if origin.remote is not None:
         traffic = origin.remote.store.traffic - before

@@ -147,7 +147,7 @@ class TestHuggingFace:
 )
 def test_a_missing_library_names_its_extra(sampler, monkeypatch, module, call, extra):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(Exception, match=rf"pip install icrl4aht-data\[{extra}\]"):
+    with pytest.raises(Exception, match=rf"pip install 'icrl4aht-data\[{extra}\]'"):
         call(sampler)
 
 

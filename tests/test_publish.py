@@ -356,7 +356,7 @@ def test_the_command_builds(release, tmp_path):
 
 def test_without_its_libraries_it_says_what_to_install(release, tmp_path, monkeypatch):
     monkeypatch.setattr("icrl4aht_data.publish.find_spec", lambda name: None if name == "pyarrow" else name)
-    with pytest.raises(OptionError, match=r"needs pyarrow: pip install icrl4aht-data\[plot,hf\]"):
+    with pytest.raises(OptionError, match=r"needs pyarrow: pip install 'icrl4aht-data\[plot,hf\]'"):
         build_release(release, tmp_path / "out")
 
 

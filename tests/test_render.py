@@ -245,5 +245,5 @@ def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
 
 def test_without_pillow_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(OptionError, match=r"pip install icrl4aht-data\[plot\]"):
+    with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[plot\]'"):
         draw_frame(COORD, scene(COORD, (2, 2, "up"), (5, 2, "up"))[0])

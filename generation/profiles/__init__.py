@@ -13,6 +13,7 @@ from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark import ALGORITHMS, PAPER_TEAMMATE_STEPS, PAPER_TEAMMATES, track_of, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import json_hash
+from icrl4aht_data.info import check_version
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.tasks import Task, make_task
 
@@ -102,7 +103,7 @@ def load_profile(name: str) -> Profile:
             name=path.stem,
             ego=_ppo("ego", content["ego"], PPOConfig()),
             teammates=_teammates(content.get("teammates", {})),
-            data_version=_typed("release.data_version", content["release"]["data_version"], str),
+            data_version=check_version(_typed("release.data_version", content["release"]["data_version"], str)),
             keep=_typed("release.keep", content["release"]["keep"], int),
             layouts=tuple(get_layout(layout).name for layout in _names("tasks.layouts", tasks["layouts"])),
             presets=_names("tasks.presets", tasks.get("presets", [])),

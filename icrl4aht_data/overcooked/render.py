@@ -125,7 +125,7 @@ def _pillow():
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise OptionError("drawing needs Pillow: pip install icrl4aht-data[plot]") from error
+        raise OptionError("drawing needs Pillow: pip install 'icrl4aht-data[plot]'") from error
     return Image, ImageDraw, ImageFont
 
 
