@@ -29,39 +29,45 @@ _COARSE_TICK_NS = 2 * 10**9  # where the clock shows no parts of a millisecond
 _SMALL = 2**20  # hashing this is quicker than remembering
 _PLENTY = 2**29  # bytes that need no look at what is free
 
+CACHE_VARIABLES = ("ICRL4AHT_CACHE_DIR", "XDG_CACHE_HOME")
+DATA_VARIABLES = ("ICRL4AHT_DATA_DIR", "XDG_DATA_HOME")
+"""Environment variables that say where a folder is; below the second one it is called icrl4aht."""
+
 Arrays = dict[str, np.ndarray]
 
 
 def cache_folder() -> Path:
     """Where arrays are kept; read from the environment at each call."""
-    given = os.environ.get("ICRL4AHT_CACHE_DIR")
-    if given:
-        return Path(given).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "icrl4aht"
+    return _folder(CACHE_VARIABLES, "~/.cache")
 
 
 def data_folder() -> Path:
     """Where remote releases come to: $ICRL4AHT_DATA_DIR, else icrl4aht below $XDG_DATA_HOME or ~/.local/share; read
     from the environment at each call. It is no cache: what is in it stays."""
-    given = os.environ.get("ICRL4AHT_DATA_DIR")
-    if given:
-        return Path(given).expanduser()
-    return Path(os.environ.get("XDG_DATA_HOME") or "~/.local/share").expanduser() / "icrl4aht"
+    return _folder(DATA_VARIABLES, "~/.local/share")
+
+
+def _folder(variables: tuple[str, str], default: str) -> Path:
+    own, shared = map(os.environ.get, variables)
+    return Path(own).expanduser() if own else Path(shared or default).expanduser() / "icrl4aht"
 
 
 def cache_limit() -> int:
     """Bytes that the cache folder may hold.
 
     Raises:
-        OptionError: if the environment variable is not a whole number.
+        OptionError: if the environment variable is not a number of bytes.
     """
     given = os.environ.get("ICRL4AHT_CACHE_BYTES")
     if not given:
         return _DEFAULT_LIMIT
     try:
-        return int(float(given))
-    except (ValueError, OverflowError) as error:
-        raise OptionError(f"ICRL4AHT_CACHE_BYTES={given!r}: expected a number of bytes, such as 2e11") from error
+        limit = int(float(given))
+    except (ValueError, OverflowError):
+        limit = -1
+    if limit < 0:
+        raise OptionError(f"ICRL4AHT_CACHE_BYTES={given!r}: expected a number of bytes, such as 2e11")
+    return limit
 
 
 def cache_room() -> int:

@@ -21,6 +21,9 @@ from icrl4aht_data.shard import DEFLATE_RATIO, decode_chunk
 _low: Any = h5py  # whose types do not know its lower half
 h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
+OLDEST_HDF5 = (1, 10, 5)
+"""The first libhdf5 that says where chunks lie."""
+
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
 _HEAP = b"GCOL\x01"  # how a heap of texts begins

@@ -49,8 +49,13 @@ class Traffic:
 
 def offline() -> bool:
     """Whether nothing may be asked of the network: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE, read at each call."""
+    return bool(offline_switches())
+
+
+def offline_switches() -> list[str]:
+    """The environment variables that are set so that nothing may be asked of the network."""
     names = ("HF_HUB_OFFLINE", "ICRL4AHT_OFFLINE")
-    return any(os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE") for name in names)
+    return [name for name in names if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
 
 
 class WrongLengthError(OSError):
@@ -160,7 +165,8 @@ class Store:
             remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
             raise OptionError(f"{self.url}: {error}; {remedy}") from error
         except ValueError as error:
-            raise OptionError(f"{self.url}: not an address that fsspec opens: {error}") from error
+            expected = "hf://datasets/<org>/<repo>, https://... or s3://..."
+            raise OptionError(f"{self.url}: not an address that fsspec opens: {error}; expected {expected}") from error
         if scheme == "s3":
             files.retries = 1  # as above
         return os.getpid(), files
