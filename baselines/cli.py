@@ -10,33 +10,99 @@ import click
 from rich.console import Console
 from rich.progress import Progress
 
-from baselines.evaluate import PROTOCOLS
+from baselines.options import (
+    AGENT,
+    CONTEXT,
+    METHOD,
+    PROTOCOL,
+    STEPS,
+    HostPort,
+    acting_option,
+    batch_size_option,
+    experiment_options,
+    films_option,
+    found_in,
+    protocol_option,
+    root_option,
+    seeds_option,
+    variants,
+)
 from icrl4aht_data.benchmark import TRACKS
-from icrl4aht_data.cli import run
+from icrl4aht_data.commands import (
+    COUNT,
+    COUNT_OR_NONE,
+    FAMILY,
+    LAYOUT,
+    RATE,
+    SEED,
+    SETTINGS,
+    TRACK,
+    Folder,
+    Names,
+    NewFile,
+    Sections,
+    examples,
+    run,
+    version_option,
+)
+from icrl4aht_data.dataset import OBS
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.sampling import CONTEXT_ORDERS
 
 console = Console(soft_wrap=True)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="icrl4aht-data")
-def cli() -> None:
-    """Train reference learners and evaluate agents on the ICRL4AHT benchmark."""
+_SECTIONS = {
+    "Train and evaluate": ("demo", "train", "evaluate", "report", "watch"),
+    "The paper's experiments": ("sweep", "ablate", "heldout-rl"),
+    "Check": ("control", "drift", "headroom"),
+}
 
 
-@cli.command()
-@click.option("--agent", required=True, help="stay, random, oracle, or a folder that `train` has made.")
-@click.option("--acting", default="cached", show_default=True, help="Of a trained model: cached, or exact and slower.")
-@click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
-@click.option("--track", multiple=True, default=tuple(TRACKS), show_default=True)
-@click.option("--layout", multiple=True, help="Only the tasks on these layouts.")
-@click.option(
-    "--manifest", type=click.Path(path_type=Path, exists=True), help="Tasks of a file instead of the tracks'."
+@click.group(
+    cls=Sections,
+    sections=_SECTIONS,
+    context_settings=SETTINGS,
+    epilog=examples(
+        "python -m baselines train ad --layout demo_wide --out runs/ad",
+        "python -m baselines evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
+        "python -m baselines report runs/ad-results",
+    ),
 )
-@click.option("--suite", type=click.Path(path_type=Path, exists=True), help="Folder of learned teammates.")
-@click.option("--seeds", default=1, show_default=True, type=click.IntRange(1), help="Play every task so often.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for one JSON per task.")
+@version_option
+def cli() -> None:
+    """Train reference learners and evaluate agents on the ICRL4AHT benchmark.
+
+    Needs the extra baselines. What is finished is kept: after a stop the same command goes on. Exit codes: 0 done, 1 a
+    failure or a check that failed, 2 a misused command.
+    """
+
+
+@cli.command(
+    epilog=examples(
+        "python -m baselines evaluate --agent random --out runs/random",
+        "python -m baselines evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
+    )
+)
+@click.option("--agent", type=AGENT, required=True, help="stay, random, oracle, or a folder that `train` has made.")
+@acting_option
+@protocol_option
+@click.option(
+    "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only the tasks of this track; again for more."
+)
+@click.option("--layout", type=LAYOUT, multiple=True, help="Only the tasks on this layout; again for more.")
+@click.option(
+    "--manifest",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="The tasks of this file instead of the tracks'.",
+)
+@click.option(
+    "--suite", type=Folder("`python -m generation teammates`"), metavar="FOLDER", help="Where learned teammates are."
+)
+@seeds_option
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
 def evaluate(
     agent: str,
     acting: Any,
@@ -48,7 +114,11 @@ def evaluate(
     seeds: int,
     out: Path,
 ) -> None:
-    """Evaluate an agent; goes on where a stopped run of the same settings ended."""
+    """Evaluate an agent on the benchmark's test tasks.
+
+    Plays 100 episodes of each task and writes one JSON a task into OUT/tasks. Tasks that are there are not played
+    again.
+    """
     from baselines.agents import find_agent
     from baselines.evaluate import evaluate as evaluate_tasks
     from baselines.evaluate import get_protocol
@@ -60,7 +130,9 @@ def evaluate(
     wanted = {get_layout(name).name for name in layout}
     tasks = [task for path in paths for task in read_tasks(path) if not wanted or task.layout.name in wanted]
     if not tasks:
-        raise EmptySelectionError(f"no task on {', '.join(sorted(wanted))} in {', '.join(map(str, paths))}")
+        raise EmptySelectionError(
+            f"no task on {', '.join(sorted(wanted))} in {', '.join(map(str, paths))}: choose another --layout, or none"
+        )
     for name in {task.layout.name for task in tasks}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
     with Progress(console=console, disable=not console.is_terminal) as bars:
@@ -81,16 +153,19 @@ def evaluate(
 
 
 @cli.command()
-@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("runs", nargs=-1, required=True, type=Folder("`python -m baselines evaluate`"), metavar="RESULTS...")
 @click.option(
-    "--out", type=click.Path(path_type=Path), help="Folder of the report; RUN/report of the first by default."
+    "--out", type=Folder(), metavar="FOLDER", help="Write it here.", show_default="report in the first RESULTS"
 )
-@click.option("--html", type=click.Path(path_type=Path, dir_okay=False), help="Also one self-contained page.")
-@click.option("--episodes/--no-episodes", default=True, show_default=True, help="A GIF per family on the page.")
-def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, episodes: bool) -> None:
-    """The paper's tables with the published numbers beside ours, as Markdown, CSV and curves, and as one page.
+@click.option(
+    "--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Also one self-contained page."
+)
+@films_option
+def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: bool) -> None:
+    """Put results beside the paper's.
 
-    Results of one agent on different layouts are put together.
+    RESULTS are folders that `evaluate` has made. Prints the paper's tables with its numbers beside ours, and writes
+    them as Markdown, CSV and curves. Results of one agent on different layouts are put together.
     """
     from baselines.report import markdown, merge, read_run, write_report
 
@@ -99,21 +174,25 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, episodes
     if html:
         from baselines.page import write_page_with_films
 
-        paths.append(write_page_with_films(loaded, html, episodes=episodes))
+        paths.append(write_page_with_films(loaded, html, episodes=films))
     click.echo(markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")
 
 
-@cli.command()
-@click.option("--layout", required=True, help="Short or environment name.")
-@click.option("--teammate", default="H4/t0", show_default=True, help="Family and published instance, such as H3/t1.")
-@click.option("--ego", default="random", show_default=True, help="An agent's name, or a run folder.")
-@click.option("--protocol", default="seeded", show_default=True)
-@click.option("--seed", default=0, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The GIF to write.")
+@cli.command(
+    epilog=examples("python -m baselines watch --layout demo_wide --teammate H3/t1 --ego oracle --out episode.gif")
+)
+@click.option("--layout", type=LAYOUT, required=True, help="The layout.")
+@click.option(
+    "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate: its family, H1 to H4, and number."
+)
+@click.option("--ego", type=AGENT, default="random", help="stay, random, oracle, or a folder that `train` has made.")
+@protocol_option
+@click.option("--seed", type=SEED, default=0, help="Of the episode.")
+@click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
 def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
-    """An episode to look at."""
+    """Play an episode and draw it as a GIF."""
     from baselines.agents import find_agent
     from baselines.evaluate import get_protocol
     from baselines.watching import film
@@ -125,10 +204,20 @@ def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: P
 
 
 @cli.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/headroom"), show_default=True)
-@click.option("--protocol", multiple=True, default=tuple(PROTOCOLS), show_default=True)
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/headroom", help="Write the results here.")
+@click.option(
+    "--protocol",
+    type=PROTOCOL,
+    multiple=True,
+    default=lambda: tuple(PROTOCOL.valid()),
+    show_default="all",
+    help="published or seeded; again for more.",
+)
 def headroom(out: Path, protocol: tuple[str, ...]) -> None:
-    """Measure the reference egos on every test task and write cards/headroom.json and cards/headroom.md."""
+    """Measure the reference egos on every test task.
+
+    Writes their results, and cards/headroom.json and cards/headroom.md from them.
+    """
     from baselines.headroom import measure, write_cards
 
     with Progress(console=console, disable=not console.is_terminal) as bars:
@@ -138,13 +227,17 @@ def headroom(out: Path, protocol: tuple[str, ...]) -> None:
 
 
 @cli.command()
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option("--layout", help="Short or environment name; the first that the model was trained on if not given.")
-@click.option("--family", default="H4", show_default=True, help="Of teammates.")
-@click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}.")
-@click.option("--episodes", type=click.IntRange(1), help="As many as fill the window three times if not given.")
+@click.argument("run", type=Folder("`python -m baselines train`"))
+@click.option("--layout", type=LAYOUT, help="The layout.", show_default="the first that the model was trained on")
+@click.option("--family", type=FAMILY, default="H4", help="Of teammates: H1, H2, H3 or H4.")
+@protocol_option
+@click.option("--episodes", type=COUNT, help="How many to play.", show_default="as many as fill the window three times")
 def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
-    """Measure how far cached acting drifts from exact acting once the window is full: a model's RUN folder."""
+    """Measure how far cached acting drifts from exact.
+
+    RUN is a folder that `train` has made. Prints a line an episode: how often both would act the same, and the total
+    variation between them. Writes nothing.
+    """
     import dataclasses
 
     from baselines.agents import find_agent
@@ -171,47 +264,82 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
         click.echo(f"{number:>7}  {same.mean():>11.1%}  {distance.mean():>21.6f}  {distance.max():>10.6f}")
 
 
-@cli.command()
-@click.argument("method")
+@cli.command(
+    epilog=examples(
+        "python -m baselines train ad --layout demo_wide --out runs/ad",
+        "python -m baselines train dpt --layout demo_wide --ta --out runs/dpt-ta",
+        "python -m baselines train ad --layout demo_wide --steps 20 --context 50 --out runs/small",
+    )
+)
+@click.argument("method", type=METHOD)
 @click.option(
-    "--layout", "layouts", multiple=True, required=True, help="To train on; several of one observation shape."
+    "--layout",
+    "layouts",
+    type=LAYOUT,
+    multiple=True,
+    required=True,
+    help="To train on; again for more, of one observation shape.",
+)
+@root_option
+@click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
+@click.option(
+    "--size",
+    type=Names("size", found_in("baselines.method", "SIZES")),
+    default="small",
+    help="small, medium or large: layers, width, steps.",
+)
+@click.option("--steps", **STEPS, show_default="the size's")
+@click.option("--context", **CONTEXT, default=500)
+@batch_size_option
+@click.option("--accumulate", type=COUNT, default=1, help="Compute a batch in so many parts.")
+@click.option("--learning-rate", type=RATE, default=1e-3, help="At its highest.")
+@click.option(
+    "--positions",
+    type=Names("positions", found_in("baselines.transformer", "POSITIONS")),
+    default="none",
+    help="none, as published, or rope.",
 )
 @click.option(
-    "--root", type=click.Path(path_type=Path, exists=True), help="A release; the bundled mini release if not given."
+    "--order",
+    type=Names("order", lambda: CONTEXT_ORDERS),
+    default="contiguous",
+    help="Of DPT's contexts: contiguous or random.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="The run folder; runs/METHOD by default.")
-@click.option("--size", default="small", show_default=True, help="small, medium or large: layers, width, steps.")
-@click.option("--steps", type=int, help="Training steps, instead of the size's.")
-@click.option("--context", type=int, default=500, show_default=True, help="K: steps of a window, or transitions.")
-@click.option("--batch-size", type=int, help="1024 as in the paper, or 32 where there is only a CPU.")
-@click.option("--accumulate", type=int, default=1, show_default=True, help="Compute a batch in so many parts.")
-@click.option("--learning-rate", type=float, default=1e-3, show_default=True)
-@click.option("--positions", default="none", show_default=True, help="none, as published, or rope.")
-@click.option("--order", default="contiguous", show_default=True, help="Of DPT's contexts: contiguous or random.")
 @click.option("--teammate-actions", "--ta", is_flag=True, help="+TA: the teammate's previous action as input.")
 @click.option("--next-obs", is_flag=True, help="+next_obs: an auxiliary loss.")
 @click.option("--bfloat16", is_flag=True, help="Compute in bfloat16.")
 @click.option("--remat", is_flag=True, help="Less memory, more computing.")
-@click.option("--obs", help="state, uint8 or float32: what batches hold; state records where there are any.")
-@click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--save-every", type=int, default=1000, show_default=True, help="Steps between checkpoints.")
-@click.option("--coordinator", help="HOST:PORT of process 0, to train on several machines.")
-@click.option("--processes", type=int, default=1, show_default=True)
-@click.option("--process", type=int, default=0, show_default=True, help="Which one this is.")
-def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | None, **options: Any) -> None:
-    """Train METHOD (ad, dpt, hybrid_ad, amago_offline) on learning histories, or go on with a stopped run."""
+@click.option(
+    "--obs",
+    type=Names("obs", lambda: OBS),
+    help="What batches hold: state, uint8 or float32.",
+    show_default="state, or uint8 where there are no state records",
+)
+@click.option("--seed", type=SEED, default=0, help="Of parameters, batches and dropout.")
+@click.option("--save-every", type=COUNT, default=1000, help="Steps between checkpoints.")
+@click.option("--coordinator", type=HostPort(), help="Of process 0, to train on several machines.")
+@click.option("--processes", type=COUNT, default=1, help="With --coordinator: how many there are.")
+@click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: which one this is.")
+def train(method: str, layouts: tuple[str, ...], root: Any, out: Path | None, **options: Any) -> None:
+    """Train a model on learning histories.
+
+    METHOD is ad, dpt, hybrid_ad or amago_offline. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
+    the same command goes on from the last checkpoint.
+    """
     import jax
 
+    if options["process"] >= options["processes"] or (options["processes"] > 1 and not options["coordinator"]):
+        raise click.UsageError(
+            f"process {options['process']} of {options['processes']}: several processes need --coordinator, and are "
+            f"numbered from 0"
+        )
     if options["coordinator"]:
         jax.distributed.initialize(options["coordinator"], options["processes"], options["process"])
     from baselines.histories import HistoryOptions, prepare
     from baselines.method import SIZES, ModelOptions
     from baselines.trainer import TrainOptions
     from baselines.trainer import train as run_training
-    from icrl4aht_data.benchmark import unknown
 
-    if options["size"] not in SIZES:
-        raise unknown("size", options["size"], SIZES)
     layers, width, steps = SIZES[options["size"]]
     names = ("positions", "teammate_actions", "next_obs", "bfloat16", "remat")
     model = ModelOptions(layers, width, **{name: options[name] for name in names})
@@ -236,63 +364,55 @@ def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | 
     )
 
 
-def _experiment_options(command: Any) -> Any:
-    """What all experiments take."""
-    folder = click.Path(path_type=Path, exists=True)
-    options = [
-        click.option("--method", "methods", multiple=True, default=("ad", "dpt"), show_default=True),
-        click.option("--layout", "layouts", multiple=True, help="To train on; the paper's that the release has."),
-        click.option("--root", type=folder, help="A release; the bundled mini release if not given."),
-        click.option("--only", "values", multiple=True, help="Only these settings, such as K250, medium or ta."),
-        click.option("--steps", type=int, help="Training steps, instead of the paper's."),
-        click.option("--context", type=int, help="K, instead of 500; not in `sweep context`."),
-        click.option("--batch-size", type=int, help="1024 as in the paper, or 32 where there is only a CPU."),
-        click.option("--family", "families", multiple=True, help="Only these teammate families, such as H4."),
-        click.option("--tasks", type=int, help="At most so many teammates of each family and layout."),
-        click.option("--episodes", type=click.IntRange(1), help="Of a task, instead of 100."),
-        click.option("--seeds", default=1, show_default=True, type=click.IntRange(1), help="Play every task so often."),
-        click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}."),
-        click.option("--acting", default="cached", show_default=True, help="cached, or exact and slower."),
-        click.option("--films/--no-films", default=True, show_default=True, help="A GIF per family on the page."),
-        click.option("--out", type=click.Path(path_type=Path), help="runs/EXPERIMENT by default."),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-@cli.command()
-@click.argument("what")
-@_experiment_options
+@cli.command(
+    epilog=examples(
+        "python -m baselines sweep size --layout demo_wide",
+        "python -m baselines sweep context --only K250 --steps 20 --layout demo_wide --tasks 1 --episodes 5",
+    )
+)
+@click.argument("what", type=variants("sweep"))
+@experiment_options
 def sweep(what: str, **options: Any) -> None:
-    """Train, evaluate and report over WHAT: context (K of 250 to 10,000) or size (small, medium, large)."""
+    """Train and evaluate over sizes, or context lengths.
+
+    WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
+    """
     _experiment(f"sweep {what}", **options)
 
 
-@cli.command()
-@click.argument("what")
-@_experiment_options
+@cli.command(epilog=examples("python -m baselines ablate ta --layout demo_wide"))
+@click.argument("what", type=variants("ablate"))
+@experiment_options
 def ablate(what: str, **options: Any) -> None:
-    """Train, evaluate and report WHAT: ta (none, +TA, +next_obs, both)."""
+    """Train and evaluate with and without parts.
+
+    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
+    """
     _experiment(f"ablate {what}", **options)
 
 
 @cli.command("heldout-rl")
-@click.option("--suite", type=click.Path(path_type=Path), default=Path("build/suite"), show_default=True)
-@_experiment_options
+@click.option(
+    "--suite",
+    type=Folder("`python -m generation teammates`"),
+    metavar="FOLDER",
+    default="build/suite",
+    help="The learned teammates.",
+)
+@experiment_options
 def heldout_rl(suite: Path, **options: Any) -> None:
-    """Train, evaluate beside a suite's learned teammates that are not in training, and report."""
+    """Train, and evaluate beside held-out teammates.
+
+    These are a suite's learned teammates that are not in training. Writes runs, results and OUT/report.
+    """
     _experiment("heldout-rl", suite=suite, **options)
 
 
-def _experiment(name: str, out: Path | None, root: Path | None, suite: Path | None = None, **options: Any) -> None:
+def _experiment(name: str, out: Path | None, root: Any, suite: Path | None = None, **options: Any) -> None:
     import jax
 
-    from baselines.experiments import EXPERIMENTS, Plan, run_experiment
-    from icrl4aht_data.benchmark import unknown
+    from baselines.experiments import Plan, run_experiment
 
-    if name not in EXPERIMENTS:
-        raise unknown("experiment", name, EXPERIMENTS)
     given = {key: options.pop(key) for key in ("steps", "context", "batch_size")}
     training = {key: value for key, value in given.items() if value is not None}
     training.setdefault("batch_size", 32 if jax.default_backend() == "cpu" else 1024)
@@ -315,9 +435,13 @@ def _experiment(name: str, out: Path | None, root: Path | None, suite: Path | No
 
 
 @cli.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/control"), show_default=True)
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/control", help="Write the runs here.")
 def control(out: Path) -> None:
-    """Show that the models adapt where adaptation is possible, and not with their context cut off; about 10 minutes."""
+    """Show that the models adapt where they can.
+
+    Trains them on bandits and Dark Room (about 10 minutes), and prints a table of checks: they adapt there, and do not
+    with their context cut off. Exits with 1 if a check fails.
+    """
     from baselines.control import run_control, table
 
     with Progress(console=console, disable=not console.is_terminal) as bars:

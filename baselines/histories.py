@@ -19,6 +19,7 @@ from icrl4aht_data.dataset import MINI, Dataset, Obs, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import json_hash
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.remote import is_address
 from icrl4aht_data.sampling import ContextOrder
 
 
@@ -64,7 +65,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         "model": asdict(model),
         "histories": asdict(histories)
         | {
-            "root": str(Path(histories.root or MINI).resolve()),
+            "root": histories.root if is_address(histories.root) else str(Path(histories.root or MINI).resolve()),
             "layouts": [layout.name for layout in dataset.layouts],
             "obs": dataset.obs,
             "obs_shape": list(dataset.layouts[0].obs_shape),

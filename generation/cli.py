@@ -11,33 +11,83 @@ import click
 from rich.console import Console
 
 from generation.options import EXECUTORS, Executor, Options, ask_for_determinism, leave_memory_to_workers
-from icrl4aht_data.cli import run
+from icrl4aht_data.benchmark import ALGORITHMS
+from icrl4aht_data.commands import (
+    COUNT,
+    COUNT_OR_NONE,
+    LAYOUT,
+    SEED,
+    SETTINGS,
+    Folder,
+    Names,
+    Sections,
+    examples,
+    json_option,
+    run,
+    version_option,
+)
 from icrl4aht_data.schema import KINDS, Kind
 
 console = Console(soft_wrap=True)
 
-_profile = click.option("--profile", "profile_name", default="smoke", show_default=True, help="Name or TOML file.")
-
-
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="icrl4aht-data")
-def cli() -> None:
-    """Rebuild the ICRL4AHT dataset from the environment and the teammates."""
-
-
-@cli.command()
-@_profile
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for artefacts and releases.")
-@click.option("--kind", type=click.Choice(KINDS), multiple=True, default=("lite",), show_default=True)
-@click.option("--suite", type=click.Path(path_type=Path), help="Folder of the learned teammates.  [default: OUT/suite]")
-@click.option("--seed", default=0, show_default=True, help="Of the learned teammates.")
-@click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
-@click.option("--executor", type=click.Choice(EXECUTORS), default="local", show_default=True)
-@click.option(
-    "--address", help="Of a running Ray cluster; by default a Ray on this machine is started for the occasion."
+_profile = click.option(
+    "--profile", "profile_name", default="smoke", metavar="PROFILE", help="smoke, mini or paper, or a TOML file."
 )
-@click.option("--workers", type=click.IntRange(min=1), help="Tasks at a time on a Ray of our own; default: all cores.")
-@click.option("--retries", type=click.IntRange(min=0), default=0, show_default=True, help="Of a task that failed.")
+
+_SECTIONS = {
+    "Rebuild": ("demo", "plan", "generate", "check"),
+    "Learned teammates": ("teammates", "diversity"),
+    "Maintain": ("speed", "manifests"),
+}
+
+
+@click.group(
+    cls=Sections,
+    sections=_SECTIONS,
+    context_settings=SETTINGS,
+    epilog=examples(
+        "python -m generation plan --profile mini",
+        "python -m generation generate --profile smoke --out build/smoke",
+        "python -m generation teammates --profile mini --layout cramped_up",
+    ),
+)
+@version_option
+def cli() -> None:
+    """Rebuild the ICRL4AHT dataset from the environment and the teammates.
+
+    Needs the extra generation. What a command has finished is kept: after a stop the same command goes on. Exit codes:
+    0 done, 1 a failure or a difference, 2 a misused command.
+    """
+
+
+@cli.command(
+    epilog=examples(
+        "python -m generation generate --profile smoke --out build/smoke",
+        "python -m generation generate --profile mini --out build/mini --kind lite --kind full",
+        "python -m generation generate --profile paper --out build/paper --executor ray",
+    )
+)
+@_profile
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write artefacts and releases here.")
+@click.option(
+    "--kind",
+    type=click.Choice(KINDS),
+    multiple=True,
+    default=("lite",),
+    help="Of release, in OUT/KIND; again for more.",
+)
+@click.option("--suite", type=Folder(), metavar="FOLDER", help="The learned teammates.", show_default="OUT/suite")
+@click.option("--seed", type=SEED, default=0, help="Of the learned teammates.")
+@click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
+@click.option("--executor", type=click.Choice(EXECUTORS), default="local", help="One task at a time here, or Ray.")
+@click.option("--address", metavar="HOST:PORT", help="Of a running Ray cluster.", show_default="a Ray made here")
+@click.option(
+    "--workers",
+    type=COUNT,
+    help="Tasks at a time on the Ray made here.",
+    show_default="as many as cores",
+)
+@click.option("--retries", type=COUNT_OR_NONE, default=0, help="Of a task that failed.")
 @click.option("--fail-fast", is_flag=True, help="Begin no task after one has failed.")
 def generate(
     profile_name: str,
@@ -52,11 +102,12 @@ def generate(
     retries: int,
     fail_fast: bool,
 ) -> None:
-    """Train the teammates and an ego for every task of a profile, record it, and pack OUT/lite or OUT/full.
+    """Rebuild a release, from nothing or from where it was.
 
-    What is finished is kept, and what is not goes on from its last saved update: after a stop or a kill the same
-    command goes on where it was. Teammates are trained by this process, tasks by the executor. Tasks that fail are
-    listed in OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1.
+    Trains the teammates of a profile and an ego for each of its tasks, records how they learn (OUT/artefacts), and
+    packs the release OUT/lite or OUT/full. What is not finished goes on from its last saved update. Teammates are
+    trained by this process, tasks by the executor. Tasks that fail are listed in OUT/failed.jsonl; the others are
+    finished, nothing is packed, and the exit code is 1.
     """
     from generation.build import build_releases
     from generation.package import bundle_release
@@ -78,10 +129,13 @@ def generate(
 
 @cli.command()
 @_profile
-@click.option("--devices", type=click.IntRange(min=1), default=8, show_default=True, help="The N of the last lines.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@click.option("--devices", type=COUNT, default=8, help="Also say the hours on so many of these devices.")
+@json_option
 def plan(profile_name: str, devices: int, as_json: bool) -> None:
-    """Say what a rebuild will cost: tasks, environment steps, disk, and hours at this machine's measured speed."""
+    """Say what a rebuild will cost.
+
+    Prints tasks, environment steps, disk, and hours at the speed that is measured here. Writes nothing.
+    """
     from generation.plan import cost
     from generation.profiles import load_profile
 
@@ -93,12 +147,16 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
             click.echo(f"{name:<28} {value}")
 
 
-@cli.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@cli.command(epilog=examples("python -m generation check build/smoke build/again"))
+@click.argument("a", type=Folder("`python -m generation generate`"))
+@click.argument("b", type=Folder("`python -m generation generate`"))
+@json_option
 def check(a: Path, b: Path, as_json: bool) -> None:
-    """Compare two rebuilds bit for bit: releases, artefacts, or whole folders. Exits with 1 if they differ."""
+    """Compare two rebuilds bit for bit.
+
+    A and B are releases, artefacts, or folders that `generate` has made. Prints what differs, and exits with 1 if
+    anything does. Writes nothing.
+    """
     from generation.check import compare
 
     compared = compare(a, b)
@@ -114,9 +172,12 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 
 @cli.command()
 @_profile
-@click.option("--layout", default="demo_wide", show_default=True, help="Short or environment name.")
+@click.option("--layout", type=LAYOUT, default="demo_wide", help="The layout.")
 def speed(profile_name: str, layout: str) -> None:
-    """Measure the learner: steps/s, and the share of environment, forward pass and update. Prints one JSON line."""
+    """Measure how fast a profile's ego learns.
+
+    Prints one JSON line: steps/s, and the shares of environment, forward pass and update. Writes nothing.
+    """
     from generation.plan import task_learner
     from generation.profiles import load_profile
     from generation.speed import learner_speed
@@ -129,9 +190,12 @@ def speed(profile_name: str, layout: str) -> None:
 
 
 @cli.command()
-@click.option("--check", is_flag=True, help="Write nothing; fail if the files differ.")
+@click.option("--check", is_flag=True, help="Write nothing; exit with 1 if the files differ.")
 def manifests(check: bool) -> None:
-    """Write the published test tasks into icrl4aht_data/manifests, from the parameter tables."""
+    """Write the lists of published test tasks anew.
+
+    Makes icrl4aht_data/manifests/*.jsonl from the parameter tables.
+    """
     from generation.teammates.instances import published_tasks
     from icrl4aht_data.benchmark import TRACKS
     from icrl4aht_data.errors import TaskFormatError
@@ -146,27 +210,34 @@ def manifests(check: bool) -> None:
         console.print(f"{path}: {len(tasks)} tasks")
 
 
-_suite = click.option(
-    "--suite",
-    type=click.Path(path_type=Path),
-    default=Path("build/suite"),
-    show_default=True,
-    help="Folder of the learned teammates.",
+_algorithms = click.option(
+    "--algorithm",
+    "algorithms",
+    type=Names("algorithm", lambda: ALGORITHMS),
+    multiple=True,
+    help="fcp, brdiv, lbrdiv or comedi; again for more.",
+    show_default="all",
 )
-_layouts = click.option("--layout", "layouts", multiple=True, help="Again for more; the profile's by default.")
-_algorithms = click.option("--algorithm", "algorithms", multiple=True, help="Again for more; all by default.")
 
 
-@cli.command()
+@cli.command(epilog=examples("python -m generation teammates --profile mini --layout cramped_up --algorithm fcp"))
 @_profile
-@_layouts
+@click.option(
+    "--layout",
+    "layouts",
+    type=LAYOUT,
+    multiple=True,
+    help="On this layout; again for more.",
+    show_default="the profile's",
+)
 @_algorithms
-@_suite
-@click.option("--seed", default=0, show_default=True)
+@click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write them here.")
+@click.option("--seed", type=SEED, default=0, help="Of their training.")
 def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, seed: int) -> None:
-    """Train populations of teammates, filter their checkpoints and write manifests of tasks with them.
+    """Train populations of teammates.
 
-    Finished populations are kept: after a stop, the same command goes on where it was.
+    Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by what they earn, and writes
+    the lists of tasks with those that are left, SUITE/manifests. Finished populations are kept.
     """
     from generation.build_suite import build_suite
     from generation.profiles import load_profile
@@ -175,12 +246,29 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
 
 
 @cli.command()
-@click.option("--layout", "layouts", multiple=True, help="Again for more; all finished ones by default.")
+@click.option(
+    "--layout",
+    "layouts",
+    type=LAYOUT,
+    multiple=True,
+    help="On this layout; again for more.",
+    show_default="all that are finished",
+)
 @_algorithms
-@_suite
+@click.option(
+    "--suite",
+    type=Folder("`python -m generation teammates`"),
+    metavar="FOLDER",
+    default="build/suite",
+    help="What `teammates` has made.",
+)
 @click.option("--greedy", is_flag=True, help="In seat 1 act greedily, as teammates do.")
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
-    """Self-play and cross-play of each population, and Hamming distances of all teammates; tables and pictures."""
+    """Show how much the teammates of a suite differ.
+
+    Prints self-play and cross-play of each population, and the Hamming distances of all teammates, and draws them into
+    SUITE/LAYOUT.
+    """
     from generation.build_suite import report_diversity
 
     report_diversity(suite, layouts, algorithms, greedy, console)

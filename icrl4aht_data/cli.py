@@ -1,14 +1,9 @@
-"""`icrl4aht-data`: thin commands; the only place where exceptions become exit codes.
-
-Exit codes: 0 done and, for `verify`, whole; 1 an error, or a release that is not whole; 2 a misused command.
-"""
+"""`icrl4aht-data`: thin commands."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,41 +13,31 @@ from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 from rich.table import Table
 
 from icrl4aht_data.benchmark import KEPT_STEPS
+from icrl4aht_data.commands import (
+    COUNT,
+    COUNT_OR_NONE,
+    SETTINGS,
+    Folder,
+    NewFile,
+    Root,
+    Sections,
+    bars,
+    examples,
+    filter_options,
+    json_option,
+    quiet_option,
+    run,
+    version_option,
+)
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
-from icrl4aht_data.errors import Icrl4ahtError, OptionError
-from icrl4aht_data.remote import is_address
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.figures import PICTURES
 from icrl4aht_data.schema import ALL_KINDS, OBSERVATIONS
 
 if TYPE_CHECKING:
     from icrl4aht_data.verify import Report
 
-
-class _Root(click.ParamType):
-    """A folder, or the address of a remote release."""
-
-    name = "folder or address"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | Path:
-        return value if isinstance(value, Path) or is_address(value) else Path(value)
-
-
-_root = click.argument("root", required=False, type=_Root())
-_json = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
-
-
-def _filters(command: Any) -> Any:
-    for name in ("teammate-kind", "teammate-family", "track", "split", "layout"):
-        command = click.option(f"--{name}", multiple=True, help=f"Only this {name}; may be given again.")(command)
-    return command
-
-
-@contextmanager
-def _bars(quiet: bool, *names: str) -> Iterator[Callable[[str, int, int], None]]:
-    """Progress of several things by name, on a terminal only."""
-    console = Console(stderr=True)
-    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
-        tasks = {name: bars.add_task(name, total=None) for name in names}
-        yield lambda what, done, total: bars.update(tasks[what], completed=done, total=total)
+_root = click.argument("root", required=False, type=Root())
 
 
 def _wanted(filters: dict[str, tuple[str, ...]]) -> dict[str, Any]:
@@ -63,22 +48,50 @@ def _load(root: str | Path | None, filters: dict[str, tuple[str, ...]]) -> Datas
     return load_icrl4aht(root, **_wanted(filters))
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="icrl4aht-data")
-def cli() -> None:
-    """Learning histories of the ICRL4AHT benchmark.
+_SECTIONS = {
+    "Look": ("list", "show", "verify", "doctor"),
+    "Bring and change": ("download", "convert", "combine"),
+    "Publish": ("release", "upload"),
+}
 
-    ROOT is a release folder, or the address of a release: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://...;
-    by default the mini release that comes with the package.
+_EXAMPLES = examples(
+    "icrl4aht-data list",
+    "icrl4aht-data show --layout coord_simple --plot curves.png",
+    "icrl4aht-data verify path/to/release --deep",
+    "icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple",
+)
+
+_EPILOG = f"""{_EXAMPLES}
+
+Exit codes: 0 done, 1 a failure or something found wrong, 2 a misused command. The folders and environment variables
+in use: `icrl4aht-data doctor`.
+
+\b
+Completion, in bash (for zsh and fish: zsh_source, fish_source):
+  eval "$(_ICRL4AHT_DATA_COMPLETE=bash_source icrl4aht-data)"
+"""
+
+
+@click.group(cls=Sections, sections=_SECTIONS, context_settings=SETTINGS, epilog=_EPILOG)
+@version_option
+def cli() -> None:
+    """Read, check, fetch and publish the learning histories of the ICRL4AHT benchmark.
+
+    ROOT is a release: its folder, or its address hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...
+    Without ROOT, the mini release that comes with the package is meant.
     """
 
 
 @cli.command("list")
 @_root
-@_filters
-@_json
+@filter_options
+@json_option
 def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
-    """List the tasks of a release: histories, transitions, returns at the start and at the end of learning."""
+    """List the tasks of a release.
+
+    A line a task: layout, teammate, histories, transitions, and the mean return of an episode at the start and at the
+    end of learning.
+    """
     dataset = _load(root, filters)
     tasks: dict[str, dict[str, Any]] = {}
     for entry in dataset.entries:
@@ -118,14 +131,17 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
 
 @cli.command()
 @_root
-@_filters
-@click.option("--history", "history_id", type=int, help="Show one history instead.")
-@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw the learning curves into this PNG.")
-@_json
+@filter_options
+@click.option("--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show this one history instead.")
+@click.option("--plot", type=NewFile(*PICTURES), metavar="FILE", help="Also draw learning curves: .png, .svg or .pdf.")
+@json_option
 def show(
     root: str | Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
 ) -> None:
-    """Show what a release, a part of it, or one of its histories is."""
+    """Show what a release, a part of it or a history is.
+
+    Prints kind, versions, counts and layouts; of one history all that the index says. Writes nothing but --plot.
+    """
     from icrl4aht_data.release import describe
 
     dataset = _load(root, filters)
@@ -172,25 +188,32 @@ def _lacks(dataset: Dataset) -> list[str]:
     return [what for what, missing in lacks.items() if missing]
 
 
-@cli.command()
-@click.argument("root", required=False, type=_Root(), envvar="ICRL4AHT_REMOTE")
-@_filters
-@click.option("--to", type=click.Path(path_type=Path, file_okay=False), help="The folder for the release.")
-@click.option("--dry-run", is_flag=True, help="Say which files would come, and how many bytes; fetch only the index.")
-@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
-@_json
+@cli.command(
+    epilog=examples(
+        "icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple --dry-run",
+        "icrl4aht-data download https://example.org/icrl4aht --to icrl4aht",
+    )
+)
+@click.argument("root", required=False, type=Root(remote=True), envvar="ICRL4AHT_REMOTE", metavar="[ADDRESS]")
+@filter_options
+@click.option("--to", type=Folder(), metavar="FOLDER", help="Write the release here.")
+@click.option("--dry-run", is_flag=True, help="Fetch the index alone; print which files would come, and their bytes.")
+@quiet_option
+@json_option
 def download(
     root: str | Path | None, to: Path | None, dry_run: bool, quiet: bool, as_json: bool, **filters: tuple[str, ...]
 ) -> None:
-    """Download the release at the address ROOT (by default $ICRL4AHT_REMOTE), or the shards of a part of it.
+    """Download a release, or a part of it.
 
-    Each file is checked on arrival; a download that was cut goes on where it was. Without --to a Hub repository goes
-    into the Hub's cache, another release below $ICRL4AHT_DATA_DIR; `load_icrl4aht(root=ROOT)` finds either.
+    ADDRESS is hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...; by default $ICRL4AHT_REMOTE. Each file
+    is checked on arrival; the same command goes on where a download was cut. Without --to a Hub repository goes into
+    the Hub's cache, another release below $ICRL4AHT_DATA_DIR (~/.local/share/icrl4aht); load_icrl4aht(root=ADDRESS)
+    finds either.
     """
     from icrl4aht_data.download import fetch_planned, plan_download
 
     if root is None:
-        raise click.UsageError("give the address of a release, or set ICRL4AHT_REMOTE")
+        raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
     plan = plan_download(str(root), to=to, **_wanted(filters))
     facts = plan.to_json()
     if not dry_run:
@@ -214,13 +237,13 @@ def download(
 
 @cli.command()
 @_root
-@_filters
+@filter_options
 @click.option("--quick", is_flag=True, help="Check names, sizes and the index alone.")
 @click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
 @click.option("--repair", is_flag=True, help="Fetch what is wrong or missing again, then verify once more.")
-@click.option("--from", "source", metavar="ADDRESS", help="Where to repair from; by default where ROOT came from.")
-@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
-@_json
+@click.option("--from", "source", metavar="ADDRESS", help="Repair from here.", show_default="where ROOT came from")
+@quiet_option
+@json_option
 def verify(
     root: str | Path | None,
     quick: bool,
@@ -231,17 +254,20 @@ def verify(
     as_json: bool,
     **filters: tuple[str, ...],
 ) -> None:
-    """Verify a release: hashes, chunk checksums, counts, ranges. Exits with 1 if anything is wrong.
+    """Verify a release: every byte, count and range.
 
-    Of a remote release, what is checked comes here first, unless --quick; repairing a shard fetches only what is wrong.
+    Prints a line for each thing that is wrong, and exits with 1 if there is one. Nothing is written, unless --repair. A
+    remote release is fetched first, unless --quick; repairing a shard fetches only what is wrong in it.
     """
     from icrl4aht_data.download import repair as repair_files
     from icrl4aht_data.verify import verify_release
 
     if quick and (deep or repair):
         raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
+    if source and not repair:
+        raise click.UsageError("--from says where to repair from: give --repair with it")
     wanted = _wanted(filters)
-    with _bars(quiet, "fetched", "files", "histories") as advance:
+    with bars(quiet, "fetched", "files", "histories") as advance:
         report = verify_release(root, deep=deep, quick=quick, advance=advance, **wanted)
         if repair and not report.ok:
             if root is None and source is None:
@@ -259,14 +285,15 @@ def verify(
         for name in report.repaired:
             click.echo(f"{name}: repaired")
         for finding in report.findings:
-            click.echo(f"{finding.file}: {finding.problem}")
+            click.echo(finding.problem if finding.file == "." else f"{finding.file}: {finding.problem}")
         if not quiet:
             click.echo("\n".join([f"{report.root}: {_verdict(report)}", *report.notes]))
     sys.exit(0 if report.ok else 1)
 
 
 def _verdict(report: Report) -> str:
-    verdict = "whole" if report.ok else f"{len(report.findings)} problems"
+    number = len(report.findings)
+    verdict = "whole" if report.ok else f"{number} problem{'s' * (number > 1)}"
     if report.quick:
         return f"{verdict}; checked names, sizes and the index of {report.files} files, no contents"
     physics = " and their physics" if report.replayed else ""
@@ -277,22 +304,25 @@ def _verdict(report: Report) -> str:
     )
 
 
-@cli.command()
-@click.argument("source", type=_Root())
-@click.argument("target", type=click.Path(path_type=Path))
-@click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]))
-@click.option(
-    "--tasks", type=click.Path(path_type=Path), help="Tasks of published files; their tasks.jsonl by default."
+@cli.command(
+    epilog=examples(
+        "icrl4aht-data convert path/to/release full --to full --layout coord_simple",
+        "icrl4aht-data convert path/to/published lite",
+    )
 )
+@click.argument("source", type=Root())
+@click.argument("target", type=click.Path(path_type=Path), metavar="OUT")
+@click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]), help="What to make.")
 @click.option(
-    "--kept-steps",
-    type=click.IntRange(min=1),
-    default=KEPT_STEPS,
-    show_default=True,
-    help="Steps an episode of published files.",
+    "--tasks",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Of published files: their tasks.",
+    show_default="tasks.jsonl beside them",
 )
-@click.option("-q", "--quiet", is_flag=True, help="No progress.")
-@_filters
+@click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Of published files: steps of an episode.")
+@filter_options
+@quiet_option
 def convert(
     source: str | Path,
     target: Path,
@@ -302,10 +332,12 @@ def convert(
     quiet: bool,
     **filters: tuple[str, ...],
 ) -> None:
-    """Convert SOURCE, a release or a folder with the published code's histories.h5, into TARGET.
+    """Convert a release, or published files, into OUT.
 
-    full, lite and observations are releases, published is the published code's two files, parquet is the index as one
-    file. Published files become lite by default, or observations where they have no state records.
+    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. OUT becomes a
+    release folder (full, lite, observations), a folder with the published code's two files (published), or a file with
+    the index as a table (parquet). Published files become lite by default, or observations where they have no state
+    records.
     """
     from icrl4aht_data import convert as forms
 
@@ -320,25 +352,40 @@ def convert(
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, and whole")
             form = forms.from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
-        elif form is None:
-            raise click.UsageError("say what to make of a release: --to full, lite, observations, published or parquet")
-        elif form in ALL_KINDS:
-            forms.to_release(_load(source, filters), target, form, advance=advance)
-        elif form == "published":
-            forms.to_published(_load(source, filters), target, advance=advance)
         else:
-            forms.to_parquet(_load(source, filters), target)
+            dataset = _load(source, filters)
+            if form is None:
+                raise click.UsageError(
+                    "say what to make of a release: --to full, lite, observations, published, parquet"
+                )
+            if tasks or kept_steps != KEPT_STEPS:
+                raise click.UsageError(f"{source} is a release: --tasks and --kept-steps are for published files")
+            if form in ALL_KINDS:
+                forms.to_release(dataset, target, form, advance=advance)
+            elif form == "published":
+                forms.to_published(dataset, target, advance=advance)
+            else:
+                forms.to_parquet(dataset, target)
     lacking = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
-    click.echo(f"{target}: {form}{lacking}")
+    if not quiet:
+        click.echo(f"{target}: {form}{lacking}")
 
 
-@cli.command()
-@click.argument("out", type=click.Path(path_type=Path))
-@click.argument("releases", nargs=-1, required=True, type=_Root(), metavar="RELEASE...")
-@click.option("--data-version", help="SemVer of the combination; that of the releases by default, if they agree.")
-@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
+@cli.command(epilog=examples("icrl4aht-data combine both path/to/release path/to/another --data-version 1.0.0"))
+@click.argument("out", type=Folder())
+@click.argument("releases", nargs=-1, required=True, type=Root(), metavar="ROOT...")
+@click.option(
+    "--data-version",
+    metavar="SEMVER",
+    help="Of the combination, such as 1.0.0.",
+    show_default="that of the releases, if they agree",
+)
+@quiet_option
 def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | None, quiet: bool) -> None:
-    """Combine releases of one kind, no two with a task in common, into the release OUT."""
+    """Combine releases into one, in the folder OUT.
+
+    They are of one kind, and no two have a task in common. A release that is at OUT is replaced.
+    """
     from icrl4aht_data.combine import combine_releases
     from icrl4aht_data.info import read_info
     from icrl4aht_data.statistics import print_statistics
@@ -351,28 +398,29 @@ def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | Non
 
 @cli.group()
 def release() -> None:
-    """Make releases ready for other people."""
+    """Make a release ready for other people."""
 
 
 @release.command()
-@click.argument("source", nargs=-1, type=click.Path(path_type=Path), metavar="[SOURCE]")
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("source", nargs=-1, type=Folder("`icrl4aht-data download`"), metavar="[SOURCE]")
+@click.argument("out", type=Folder())
 @click.option("--link", is_flag=True, help="Hard links instead of copies: no space, but both change if one is changed.")
-@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
-@_json
+@quiet_option
+@json_option
 def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json: bool) -> None:
-    """Build the release OUT for publication: all of SOURCE, a release, and what people and tools look for beside it.
+    """Build a release for publication in the folder OUT.
 
-    That is README.md with a dataset card, figures, the index as Parquet for viewers, croissant.json, LICENSE,
-    CITATION.cff, cards of the learned teammates and a new manifest. SOURCE is verified first; by default it is the
-    bundled mini release.
+    It holds all of SOURCE, a release folder (by default the bundled mini release), which is verified first, and what
+    people and tools look for beside it: README.md with a dataset card, figures, the index as Parquet for viewers,
+    croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras plot and
+    hf.
     """
     from icrl4aht_data.manifest import read_manifest
     from icrl4aht_data.publish import build_release
 
     if len(source) > 1:
         raise click.UsageError("give one SOURCE at most, then OUT")
-    with _bars(quiet, "files", "histories", "copying") as advance:
+    with bars(quiet, "files", "histories", "copying") as advance:
         build_release(source[0] if source else None, out, link=link, advance=advance)
     files = list(read_manifest(out))
     size = sum((out / name).stat().st_size for name in files)
@@ -382,23 +430,24 @@ def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json:
         click.echo(f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}")
 
 
-@cli.command()
-@click.argument("folder", type=click.Path(path_type=Path))
-@click.argument("address", metavar="hf://datasets/ORG/REPO")
+@cli.command(epilog=examples("icrl4aht-data upload build/release hf://datasets/you/icrl4aht --dry-run"))
+@click.argument("folder", type=Folder("`icrl4aht-data release build`"))
+@click.argument("address", type=Root(remote=True))
 @click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done; change nothing.")
-@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
-@_json
+@click.option("--dry-run", is_flag=True, help="Print what would be done; change nothing.")
+@quiet_option
+@json_option
 def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool, as_json: bool) -> None:
-    """Upload the release FOLDER to a dataset repository of the Hugging Face Hub, and tag it with the data version.
+    """Upload a release to the Hugging Face Hub, and tag it.
 
-    The release is verified first, the repository made if there is none. An upload that was cut off goes on with the
-    same command. Afterwards what the repository holds is compared with the manifest; only then it is tagged. A tag
-    never moves: other data need another version. `hf auth login` gives the token.
+    FOLDER is a release, as `release build` makes it; ADDRESS is hf://datasets/<org>/<repo>. The release is verified
+    first, the repository made if there is none. The same command goes on where an upload was cut. Afterwards what the
+    repository holds is compared with the manifest; only then it is tagged with the data version. A tag never moves:
+    other data need another version. `hf auth login` gives the token.
     """
     from icrl4aht_data.upload import upload_release
 
-    with _bars(quiet, "files", "histories") as advance:
+    with bars(quiet, "files", "histories") as advance:
         done = upload_release(
             folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
         )
@@ -408,15 +457,20 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
         click.echo("\n".join(done.in_words()))
 
 
-def run(command: click.Command) -> None:
-    """Run a command line; what is wrong with the input becomes one line and exit code 1."""
-    try:
-        command()
-    except BrokenPipeError:
-        sys.exit(1)
-    except (Icrl4ahtError, OSError) as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+@cli.command()
+@json_option
+def doctor(as_json: bool) -> None:
+    """Look at this installation, and say what is wrong.
+
+    Prints versions, optional packages and which extra brings them, devices, the folders in use (where they are set,
+    what they hold, whether they can be written), environment variables, and whether the bundled release is whole.
+    Nothing is written or asked of the network. Exits with 1 and a next step for each problem if there is one.
+    """
+    from icrl4aht_data.doctor import diagnose, in_words
+
+    found = diagnose()
+    click.echo(json.dumps(found.to_json(), indent=2) if as_json else "\n".join(in_words(found)))
+    sys.exit(0 if found.ok else 1)
 
 
 def main() -> None:
