@@ -334,6 +334,15 @@ def control(out: Path) -> None:
         sys.exit(1)
 
 
+@cli.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("build/demo"), show_default=True)
+def demo(out: Path) -> None:
+    """The whole way on the bundled release: load, sample, verify, train a small AD, evaluate it, report."""
+    from baselines.demo import run_demo
+
+    run_demo(out, console)
+
+
 def main() -> None:
     """Entry point."""
     run(cli)

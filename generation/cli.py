@@ -186,16 +186,6 @@ def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path
     report_diversity(suite, layouts, algorithms, greedy, console)
 
 
-@cli.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("build/demo"), show_default=True)
-@_profile
-def demo(out: Path, profile_name: str) -> None:
-    """From nothing to a verified dataset: generate, verify, load, sample, draw."""
-    from generation.demo import run_demo
-
-    run_demo(out, profile_name, console)
-
-
 def main() -> None:
     """Entry point."""
     run(cli)
