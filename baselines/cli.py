@@ -176,9 +176,7 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
 @click.option(
     "--layout", "layouts", multiple=True, required=True, help="To train on; several of one observation shape."
 )
-@click.option(
-    "--root", type=click.Path(path_type=Path, exists=True), help="A release; the bundled mini release if not given."
-)
+@click.option("--root", help="A release, its folder or address; the bundled mini release if not given.")
 @click.option("--out", type=click.Path(path_type=Path), help="The run folder; runs/METHOD by default.")
 @click.option("--size", default="small", show_default=True, help="small, medium or large: layers, width, steps.")
 @click.option("--steps", type=int, help="Training steps, instead of the size's.")
@@ -198,7 +196,7 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
 @click.option("--coordinator", help="HOST:PORT of process 0, to train on several machines.")
 @click.option("--processes", type=int, default=1, show_default=True)
 @click.option("--process", type=int, default=0, show_default=True, help="Which one this is.")
-def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | None, **options: Any) -> None:
+def train(method: str, layouts: tuple[str, ...], root: str | None, out: Path | None, **options: Any) -> None:
     """Train METHOD (ad, dpt, hybrid_ad, amago_offline) on learning histories, or go on with a stopped run."""
     import jax
 
@@ -221,7 +219,7 @@ def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | 
         batch_size=options["batch_size"] or (32 if jax.default_backend() == "cpu" else 1024),
         **{name: options[name] for name in names},
     )
-    histories = HistoryOptions(layouts, root and str(root), order=options["order"], obs=options["obs"])
+    histories = HistoryOptions(layouts, root, order=options["order"], obs=options["obs"])
     job = prepare(method, model, training, histories)
     folder = out or Path("runs") / method
     with Progress(console=console, disable=not console.is_terminal) as bars:
@@ -238,11 +236,10 @@ def train(method: str, layouts: tuple[str, ...], root: Path | None, out: Path | 
 
 def _experiment_options(command: Any) -> Any:
     """What all experiments take."""
-    folder = click.Path(path_type=Path, exists=True)
     options = [
         click.option("--method", "methods", multiple=True, default=("ad", "dpt"), show_default=True),
         click.option("--layout", "layouts", multiple=True, help="To train on; the paper's that the release has."),
-        click.option("--root", type=folder, help="A release; the bundled mini release if not given."),
+        click.option("--root", help="A release, its folder or address; the bundled mini release if not given."),
         click.option("--only", "values", multiple=True, help="Only these settings, such as K250, medium or ta."),
         click.option("--steps", type=int, help="Training steps, instead of the paper's."),
         click.option("--context", type=int, help="K, instead of 500; not in `sweep context`."),
@@ -285,7 +282,7 @@ def heldout_rl(suite: Path, **options: Any) -> None:
     _experiment("heldout-rl", suite=suite, **options)
 
 
-def _experiment(name: str, out: Path | None, root: Path | None, suite: Path | None = None, **options: Any) -> None:
+def _experiment(name: str, out: Path | None, root: str | None, suite: Path | None = None, **options: Any) -> None:
     import jax
 
     from baselines.experiments import EXPERIMENTS, Plan, run_experiment
@@ -298,7 +295,7 @@ def _experiment(name: str, out: Path | None, root: Path | None, suite: Path | No
     training.setdefault("batch_size", 32 if jax.default_backend() == "cpu" else 1024)
     if name == "sweep context" and "context" in training:
         raise OptionError(f"--context {training['context']}: `sweep context` varies it; choose by --only, such as K250")
-    plan = Plan(root=root and str(root), suite=suite, train=training, **options)
+    plan = Plan(root=root, suite=suite, train=training, **options)
     with Progress(console=console, disable=not console.is_terminal) as bars:
         running: dict[str, Any] = {}
 

@@ -94,7 +94,7 @@ class Plan:
 
     methods: tuple[str, ...] = ("ad", "dpt")
     layouts: tuple[str, ...] = ()  # to train on; those of the experiment that the release has
-    root: str | None = None  # a release; the bundled mini release by default
+    root: str | None = None  # a release, its folder or address; the bundled mini release by default
     suite: Path | None = None  # learned teammates; for "heldout-rl"
     train: dict[str, Any] = field(default_factory=dict)  # of `TrainOptions` for all entries: steps, batch_size, ..
     model: dict[str, Any] = field(default_factory=dict)  # of `ModelOptions` for all entries
