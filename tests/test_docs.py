@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import importlib
 import io
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from plays import play, random_release
 from test_readme import ROOT, blocks, commands, understand
+from tiny import start
 
 from baselines.cli import cli as baselines_cli
 from baselines.histories import LABELS
@@ -238,3 +240,62 @@ def type_of(field: Field, kind: Kind) -> str:
     return {"int32": "i4", "int8": "i1", "float32": "f4", "bool": "bool"}[
         field.compact if kind == "lite" else field.dtype
     ]
+
+
+class TestExtending:
+    def test_what_is_named_as_the_page_says_is_known_everywhere(self, tmp_path):
+        """The page's lines, in a copy: a task beside the new teammate on the new layout, played and reported."""
+        for folder in ("icrl4aht_data", "generation", "baselines", "cards"):
+            shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("mini", "__pycache__"))
+        for block in blocks("diff", PAGES["extending"]):
+            for change in block.split("--- ")[1:]:
+                name, *lines = change.splitlines()
+                apply(tmp_path / name, lines)
+        (module,) = (block for block in blocks("python", PAGES["extending"]) if block.startswith('"""`waiter`'))
+        (tmp_path / "generation" / "teammates" / "waiter.py").write_text(module, encoding="utf-8")
+        process = start("-c", NAMED, str(tmp_path), str(ROOT / "tests"), JAX_DISABLE_MOST_OPTIMIZATIONS="true")
+        out, error = process.communicate(timeout=240)
+        assert process.returncode == 0, error
+        assert ast.literal_eval(out.splitlines()[-1]) == ("H5", "open_kitchen", 1, True)
+
+
+NAMED = """
+import os, sys
+sys.path[:0] = sys.argv[1:]
+os.chdir(sys.argv[1])
+import dataclasses
+from pathlib import Path
+from plays import random_release
+from baselines.agents import stay
+from baselines.evaluate import evaluate, get_protocol
+from baselines.report import as_run, markdown, rows
+from generation.teammates.registry import heuristic_teammate, sample
+from icrl4aht_data import __file__, verify_release
+from icrl4aht_data.tasks import make_task, read_tasks, write_tasks
+assert __file__.startswith(sys.argv[1])
+made = make_task("layout", "train", "open_kitchen", heuristic_teammate("waiter", "lazy", 0), 0)
+write_tasks(Path("mine.jsonl"), [made, make_task("layout", "train", "open_kitchen", sample("waiter", 1, "test"), 1)])
+tasks = read_tasks(Path("mine.jsonl"))
+short = dataclasses.replace(get_protocol("seeded"), episodes=1, steps=10)
+run = as_run(evaluate("stay", stay, tasks[:1], short), tasks=tasks)
+assert "| H5 |" in markdown([run])
+(row,) = rows(run)
+random_release(Path("release"), layouts=("open_kitchen",))
+whole = verify_release("release", deep=True).ok
+print((row["family"], row["layout"], row["instances"], whole))
+"""
+
+
+def apply(path: Path, lines: list[str]) -> None:
+    """Make the change that some lines of a diff say, each run of them where the file has what they begin with."""
+    text = path.read_text(encoding="utf-8")
+    hunks: list[list[str]] = []
+    for before, line in zip([" ", *lines], lines, strict=False):
+        if (before[0] == "+" and line[0] != "+") or not hunks:
+            hunks.append([])
+        hunks[-1].append(line)
+    for hunk in hunks:
+        old, new = ("\n".join(line[1:] for line in hunk if line[0] in signs) for signs in (" -", " +"))
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path.write_text(text, encoding="utf-8")
