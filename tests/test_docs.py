@@ -18,6 +18,7 @@ from unittest import mock
 import fsspec
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from plays import play, random_release
 from test_readme import ROOT, blocks, commands, understand
 from tiny import start
@@ -25,6 +26,7 @@ from tiny import start
 from baselines.cli import cli as baselines_cli
 from baselines.histories import LABELS
 from baselines.methods import METHODS
+from generation import plan
 from generation.cli import cli as generation_cli
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.cli import cli as reader_cli
@@ -299,3 +301,25 @@ def apply(path: Path, lines: list[str]) -> None:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
     path.write_text(text, encoding="utf-8")
+
+
+class TestScale:
+    def test_the_plan_of_the_paper_is_the_printed_one(self, monkeypatch):
+        """But for what is measured."""
+        monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.Speed(1000.0, 1.0))
+        monkeypatch.setattr(plan, "bytes_per_transition", lambda kind: 1.0)
+        (arguments,) = (a for a in commands("python -m generation", PAGES["scale"]) if a[0] == "plan")
+        result = CliRunner().invoke(generation_cli, arguments)
+        assert result.exit_code == 0, result.output
+        (written,) = (block for block in blocks("text", PAGES["scale"]) if block.startswith("profile"))
+        both = [text.splitlines() for text in (result.output, written)]
+        for ours, theirs in zip(*both, strict=True):
+            measured = re.match("disk, release|measured|compiling|hours", ours)
+            assert ours[:29] == theirs[:29] if measured else ours == theirs
+
+    def test_the_variables_are_those_that_are_read(self):
+        sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "icrl4aht_data").rglob("*.py"))
+        read = set(re.findall(r'"((?:ICRL4AHT|HF)_[A-Z_]+)"', sources))
+        written = {name for cells in rows("scale", "variable") for name in cells[0].split(", ")}
+        assert read <= written
+        assert {name for name in written if name.startswith("ICRL4AHT")} <= read
