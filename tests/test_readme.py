@@ -21,13 +21,13 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+def blocks(language: str, page: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
 
 
-def commands(start: str) -> list[list[str]]:
+def commands(start: str, page: str = README) -> list[list[str]]:
     """The arguments of every shell line that starts so."""
-    lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(start)]
+    lines = [line for block in blocks("sh", page) for line in block.splitlines() if line.startswith(start)]
     return [shlex.split(line, comments=True)[len(start.split()) :] for line in lines]
 
 
