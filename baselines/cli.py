@@ -200,6 +200,8 @@ def train(method: str, layouts: tuple[str, ...], root: str | None, out: Path | N
     """Train METHOD (ad, dpt, hybrid_ad, amago_offline) on learning histories, or go on with a stopped run."""
     import jax
 
+    if not options["coordinator"] and (options["processes"], options["process"]) != (1, 0):
+        raise OptionError("--processes and --process: expected a --coordinator HOST:PORT as well, the same for all")
     if options["coordinator"]:
         jax.distributed.initialize(options["coordinator"], options["processes"], options["process"])
     from baselines.histories import HistoryOptions, prepare

@@ -152,10 +152,6 @@ def _rank(seed: int, *name: object) -> bytes:
     return hashlib.blake2b(repr((seed, *name)).encode(), digest_size=8).digest()
 
 
-LABELS = {"ad": "AD", "dpt": "DPT", "hybrid_ad": "Hybrid-AD", "amago_offline": "AMAGO-Offline"}
-"""Method -> its name in the paper's tables."""
-
-
 class Run(NamedTuple):
     """A trained model."""
 
@@ -194,6 +190,6 @@ def read_run(folder: Path) -> Run:
         found = checkpoints.restore(jax.eval_shape(method.init, jax.random.key(0)))
     finally:
         checkpoints.close()
-    label = LABELS[method.name] + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
+    label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
     return Run(method, found.params, found.step, context, names, layouts[0].obs_shape, label, json_hash(config))

@@ -133,3 +133,5 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
     assert "model.teammate_actions: the run has False, asked for True" in str(again.exception)
     wrong = CliRunner().invoke(cli, [*arguments, "--size", "smal"])
     assert "unknown size 'smal'" in str(wrong.exception)
+    alone = CliRunner().invoke(cli, [*arguments, *small, "--processes", "2"])
+    assert "expected a --coordinator HOST:PORT as well" in str(alone.exception)

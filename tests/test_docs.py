@@ -24,7 +24,6 @@ from test_readme import ROOT, blocks, commands, understand
 from tiny import start
 
 from baselines.cli import cli as baselines_cli
-from baselines.histories import LABELS
 from baselines.methods import METHODS
 from generation import plan
 from generation.cli import cli as generation_cli
@@ -50,8 +49,7 @@ def run(tmp_path_factory):
     with contextlib.ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         patch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path_factory.mktemp("data")))
-        for table in (METHODS, LABELS):
-            stack.enter_context(mock.patch.dict(table))
+        stack.enter_context(mock.patch.dict(METHODS))
         stack.callback(lambda: fsspec.filesystem("memory").store.clear())
 
         @cache
