@@ -181,7 +181,7 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
 @click.option("--size", default="small", show_default=True, help="small, medium or large: layers, width, steps.")
 @click.option("--steps", type=int, help="Training steps, instead of the size's.")
 @click.option("--context", type=int, default=500, show_default=True, help="K: steps of a window, or transitions.")
-@click.option("--batch-size", type=int, help="1024 as in the paper, or 32 where there is only a CPU.")
+@click.option("--batch-size", type=int, help="1024 as in the paper, or 8 where there is only a CPU.")
 @click.option("--accumulate", type=int, default=1, show_default=True, help="Compute a batch in so many parts.")
 @click.option("--learning-rate", type=float, default=1e-3, show_default=True)
 @click.option("--positions", default="none", show_default=True, help="none, as published, or rope.")
@@ -218,7 +218,7 @@ def train(method: str, layouts: tuple[str, ...], root: str | None, out: Path | N
     names = ("context", "accumulate", "learning_rate", "seed", "save_every")
     training = TrainOptions(
         steps=steps if options["steps"] is None else options["steps"],
-        batch_size=options["batch_size"] or (32 if jax.default_backend() == "cpu" else 1024),
+        batch_size=options["batch_size"] or _default_batch_size(),
         **{name: options[name] for name in names},
     )
     histories = HistoryOptions(layouts, root, order=options["order"], obs=options["obs"])
@@ -236,6 +236,13 @@ def train(method: str, layouts: tuple[str, ...], root: str | None, out: Path | N
     )
 
 
+def _default_batch_size() -> int:
+    """The paper's, or what a step in seconds allows."""
+    import jax
+
+    return 8 if jax.default_backend() == "cpu" else 1024
+
+
 def _experiment_options(command: Any) -> Any:
     """What all experiments take."""
     options = [
@@ -245,7 +252,7 @@ def _experiment_options(command: Any) -> Any:
         click.option("--only", "values", multiple=True, help="Only these settings, such as K250, medium or ta."),
         click.option("--steps", type=int, help="Training steps, instead of the paper's."),
         click.option("--context", type=int, help="K, instead of 500; not in `sweep context`."),
-        click.option("--batch-size", type=int, help="1024 as in the paper, or 32 where there is only a CPU."),
+        click.option("--batch-size", type=int, help="1024 as in the paper, or 8 where there is only a CPU."),
         click.option("--family", "families", multiple=True, help="Only these teammate families, such as H4."),
         click.option("--tasks", type=int, help="At most so many teammates of each family and layout."),
         click.option("--episodes", type=click.IntRange(1), help="Of a task, instead of 100."),
@@ -285,8 +292,6 @@ def heldout_rl(suite: Path, **options: Any) -> None:
 
 
 def _experiment(name: str, out: Path | None, root: str | None, suite: Path | None = None, **options: Any) -> None:
-    import jax
-
     from baselines.experiments import EXPERIMENTS, Plan, run_experiment
     from icrl4aht_data.benchmark import unknown
 
@@ -294,7 +299,7 @@ def _experiment(name: str, out: Path | None, root: str | None, suite: Path | Non
         raise unknown("experiment", name, EXPERIMENTS)
     given = {key: options.pop(key) for key in ("steps", "context", "batch_size")}
     training = {key: value for key, value in given.items() if value is not None}
-    training.setdefault("batch_size", 32 if jax.default_backend() == "cpu" else 1024)
+    training.setdefault("batch_size", _default_batch_size())
     if name == "sweep context" and "context" in training:
         raise OptionError(f"--context {training['context']}: `sweep context` varies it; choose by --only, such as K250")
     plan = Plan(root=root, suite=suite, train=training, **options)
