@@ -25,8 +25,8 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
-demo: install ## from nothing to a verified dataset: generate smoke, verify, sample, draw (at most 10 minutes)
-	$(BIN)/python -m generation demo
+demo: install ## the whole way on the bundled release: load, sample, verify, train, evaluate, report (at most 10 minutes)
+	$(BIN)/python -m baselines demo
 
 generate: install ## rebuild a dataset, or go on with it: PROFILE=smoke|mini|paper, OUT=folder, OPTIONS=...
 	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)

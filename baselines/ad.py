@@ -111,7 +111,9 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
     return loss
 
 
-def action_method(name: str, trunk: Callable[[ModelOptions], nn.Module]) -> Callable[[ModelOptions, World], Method]:
+def action_method(
+    name: str, label: str, trunk: Callable[[ModelOptions], nn.Module]
+) -> Callable[[ModelOptions, World], Method]:
     """Algorithm Distillation on a trunk."""
 
     def make(options: ModelOptions, world: World) -> Method:
@@ -119,6 +121,7 @@ def action_method(name: str, trunk: Callable[[ModelOptions], nn.Module]) -> Call
         example = example_step(world)
         return Method(
             name=name,
+            label=label,
             data="ad",
             model=model,
             example=(example, example.prev_action),
@@ -129,5 +132,5 @@ def action_method(name: str, trunk: Callable[[ModelOptions], nn.Module]) -> Call
     return make
 
 
-ad = action_method("ad", ModelOptions.transformer)
+ad = action_method("ad", "AD", ModelOptions.transformer)
 """3,283,870 parameters at C = 40."""

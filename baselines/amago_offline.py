@@ -97,6 +97,7 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
     example = example_step(world)
     return Method(
         name="amago_offline",
+        label="AMAGO-Offline",
         data="ad",
         model=model,
         example=(example, example.prev_action),

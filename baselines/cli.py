@@ -18,6 +18,7 @@ from baselines.options import (
     STEPS,
     HostPort,
     acting_option,
+    agent_of,
     batch_size_option,
     experiment_options,
     films_option,
@@ -27,11 +28,10 @@ from baselines.options import (
     seeds_option,
     variants,
 )
-from icrl4aht_data.benchmark import TRACKS
+from icrl4aht_data.benchmark import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.commands import (
     COUNT,
     COUNT_OR_NONE,
-    FAMILY,
     LAYOUT,
     RATE,
     SEED,
@@ -119,14 +119,13 @@ def evaluate(
     Plays 100 episodes of each task and writes one JSON a task into OUT/tasks. Tasks that are there are not played
     again.
     """
-    from baselines.agents import find_agent
     from baselines.evaluate import evaluate as evaluate_tasks
     from baselines.evaluate import get_protocol
     from baselines.provenance import note_results
     from icrl4aht_data.tasks import manifest_path, read_tasks
 
     paths = [manifest] if manifest else [manifest_path(name, "test") for name in track]
-    ego = find_agent(agent, acting)
+    ego = agent_of("--agent", agent, acting)
     wanted = {get_layout(name).name for name in layout}
     tasks = [task for path in paths for task in read_tasks(path) if not wanted or task.layout.name in wanted]
     if not tasks:
@@ -153,7 +152,7 @@ def evaluate(
 
 
 @cli.command()
-@click.argument("runs", nargs=-1, required=True, type=Folder("`python -m baselines evaluate`"), metavar="RESULTS...")
+@click.argument("runs", nargs=-1, required=True, type=Folder(), metavar="RESULTS...")
 @click.option(
     "--out", type=Folder(), metavar="FOLDER", help="Write it here.", show_default="report in the first RESULTS"
 )
@@ -193,13 +192,12 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: b
 @click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
 def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
     """Play an episode and draw it as a GIF."""
-    from baselines.agents import find_agent
     from baselines.evaluate import get_protocol
     from baselines.watching import film
     from generation.teammates.instances import named_task
 
     task = named_task(layout, teammate)
-    earned = film(out, task, find_agent(ego).make, get_protocol(protocol), seed=seed)
+    earned = film(out, task, agent_of("--ego", ego).make, get_protocol(protocol), seed=seed)
     console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
 
 
@@ -227,9 +225,11 @@ def headroom(out: Path, protocol: tuple[str, ...]) -> None:
 
 
 @cli.command()
-@click.argument("run", type=Folder("`python -m baselines train`"))
+@click.argument("run", type=Folder())
 @click.option("--layout", type=LAYOUT, help="The layout.", show_default="the first that the model was trained on")
-@click.option("--family", type=FAMILY, default="H4", help="Of teammates: H1, H2, H3 or H4.")
+@click.option(
+    "--family", type=Names("family", HEURISTIC_KINDS.values), default="H4", help="Of teammates: H1, H2, H3 or H4."
+)
 @protocol_option
 @click.option("--episodes", type=COUNT, help="How many to play.", show_default="as many as fill the window three times")
 def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
@@ -328,11 +328,12 @@ def train(method: str, layouts: tuple[str, ...], root: Any, out: Path | None, **
     """
     import jax
 
-    if options["process"] >= options["processes"] or (options["processes"] > 1 and not options["coordinator"]):
+    if not options["coordinator"] and (options["processes"], options["process"]) != (1, 0):
         raise click.UsageError(
-            f"process {options['process']} of {options['processes']}: several processes need --coordinator, and are "
-            f"numbered from 0"
+            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
         )
+    if options["process"] >= options["processes"]:
+        raise click.UsageError(f"--process {options['process']}: expected a number below {options['processes']}")
     if options["coordinator"]:
         jax.distributed.initialize(options["coordinator"], options["processes"], options["process"])
     from baselines.histories import HistoryOptions, prepare
@@ -346,7 +347,7 @@ def train(method: str, layouts: tuple[str, ...], root: Any, out: Path | None, **
     names = ("context", "accumulate", "learning_rate", "seed", "save_every")
     training = TrainOptions(
         steps=steps if options["steps"] is None else options["steps"],
-        batch_size=options["batch_size"] or (32 if jax.default_backend() == "cpu" else 1024),
+        batch_size=options["batch_size"] or _default_batch_size(),
         **{name: options[name] for name in names},
     )
     histories = HistoryOptions(layouts, root and str(root), order=options["order"], obs=options["obs"])
@@ -362,6 +363,13 @@ def train(method: str, layouts: tuple[str, ...], root: Any, out: Path | None, **
     console.print(
         f"{training.steps} steps in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
+
+
+def _default_batch_size() -> int:
+    """The paper's, or what a step in seconds allows."""
+    import jax
+
+    return 8 if jax.default_backend() == "cpu" else 1024
 
 
 @cli.command(
@@ -394,7 +402,7 @@ def ablate(what: str, **options: Any) -> None:
 @cli.command("heldout-rl")
 @click.option(
     "--suite",
-    type=Folder("`python -m generation teammates`"),
+    type=Folder(),
     metavar="FOLDER",
     default="build/suite",
     help="The learned teammates.",
@@ -409,13 +417,11 @@ def heldout_rl(suite: Path, **options: Any) -> None:
 
 
 def _experiment(name: str, out: Path | None, root: Any, suite: Path | None = None, **options: Any) -> None:
-    import jax
-
     from baselines.experiments import Plan, run_experiment
 
     given = {key: options.pop(key) for key in ("steps", "context", "batch_size")}
     training = {key: value for key, value in given.items() if value is not None}
-    training.setdefault("batch_size", 32 if jax.default_backend() == "cpu" else 1024)
+    training.setdefault("batch_size", _default_batch_size())
     if name == "sweep context" and "context" in training:
         raise OptionError(f"--context {training['context']}: `sweep context` varies it; choose by --only, such as K250")
     plan = Plan(root=root and str(root), suite=suite, train=training, **options)
@@ -456,6 +462,18 @@ def control(out: Path) -> None:
     click.echo(table(checks))
     if not all(check.passed for check in checks):
         sys.exit(1)
+
+
+@cli.command()
+@click.option("--out", type=Folder(), metavar="FOLDER", default="build/demo", help="Write all of it here.")
+def demo(out: Path) -> None:
+    """Go the whole way on the bundled release.
+
+    Loads, samples and verifies it, trains a small AD model, evaluates it, and writes a report of one page.
+    """
+    from baselines.demo import run_demo
+
+    run_demo(out, console)
 
 
 def main() -> None:

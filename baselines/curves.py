@@ -21,7 +21,7 @@ def plot_run(metrics: Path, path: Path, title: str) -> None:
     parts = list(dict.fromkeys(line["part"] for line in lines))
     columns = min(3, len(names))
     figure = Figure(figsize=(4.6 * columns, 3.1 * -(-len(names) // columns)), layout="constrained")
-    panels: Any = figure.subplots(-(-len(names) // columns), columns, squeeze=False).flat
+    panels: list[Any] = [*figure.subplots(-(-len(names) // columns), columns, squeeze=False).flat]
     for axes, name in zip(panels, names, strict=False):
         for part in parts:
             points = [(line["step"], line[name]) for line in lines if line["part"] == part and name in line]
@@ -30,7 +30,7 @@ def plot_run(metrics: Path, path: Path, title: str) -> None:
         axes.set_title(name.replace("_", " "), fontsize=9)
         axes.set_xlabel("training step", fontsize=8)
         axes.grid(alpha=0.3)
-    for axes in list(panels)[len(names) :]:
+    for axes in panels[len(names) :]:
         axes.set_axis_off()
     figure.suptitle(title, fontsize=10)
     handles, labels = figure.axes[0].get_legend_handles_labels()

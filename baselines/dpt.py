@@ -143,4 +143,4 @@ def dpt(options: ModelOptions, world: World, whole_episodes: bool = True) -> Met
 
     two, none = jnp.zeros((1, 2, *world.obs_shape)), jnp.zeros((1, 2), jnp.int32)
     example = (Transition(two, none, jnp.zeros((1, 2)), two, none), two[:, 0])
-    return Method("dpt", "dpt", model, example, loss, lambda logits: logits)
+    return Method("dpt", "DPT", "dpt", model, example, loss, lambda logits: logits)

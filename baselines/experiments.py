@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from baselines.agents import Acting, find_agent
 from baselines.evaluate import evaluate, get_protocol
-from baselines.histories import LABELS, HistoryOptions, prepare
+from baselines.histories import HistoryOptions, prepare
 from baselines.method import SIZES, ModelOptions
 from baselines.methods import get_method
 from baselines.page import write_page_with_films
@@ -94,7 +94,7 @@ class Plan:
 
     methods: tuple[str, ...] = ("ad", "dpt")
     layouts: tuple[str, ...] = ()  # to train on; those of the experiment that the release has
-    root: str | None = None  # a release; the bundled mini release by default
+    root: str | None = None  # a release, its folder or address; the bundled mini release by default
     suite: Path | None = None  # learned teammates; for "heldout-rl"
     train: dict[str, Any] = field(default_factory=dict)  # of `TrainOptions` for all entries: steps, batch_size, ..
     model: dict[str, Any] = field(default_factory=dict)  # of `ModelOptions` for all entries
@@ -250,7 +250,7 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
 def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, progress: Progress) -> None:
     options = TrainOptions(**{**entry.train, **plan.train})
     job = prepare(method, ModelOptions(**{**entry.model, **plan.model}), options, HistoryOptions((layout,), plan.root))
-    what = f"{LABELS[method]} {entry.name} on {layout}: training"
+    what = f"{job.method.label} {entry.name} on {layout}: training"
     progress(what, 0, options.steps)
     train(
         job.method,

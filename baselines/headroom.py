@@ -6,15 +6,18 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.progress import Progress
 
 from baselines.agents import get_agent
 from baselines.evaluate import evaluate, get_protocol
-from baselines.report import LAYOUTS, Run, as_run
+from baselines.report import LAYOUTS, Run, as_run, published_cells
 from icrl4aht_data.benchmark import TRACKS
-from icrl4aht_data.cards import card_file
-from icrl4aht_data.headroom import REFERENCES, headroom_table
+from icrl4aht_data.cards import card_file, markdown_table
+from icrl4aht_data.headroom import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.tasks import manifest_path, read_tasks
+
+_PAPER = ("random", "AD", "DPT")
 
 
 def measure(out: Path, protocols: Sequence[str], bars: Progress) -> list[Run]:
@@ -62,4 +65,24 @@ def _markdown(table: dict[str, dict[str, dict[str, dict[str, float]]]]) -> str:
         names = [layout for layout in LAYOUTS if layout in layouts]
         cells = {(layout, family): cell for layout in names for family, cell in layouts[layout].items()}
         lines += ["", f"## Protocol `{protocol}`", "", headroom_table(cells, names)]
+    if "published" in table:
+        lines += ["", "## The paper's methods beside the reference egos", "", published_table(table["published"])]
     return "\n".join(lines) + "\n"
+
+
+def published_table(layouts: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Markdown: a row a layout, mean returns over its families under protocol `published`, the paper's numbers beside.
+
+    Args:
+        layouts: layout -> family -> reference ego -> mean return.
+    """
+    rows = []
+    for layout in (name for name in LAYOUTS if name in layouts):
+        cells = layouts[layout]
+        ours = {agent: np.mean([cell[agent] for cell in cells.values()]) for agent in REFERENCES}
+        paper = {name: np.mean([published_cells(name)[layout][family][0] for family in cells]) for name in _PAPER}
+        open_cells = sum(map(has_headroom, cells.values()))
+        numbers = [ours["stay"], ours["random"], *paper.values(), ours["oracle"]]
+        rows.append([layout, *(f"{number:z.1f}" for number in numbers), f"{open_cells} of {len(cells)}"])
+    names = ["stay", "random", *(f"{name} (paper)" for name in _PAPER), "oracle", "cells with headroom"]
+    return markdown_table(["layout", *names], rows)

@@ -15,12 +15,13 @@ from baselines.method import Method, ModelOptions
 from baselines.methods import get_method, kitchen
 from baselines.runs import Checkpoints, read_config
 from baselines.trainer import Data, TrainOptions
-from icrl4aht_data.dataset import MINI, Dataset, Obs, load_icrl4aht
+from icrl4aht_data.dataset import Dataset, Obs, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import json_hash
+from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.remote import is_address
 from icrl4aht_data.sampling import ContextOrder
+from icrl4aht_data.schema import MANIFEST
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class HistoryOptions:
     """Which histories a run is trained on."""
 
     layouts: tuple[str, ...]  # with observations of one shape
-    root: str | None = None  # a release; the bundled mini release by default
+    root: str | None = None  # a release, its folder or address; the bundled mini release by default
     split: str = "train"
     order: ContextOrder = "contiguous"  # of DPT's contexts
     held_out: float = 0.1  # share of the tasks, and of the histories of every other task
@@ -65,7 +66,8 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         "model": asdict(model),
         "histories": asdict(histories)
         | {
-            "root": histories.root if is_address(histories.root) else str(Path(histories.root or MINI).resolve()),
+            "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
+            "manifest_sha256": file_hash(dataset.root / MANIFEST),
             "layouts": [layout.name for layout in dataset.layouts],
             "obs": dataset.obs,
             "obs_shape": list(dataset.layouts[0].obs_shape),
@@ -150,10 +152,6 @@ def _rank(seed: int, *name: object) -> bytes:
     return hashlib.blake2b(repr((seed, *name)).encode(), digest_size=8).digest()
 
 
-LABELS = {"ad": "AD", "dpt": "DPT", "hybrid_ad": "Hybrid-AD", "amago_offline": "AMAGO-Offline"}
-"""Method -> its name in the paper's tables."""
-
-
 class Run(NamedTuple):
     """A trained model."""
 
@@ -192,6 +190,6 @@ def read_run(folder: Path) -> Run:
         found = checkpoints.restore(jax.eval_shape(method.init, jax.random.key(0)))
     finally:
         checkpoints.close()
-    label = LABELS[method.name] + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
+    label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
     return Run(method, found.params, found.step, context, names, layouts[0].obs_shape, label, json_hash(config))

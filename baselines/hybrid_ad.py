@@ -56,5 +56,5 @@ def _trunk(options: ModelOptions) -> Recurrent:
     return Recurrent(options.recurrent_layers, options.width, options.dropout)
 
 
-hybrid_ad = action_method("hybrid_ad", _trunk)
+hybrid_ad = action_method("hybrid_ad", "Hybrid-AD", _trunk)
 """913,310 parameters at C = 40."""

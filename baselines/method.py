@@ -91,6 +91,7 @@ class Method:
     """One way to learn from histories; made by a function of (options, world)."""
 
     name: str
+    label: str  # in tables
     data: Literal["ad", "dpt"]  # which sampler's batches it takes
     model: nn.Module
     example: tuple  # arguments that the model's parameters are made for

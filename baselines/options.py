@@ -22,14 +22,20 @@ class Agent(Names):
     """An ego's name, or the folder of a run."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        if value in self.valid():
-            return value
-        if not value or not Path(value).is_dir():
-            others = "A trained model is named by its folder, which `python -m baselines train` makes."
-            self.fail(f"{unknown(self.name, value, self.valid())} {others}", param, ctx)
-        if not (Path(value) / "config.json").is_file():
-            self.fail(f"{value}: not a run: no config.json in it; `python -m baselines train` makes one", param, ctx)
         return value
+
+
+def agent_of(option: str, value: str, acting: Any = "cached") -> Any:
+    """The ego that an option names."""
+    from baselines.agents import AGENTS, find_agent
+    from baselines.runs import CONFIG
+
+    if value not in AGENTS and not Path(value).is_dir():
+        folder = "A trained model is named by its folder, which `python -m baselines train` makes."
+        raise click.UsageError(f"{option}: {unknown('agent', value, AGENTS)} {folder}")
+    if value not in AGENTS and not (Path(value) / CONFIG).is_file():
+        raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `python -m baselines train` makes one")
+    return find_agent(value, acting)
 
 
 class HostPort(click.ParamType):
@@ -69,7 +75,7 @@ STEPS: dict[str, Any] = {"type": COUNT, "help": "Training steps."}
 CONTEXT: dict[str, Any] = {"type": COUNT, "help": "K: steps of a window, or transitions of a context."}
 
 batch_size_option = click.option(
-    "--batch-size", type=COUNT, help="Windows, or contexts.", show_default="1024 as in the paper, or 32 on a CPU"
+    "--batch-size", type=COUNT, help="Windows, or contexts.", show_default="1024 as in the paper, or 8 on a CPU"
 )
 
 

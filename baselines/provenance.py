@@ -10,8 +10,6 @@ from baselines.report import ABOUT, TASKS
 from baselines.runs import read_config
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of, json_hash, write_json
-from icrl4aht_data.manifest import file_hash
-from icrl4aht_data.schema import MANIFEST
 from icrl4aht_data.tasks import Task, read_tasks, write_tasks
 
 
@@ -42,11 +40,10 @@ def note_run(run: Path, results: Path) -> None:
     config = read_config(run)
     if "histories" not in config:
         raise OptionError(f"{run}: its config.json has no `histories`: expected a run on learning histories")
-    manifest = Path(config["histories"]["root"]) / MANIFEST
     content: dict[str, Any] = {
         "run": str(run.resolve()),
         "run_hash": json_hash(config),
-        "manifest_sha256": file_hash(manifest) if manifest.is_file() else None,
+        "manifest_sha256": config["histories"]["manifest_sha256"],
         "config": config,
     }
     with file_in_place_of(results / ABOUT) as partial:

@@ -35,7 +35,7 @@ _profile = click.option(
 )
 
 _SECTIONS = {
-    "Rebuild": ("demo", "plan", "generate", "check"),
+    "Rebuild": ("plan", "generate", "check"),
     "Learned teammates": ("teammates", "diversity"),
     "Maintain": ("speed", "manifests"),
 }
@@ -148,8 +148,8 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 
 
 @cli.command(epilog=examples("python -m generation check build/smoke build/again"))
-@click.argument("a", type=Folder("`python -m generation generate`"))
-@click.argument("b", type=Folder("`python -m generation generate`"))
+@click.argument("a", type=Folder())
+@click.argument("b", type=Folder())
 @json_option
 def check(a: Path, b: Path, as_json: bool) -> None:
     """Compare two rebuilds bit for bit.
@@ -257,7 +257,7 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
 @_algorithms
 @click.option(
     "--suite",
-    type=Folder("`python -m generation teammates`"),
+    type=Folder(),
     metavar="FOLDER",
     default="build/suite",
     help="What `teammates` has made.",
@@ -272,16 +272,6 @@ def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path
     from generation.build_suite import report_diversity
 
     report_diversity(suite, layouts, algorithms, greedy, console)
-
-
-@cli.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("build/demo"), show_default=True)
-@_profile
-def demo(out: Path, profile_name: str) -> None:
-    """From nothing to a verified dataset: generate, verify, load, sample, draw."""
-    from generation.demo import run_demo
-
-    run_demo(out, profile_name, console)
 
 
 def main() -> None:

@@ -30,6 +30,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import KINDS, TASKS, Kind
 from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.threads import usable_cores
 
 _WORTH_MEASURING = 20.0
 """Seconds: a whole update that should take less is measured itself, not only a share of it."""
@@ -120,7 +121,7 @@ def cost(profile: Profile, devices: int) -> Cost:
         kept_transitions=kept,
         artefact_bytes=count * artefact_bytes(profile.layouts, ego),
         **{f"{kind}_bytes": round(kept * bytes_per_transition(kind)) for kind in KINDS},
-        device=f"{device.device_kind} ({device.platform})",
+        device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
         teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
         steps_per_second=round(learning.steps_per_second, 1),
         compile_seconds=round(learning.compile_seconds, 1),

@@ -402,7 +402,7 @@ def release() -> None:
 
 
 @release.command()
-@click.argument("source", nargs=-1, type=Folder("`icrl4aht-data download`"), metavar="[SOURCE]")
+@click.argument("source", nargs=-1, type=Folder(), metavar="[SOURCE]")
 @click.argument("out", type=Folder())
 @click.option("--link", is_flag=True, help="Hard links instead of copies: no space, but both change if one is changed.")
 @quiet_option
@@ -431,7 +431,7 @@ def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json:
 
 
 @cli.command(epilog=examples("icrl4aht-data upload build/release hf://datasets/you/icrl4aht --dry-run"))
-@click.argument("folder", type=Folder("`icrl4aht-data release build`"))
+@click.argument("folder", type=Folder())
 @click.argument("address", type=Root(remote=True))
 @click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done; change nothing.")

@@ -69,7 +69,7 @@ def load_icrl4aht(
         root: a release folder, or an address: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://..., any other
             that fsspec opens; the bundled mini release by default. Of a remote release the index comes here at once,
             all else when it is read.
-        split: "train" or "test".
+        split: "train", "test" or "heldout".
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple); or several.
         track: "teammate" or "layout".
         teammate_family: "rl" or "H1".."H4".

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from servers import http_server
 from test_models import drawn
 
 from baselines.agents import find_agent
@@ -23,6 +24,7 @@ from baselines.runs import Checkpoints, open_run, versions
 from baselines.trainer import TrainOptions
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.manifest import file_hash
 
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2, steps=10)
 WIDE = [task for task in published_tasks("teammate") if (task.layout.name, task.teammate_family) == ("demo_wide", "H4")]
@@ -113,16 +115,25 @@ class TestBadRuns:
 
 
 def test_the_train_command(lite, tmp_path, monkeypatch):
+    """From an address, as from a folder."""
     monkeypatch.setitem(SIZES, "small", (1, 16, 5))
-    arguments = ["train", "ad", "--layout", "demo_wide", "--root", str(lite[0]), "--out", str(tmp_path / "run")]
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]
-    result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert "1 steps in" in result.output
+    with http_server(lite[0]) as server:
+        arguments = ["train", "ad", "--layout", "demo_wide", "--root", server.url, "--out", str(tmp_path / "run")]
+        result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        assert "1 steps in" in result.output
+        again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
     assert config["histories"]["data_version"] == "0.0.1"
-    again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
+    assert config["histories"]["root"] == server.url
+    assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")
     assert "model.teammate_actions: the run has False, asked for True" in str(again.exception)
     wrong = CliRunner().invoke(cli, [*arguments, "--size", "smal"])
-    assert "unknown size 'smal'" in str(wrong.exception)
+    assert wrong.exit_code == 2
+    assert "unknown size 'smal'" in wrong.output
+    alone = CliRunner().invoke(cli, [*arguments, *small, "--processes", "2"])
+    assert alone.exit_code == 2
+    assert "expected a --coordinator HOST:PORT as well" in alone.output.replace("\n", " ")

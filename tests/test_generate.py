@@ -1,4 +1,4 @@
-"""The whole rebuild at its smallest: collect, resume, pack, verify, sample; the demo; the learner's speed."""
+"""The whole rebuild at its smallest: collect, resume, pack, verify, sample; the learner's speed."""
 
 from __future__ import annotations
 
@@ -129,21 +129,6 @@ def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
     with pytest.raises(OptionError, match="is not a release"):
         build.build_releases(str(built / "tiny.toml"), tmp_path, ["lite"], Console(file=StringIO()))
     assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
-
-
-def test_demo_draws_and_measures(built):
-    out = built / "a"  # its task is finished, so the demo goes straight on
-    result = CliRunner().invoke(cli, ["demo", "--profile", str(built / "tiny.toml"), "--out", str(out)])
-    assert result.exit_code == 0, result.output
-    for expected in ("6/6", "whole:", "target_actions", "context_next_obs", "done in"):
-        assert expected in result.output
-    assert (out / "learning_curves.png").stat().st_size > 5_000
-    assert (out / "episode.gif").read_bytes()[:6] == b"GIF89a"
-    (line,) = [line for line in result.output.splitlines() if line.startswith("{")]
-    measured = json.loads(line)
-    shares = [measured[f"{name}_share"] for name in ("environment", "forward", "update")]
-    assert sum(shares) == pytest.approx(1, abs=1e-3)
-    assert measured["steps_per_second"] > 0
 
 
 def test_nothing_but_lines_where_output_is_no_terminal(built):

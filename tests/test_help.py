@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from test_readme import ROOT, understand
 
 from baselines.cli import cli as baselines_cli
 from generation.cli import cli as generation_cli
@@ -102,19 +103,9 @@ def examples() -> list[str]:
 
 
 @pytest.mark.parametrize("line", examples())
-def test_examples_are_understood(line, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for folder in ("runs/ad", "runs/ad-results", "build/smoke", "build/again", "build/release"):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "runs" / "ad" / "config.json").touch()
+def test_examples_are_understood(line):
     program = next(name for name in PROGRAMS if line.startswith(name))
-    group, words = PROGRAMS[program], shlex.split(line)[len(program.split()) :]
-    while isinstance(group, click.Group):
-        context = group.make_context("x", words, resilient_parsing=True)
-        _, command, words = group.resolve_command(context, words)
-        assert command is not None
-        group = command
-    group.make_context("x", words)
+    understand(PROGRAMS[program], shlex.split(line)[len(program.split()) :])
 
 
 def completed(*words: str) -> list[str]:
@@ -126,7 +117,7 @@ def completed(*words: str) -> list[str]:
 
 def script(environment: dict[str, str]) -> str:
     path = Path(sys.executable).with_name("icrl4aht-data")
-    of_here = {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    of_here = {"PYTHONPATH": str(ROOT)}
     done = subprocess.run([path], env=os.environ | of_here | environment, capture_output=True, text=True, check=True)
     return done.stdout
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import re
 import shlex
 from pathlib import Path
@@ -12,7 +14,9 @@ from click.testing import CliRunner
 from servers import hub_server, uploads
 
 from baselines.cli import cli as baselines_cli
+from baselines.headroom import published_table
 from generation.cli import cli as generation_cli
+from icrl4aht_data.cards import card_file
 from icrl4aht_data.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.info import read_info
@@ -21,13 +25,13 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+def blocks(language: str, page: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
 
 
-def commands(start: str) -> list[list[str]]:
+def commands(start: str, page: str = README) -> list[list[str]]:
     """The arguments of every shell line that starts so."""
-    lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(start)]
+    lines = [line for block in blocks("sh", page) for line in block.splitlines() if line.startswith(start)]
     return [shlex.split(line, comments=True)[len(start.split()) :] for line in lines]
 
 
@@ -108,7 +112,24 @@ def test_snippets_were_found():
 
 
 def test_files_that_the_map_names_exist():
-    for cell in re.findall(r"^\| `(.*?)` \|", README, flags=re.MULTILINE):
+    (table,) = re.findall(r"## Map\n(.*?)\n## ", README, flags=re.DOTALL)
+    for cell in re.findall(r"^\| `(.*?)` \|", table, flags=re.MULTILINE):
         stem, names, end = re.fullmatch(r"([^{]*)(?:\{(.*)\}(.*))?", cell).groups()  # type: ignore[union-attr]
         for name in names.split(",") if names else [""]:
             assert (ROOT / f"{stem}{name}{end or ''}").exists(), cell
+
+
+def test_the_table_of_published_numbers_is_what_the_command_writes():
+    table = published_table(json.loads(card_file("headroom.json").read_text())["published"])
+    assert table in README
+    assert table in card_file("headroom.md").read_text()
+
+
+def test_the_public_interface_exists():
+    (table,) = re.findall(r"## Public interface\n(.*?)\n## ", README, flags=re.DOTALL)
+    for cell in re.findall(r"^\| (.*?) \|", table, flags=re.MULTILINE)[2:]:
+        for module, names in re.findall(r"`([\w.]+)`: ((?:`[\w.]+`(?:, )?)+)", cell):
+            for name in re.findall(r"`([\w.]+)`", names):
+                if name != "__all__":
+                    path, _, attribute = f"{module}.{name}".rpartition(".")
+                    assert hasattr(importlib.import_module(path), attribute), (module, name)
