@@ -31,7 +31,7 @@ from icrl4aht_data.info import read_info
 from icrl4aht_data.manifest import file_hash, read_manifest, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.release import CARD, folder_in_place_of
-from icrl4aht_data.schema import INFO, TEAMMATES
+from icrl4aht_data.schema import INFO, MANIFEST, TEAMMATES
 from icrl4aht_data.verify import Advance, verify_release
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
@@ -95,7 +95,7 @@ def check_whole(root: Path, advance: Advance = lambda what, done, total: None) -
     Raises:
         ReleaseError: if anything is wrong; names the first problems.
     """
-    if not (root / INFO).exists():
+    if not (root / INFO).exists() and not (root / MANIFEST).exists():
         read_info(root)  # says what to give instead
     report = verify_release(root, advance=advance)
     if not report.ok:
