@@ -196,4 +196,7 @@ def test_impossible_plans(release, tmp_path):
     fails(OptionError, "tasks = 0: expected at least 1", tasks=0)
     result = CliRunner().invoke(cli, ["sweep", "context", "--context", "9"])
     assert "`sweep context` varies it; choose by --only" in str(result.exception)
-    assert "unknown experiment 'sweep sizes'" in str(CliRunner().invoke(cli, ["sweep", "sizes"]).exception)
+    assert (
+        "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'"
+        in CliRunner().invoke(cli, ["sweep", "sizes"]).output
+    )
