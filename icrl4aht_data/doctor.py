@@ -44,6 +44,9 @@ _LEAST_FREE = 2**30
 _HUB_VARIABLES = ("HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "HF_HOME", "XDG_CACHE_HOME")
 """Environment variables by which the Hub's client chooses its cache."""
 
+_OF_CHECKOUT = ("generation", "baselines")
+"""Packages of the project that no wheel has."""
+
 _ASK_JAX = "import json, jax; print(json.dumps([jax.default_backend(), [d.device_kind for d in jax.local_devices()]]))"
 _JAX_TIMEOUT = 120  # seconds
 
@@ -93,6 +96,7 @@ def diagnose() -> Diagnosis:
 def _look_at_versions(found: Diagnosis) -> None:
     python, hdf5 = platform.python_version(), h5py.version.hdf5_version
     found.versions = {"python": python, "numpy": np.__version__, "h5py": h5py.version.version, "hdf5": hdf5}
+    found.versions["checkout"] = all(importlib.util.find_spec(name) for name in _OF_CHECKOUT)
     if h5py.version.hdf5_version_tuple < OLDEST_HDF5:
         oldest = ".".join(map(str, OLDEST_HDF5))
         found.wrong(f"HDF5 {hdf5}: expected {oldest} or newer", "pip install -U --force-reinstall h5py")
@@ -241,10 +245,12 @@ Rows = Iterator[tuple[str, str]]
 
 
 def _tell_versions(found: Diagnosis) -> Rows:
-    told = {name: text for name, text in found.versions.items() if name not in ("package", "folder")}
     if "package" in found.versions:
         yield PACKAGE, f"{found.versions['package']} in {found.versions['folder']}"
-    yield from told.items()
+    if not found.versions["checkout"]:
+        yield ", ".join(_OF_CHECKOUT), "not here: they run from a checkout of the project"
+    for name in ("python", "numpy", "h5py", "hdf5"):
+        yield name, found.versions[name]
     release = found.bundled
     if "data_version" in release:
         what = f"data version {release['data_version']}, {release['kind']}, format {release['format_version']}"

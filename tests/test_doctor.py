@@ -200,6 +200,7 @@ def test_without_jax(elsewhere, monkeypatch):
     code, text = ask()
     assert code == 0
     assert "JAX" not in text
+    assert "generation, baselines  not here: they run from a checkout" in text
 
 
 def test_a_gpu_that_jax_does_not_see(elsewhere, monkeypatch):
