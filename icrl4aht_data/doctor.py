@@ -170,7 +170,6 @@ def _look_at_folders(found: Diagnosis) -> None:
 def _folder(found: Diagnosis, name: str, path: Path, variables: tuple[str, ...]) -> dict[str, Any]:
     """What is true of a folder, whether it exists already or will be made."""
     source = next((variable for variable in variables if os.environ.get(variable)), None)
-    remedy = f"set {variables[0]} to a folder on another disk"
     free, fault = None, None
     try:
         above = next(folder for folder in (path, *path.parents) if folder.exists())
@@ -179,10 +178,13 @@ def _folder(found: Diagnosis, name: str, path: Path, variables: tuple[str, ...])
             pass
     except OSError as error:
         fault = error.strerror or str(error)
-        found.wrong(f"{path}: the {name} folder cannot be written: {fault}", f"{remedy}, or make it writable")
+        found.wrong(
+            f"{path}: the {name} folder cannot be written: {fault}",
+            f"set {variables[0]} to another folder, or make it writable",
+        )
     if free is not None and free < _LEAST_FREE:
         problem = f"{path}: the disk of the {name} folder is nearly full: {free:,} bytes are free"
-        found.wrong(problem, f"{remedy}, or free some space")
+        found.wrong(problem, f"set {variables[0]} to a folder on another disk, or free some space")
     return {
         "path": str(path),
         "set_by": source,

@@ -114,7 +114,7 @@ def test_folders_that_cannot_be_written(elsewhere, monkeypatch):
     (elsewhere / "cache").write_text("a file")
     found = problems()
     assert found[f"{elsewhere / 'cache'}: the cache folder cannot be written: Not a directory"] == (
-        "set ICRL4AHT_CACHE_DIR to a folder on another disk, or make it writable"
+        "set ICRL4AHT_CACHE_DIR to another folder, or make it writable"
     )
 
     def refuse(dir: Path) -> None:
