@@ -5,6 +5,7 @@ OUT ?= build/$(PROFILE)
 ROOT ?=
 PEER ?=
 OPTIONS ?=
+WORKERS ?= 2
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -40,8 +41,8 @@ verify: install ## verify a release, every byte and the physics: ROOT=folder (de
 control: install ## show that the models adapt in context where that is possible (about 10 minutes)
 	$(BIN)/python -m baselines control
 
-test: check ## lint, types and all tests
-	$(BIN)/python -m pytest
+test: check ## lint, types and all tests: WORKERS=2 (3 GB each)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 check: install ## lint, formatting and types
 	$(BIN)/ruff check $(CODE)

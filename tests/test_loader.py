@@ -97,7 +97,8 @@ class TestHolding:
         assert {path.name: path.stat().st_mtime_ns for path in made.iterdir()} == stamps
 
     @pytest.mark.parametrize("cache", CACHES)
-    def test_damage_is_named_not_sampled(self, damaged, cache):
+    def test_damage_is_named_not_sampled(self, damaged, cache, tmp_path, monkeypatch):
+        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))  # without what the whole release left
         shard = "data/teammate/coord_simple/train-00000-of-00001.h5"
         data = bytearray((damaged / shard).read_bytes())
         data[int(np.load(chunk_table_path(damaged, shard))["offset"][0])] ^= 1
