@@ -87,7 +87,8 @@ def evaluate(
 )
 @click.option("--html", type=click.Path(path_type=Path, dir_okay=False), help="Also one self-contained page.")
 @click.option("--episodes/--no-episodes", default=True, show_default=True, help="A GIF per family on the page.")
-def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, episodes: bool) -> None:
+@click.option("--suite", type=click.Path(path_type=Path, exists=True), help="Of learned teammates, for their GIFs.")
+def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, episodes: bool, suite: Path | None) -> None:
     """The paper's tables with the published numbers beside ours, as Markdown, CSV and curves, and as one page.
 
     Results of one agent on different layouts are put together.
@@ -99,7 +100,7 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, episodes
     if html:
         from baselines.page import write_page_with_films
 
-        paths.append(write_page_with_films(loaded, html, episodes=episodes))
+        paths.append(write_page_with_films(loaded, html, episodes=episodes, suite=suite))
     click.echo(markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")
