@@ -284,6 +284,13 @@ def ablate(what: str, **options: Any) -> None:
     _experiment(f"ablate {what}", **options)
 
 
+@cli.command()
+@_experiment_options
+def tracks(**options: Any) -> None:
+    """Train, evaluate and report on both tracks (the paper's Tables 1 and 2; with other methods 4 and 5)."""
+    _experiment("tracks", **options)
+
+
 @cli.command("heldout-rl")
 @click.option("--suite", type=click.Path(path_type=Path), default=Path("build/suite"), show_default=True)
 @_experiment_options
