@@ -194,6 +194,7 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
 @click.option("--obs", help="state, uint8 or float32: what batches hold; state records where there are any.")
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.option("--save-every", type=int, default=1000, show_default=True, help="Steps between checkpoints.")
+@click.option("--tensorboard", is_flag=True, help="Also log for TensorBoard, into OUT/tensorboard.")
 @click.option("--coordinator", help="HOST:PORT of process 0, to train on several machines.")
 @click.option("--processes", type=int, default=1, show_default=True)
 @click.option("--process", type=int, default=0, show_default=True, help="Which one this is.")
@@ -231,7 +232,8 @@ def train(method: str, layouts: tuple[str, ...], root: str | None, out: Path | N
         def done(step: int, loss: float) -> None:
             bars.update(bar, completed=step, description=f"{method}, loss {loss:.3f}")
 
-        run_training(job.method, job.data, job.options, folder, job.about, done=done)
+        log = options["tensorboard"]
+        run_training(job.method, job.data, job.options, folder, job.about, tensorboard=log, done=done)
     console.print(
         f"{training.steps} steps in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
@@ -261,6 +263,7 @@ def _experiment_options(command: Any) -> Any:
         click.option("--protocol", default="seeded", show_default=True, help=f"One of {', '.join(PROTOCOLS)}."),
         click.option("--acting", default="cached", show_default=True, help="cached, or exact and slower."),
         click.option("--films/--no-films", default=True, show_default=True, help="A GIF per family on the page."),
+        click.option("--tensorboard", is_flag=True, help="Also log training for TensorBoard, in every run's folder."),
         click.option("--out", type=click.Path(path_type=Path), help="runs/EXPERIMENT by default."),
     ]
     for option in reversed(options):

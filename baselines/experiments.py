@@ -108,6 +108,7 @@ class Plan:
     protocol: str = "seeded"
     acting: Acting = "cached"
     films: bool = True  # whether the page shows an episode per family
+    tensorboard: bool = False  # whether training is also logged for TensorBoard
 
 
 class Done(NamedTuple):
@@ -273,6 +274,7 @@ def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, pro
         options,
         folder,
         job.about,
+        tensorboard=plan.tensorboard,
         done=lambda step, loss: progress(what, step, options.steps),
     )
     progress(what, options.steps, options.steps)

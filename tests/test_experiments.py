@@ -111,7 +111,13 @@ def asked(release, tmp_path_factory) -> Path:
     """DPT, with all that it can be given."""
     out = tmp_path_factory.mktemp("asked")
     plan = dataclasses.replace(
-        SMALL, root=str(release), methods=("dpt",), layouts=("demo_wide",), values=("ta-next_obs",), films=True
+        SMALL,
+        root=str(release),
+        methods=("dpt",),
+        layouts=("demo_wide",),
+        values=("ta-next_obs",),
+        films=True,
+        tensorboard=True,
     )
     run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), out)
     return out
@@ -121,6 +127,7 @@ def test_dpt_is_trained_evaluated_and_reported(asked):
     where = asked / "dpt-ta-next_obs" / "demo_wide"
     losses = [json.loads(line) for line in (where / "run" / "metrics.jsonl").read_text().splitlines()]
     assert {"prior_accuracy", "next_obs_loss"} <= losses[-1].keys()
+    assert list((where / "run" / "tensorboard" / "train").iterdir())
     lines = (asked / "report" / "report.csv").read_text().splitlines()
     assert [line.split(",")[:6] for line in lines[1:]] == [["DPT+TA+next_obs", "seeded", "demo_wide", "H4", "1", "2"]]
 
