@@ -26,6 +26,8 @@ from baselines.options import (
     protocol_option,
     root_option,
     seeds_option,
+    suite_option,
+    tensorboard_option,
     variants,
 )
 from icrl4aht_data.benchmark import HEURISTIC_KINDS, TRACKS
@@ -55,7 +57,7 @@ console = Console(soft_wrap=True)
 
 _SECTIONS = {
     "Train and evaluate": ("demo", "train", "evaluate", "report", "watch"),
-    "The paper's experiments": ("sweep", "ablate", "heldout-rl"),
+    "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
     "Check": ("control", "drift", "headroom"),
 }
 
@@ -98,9 +100,7 @@ def cli() -> None:
     metavar="FILE",
     help="The tasks of this file instead of the tracks'.",
 )
-@click.option(
-    "--suite", type=Folder("`python -m generation teammates`"), metavar="FOLDER", help="Where learned teammates are."
-)
+@suite_option
 @seeds_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
 def evaluate(
@@ -160,7 +160,8 @@ def evaluate(
     "--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Also one self-contained page."
 )
 @films_option
-def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: bool) -> None:
+@suite_option
+def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: bool, suite: Path | None) -> None:
     """Put results beside the paper's.
 
     RESULTS are folders that `evaluate` has made. Prints the paper's tables with its numbers beside ours, and writes
@@ -173,7 +174,7 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: b
     if html:
         from baselines.page import write_page_with_films
 
-        paths.append(write_page_with_films(loaded, html, episodes=films))
+        paths.append(write_page_with_films(loaded, html, episodes=films, suite=suite))
     click.echo(markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")
@@ -317,6 +318,7 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
 )
 @click.option("--seed", type=SEED, default=0, help="Of parameters, batches and dropout.")
 @click.option("--save-every", type=COUNT, default=1000, help="Steps between checkpoints.")
+@tensorboard_option
 @click.option("--coordinator", type=HostPort(), help="Of process 0, to train on several machines.")
 @click.option("--processes", type=COUNT, default=1, help="With --coordinator: how many there are.")
 @click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: which one this is.")
@@ -359,7 +361,8 @@ def train(method: str, layouts: tuple[str, ...], root: Any, out: Path | None, **
         def done(step: int, loss: float) -> None:
             bars.update(bar, completed=step, description=f"{method}, loss {loss:.3f}")
 
-        run_training(job.method, job.data, job.options, folder, job.about, done=done)
+        log = options["tensorboard"]
+        run_training(job.method, job.data, job.options, folder, job.about, tensorboard=log, done=done)
     console.print(
         f"{training.steps} steps in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
@@ -397,6 +400,16 @@ def ablate(what: str, **options: Any) -> None:
     WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
     """
     _experiment(f"ablate {what}", **options)
+
+
+@cli.command()
+@experiment_options
+def tracks(**options: Any) -> None:
+    """Train and evaluate on both tracks.
+
+    The paper's Tables 1 and 2; with other methods 4 and 5. Writes runs, results and OUT/report.
+    """
+    _experiment("tracks", **options)
 
 
 @cli.command("heldout-rl")

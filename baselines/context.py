@@ -148,16 +148,6 @@ class TransitionTokens(Tokens):
         return self.drop(self.project(jnp.concatenate(parts, -1, dtype=self.dtype)), deterministic=deterministic)
 
 
-def query_mask(context: int, seen: Int[Array, " Q"]) -> Bool[Array, "1 1 N N"]:
-    """What each token sees of [c_1 .. c_K, q_1 .. q_Q]: a transition those up to itself, a query the first `seen`
-    transitions and itself. N = K + Q."""
-    own, of_context = jnp.arange(context + len(seen)), jnp.arange(context)
-    last = jnp.concatenate([of_context + 1, seen])
-    to_context = of_context < last[:, None]
-    to_queries = jnp.broadcast_to(own[context:] == own[:, None], (len(own), len(seen)))
-    return jnp.concatenate([to_context, to_queries], axis=1)[None, None]
-
-
 class Log(NamedTuple):
     """What an ego remembers when it acts, as a ring: entry i stands in slot i % slots."""
 

@@ -19,7 +19,6 @@ from baselines.context import (
     Transition,
     TransitionTokens,
     empty_log,
-    query_mask,
     transitions_of,
     visible_slots,
 )
@@ -61,29 +60,18 @@ class DPT(nn.Module):
 
     def __call__(self, context: Transition, query: Num[Array, "B ..."], deterministic: bool = True) -> DPTOutput:
         """A context (B, K) and a query (B,), answered after every part of the context."""
-        tokens = self.tokens.context(context, deterministic)
-        seen = jnp.arange(tokens.shape[1] + 1)
-        features, answers = self._features(tokens, self.tokens.query(query, deterministic), seen, deterministic)
+        tokens, asked = self.tokens.context(context, deterministic), self.tokens.query(query, deterministic)
+        length = tokens.shape[1]
+        queries = jnp.broadcast_to(asked[:, None], (len(tokens), length + 1, tokens.shape[-1]))
+        sequence = jnp.concatenate([tokens, queries], axis=1)
+        features = self.trunk(sequence, context=length, deterministic=deterministic)
+        features, answers = features[:, :length], features[:, length:]
         predicted = None
         if self.next_obs is not None:
             coming = self.tokens.encoder(context.obs[:, 1:])  # type: ignore[operator]
             known = jnp.concatenate([features[:, :-1], coming], axis=-1)
             predicted = self.next_obs(known, context.action[:, 1:])
         return DPTOutput(self.head(answers), predicted)
-
-    def _features(
-        self, tokens: Float[Array, "B K D"], query: Float[Array, "B D"], seen: Int[Array, " Q"], deterministic: bool
-    ) -> tuple[Float[Array, "B K D"], Float[Array, "B Q D"]]:
-        """Of the context, and of the query having seen so many of its transitions."""
-        length = tokens.shape[1]
-        queries = jnp.broadcast_to(query[:, None], (len(tokens), len(seen), query.shape[-1]))
-        features = self.trunk(
-            jnp.concatenate([tokens, queries], axis=1),
-            mask=query_mask(length, seen),
-            positions=jnp.concatenate([jnp.arange(length), seen]),
-            deterministic=deterministic,
-        )
-        return features[:, :length], features[:, length:]
 
     def start(self, context: int, cached: bool) -> Memory:
         """The memory of an ego before its first step: K transitions, and room for a running episode."""
@@ -110,8 +98,8 @@ class DPT(nn.Module):
         """The answer from all tokens of the context, anew."""
         log = Log(memory.held.add(token).tokens, written)  # type: ignore[union-attr]
         window, seen = log.last(len(log.tokens) - KEPT_STEPS, complete)
-        _, answers = self._features(window[None], query[None], seen[None], True)
-        return answers[0, 0], log
+        sequence = jnp.append(window, query[None], axis=0).at[seen].set(query)  # what is behind it does not count
+        return self.trunk(sequence[None])[0, seen], log
 
     def _recall(self, token: Array, query: Array, memory: Memory, written: Array, complete: Array) -> tuple:
         """The answer from what was kept of the context."""

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.agents import Acting, find_agent
 from baselines.evaluate import evaluate, get_protocol
-from baselines.histories import HistoryOptions, prepare
+from baselines.histories import HistoryOptions, Job, prepare
 from baselines.method import SIZES, ModelOptions
 from baselines.methods import get_method
 from baselines.page import write_page_with_films
@@ -28,7 +29,7 @@ from baselines.report import merge, read_run, write_report
 from baselines.trainer import TrainOptions, train
 from icrl4aht_data.benchmark import TRACKS, track_of, unknown
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.errors import EmptySelectionError, OptionError
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.schema import TASKS as RELEASE_TASKS
 from icrl4aht_data.tasks import Task, manifest_path, read_tasks
@@ -67,6 +68,7 @@ def _size(name: str) -> Entry:
 
 
 EXPERIMENTS = {
+    "tracks": Experiment("Teammate and layout generalization", (Entry("plain"),), tuple(TESTED_ON)),
     "sweep context": Experiment(
         "Context length",
         tuple(Entry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
@@ -106,6 +108,7 @@ class Plan:
     protocol: str = "seeded"
     acting: Acting = "cached"
     films: bool = True  # whether the page shows an episode per family
+    tensorboard: bool = False  # whether training is also logged for TensorBoard
 
 
 class Done(NamedTuple):
@@ -131,8 +134,9 @@ def run_experiment(name: str, plan: Plan, out: Path, progress: Progress = lambda
     Raises:
         UnknownNameError: for an experiment, method, entry or layout that does not exist.
         EmptySelectionError: if the release has histories of none of the layouts, or no task is left.
-        OptionError: if a folder holds a run of other settings; for "heldout-rl", if the suite has no held-out
-            teammates, or one of them was trained with.
+        LabelsMissingError: for DPT on histories without expert actions.
+        OptionError: if a context is longer than a history, or a folder holds a run of other settings; for
+            "heldout-rl", if the suite has no held-out teammates, or one of them was trained with.
     """
     if name not in EXPERIMENTS:
         raise unknown("experiment", name, EXPERIMENTS)
@@ -145,18 +149,20 @@ def run_experiment(name: str, plan: Plan, out: Path, progress: Progress = lambda
     entries = [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
     layouts, notes = _layouts(experiment, plan)
     tasks = {layout: _tasks(experiment, plan, layout) for layout in layouts}
+    models = list(product(plan.methods, entries, layouts))
+    for model in models:
+        _prepared(*model, plan)  # what cannot be trained on fails before any work
     results = []
-    for method in plan.methods:
-        for entry in entries:
-            for layout in layouts:
-                folder = out / f"{method}-{entry.name}" / layout
-                _train(method, entry, layout, plan, folder / "run", progress)
-                _evaluate(entry, tasks[layout], plan, folder, progress, own_tasks=experiment.held_out)
-                results.append(folder / "results")
+    for method, entry, layout in models:
+        folder = out / f"{method}-{entry.name}" / layout
+        _train(method, entry, layout, plan, folder / "run", progress)
+        _evaluate(entry, tasks[layout], plan, folder, progress, own_tasks=experiment.held_out)
+        results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
-    report.append(write_page_with_films(runs, out / "report" / "report.html", episodes=plan.films, notes=notes))
+    page = out / "report" / "report.html"
+    report.append(write_page_with_films(runs, page, episodes=plan.films, notes=notes, suite=plan.suite))
     return Done(report, notes)
 
 
@@ -247,9 +253,19 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
     return tasks
 
 
-def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, progress: Progress) -> None:
+def _prepared(method: str, entry: Entry, layout: str, plan: Plan) -> Job:
     options = TrainOptions(**{**entry.train, **plan.train})
-    job = prepare(method, ModelOptions(**{**entry.model, **plan.model}), options, HistoryOptions((layout,), plan.root))
+    model = ModelOptions(**{**entry.model, **plan.model})
+    try:
+        return prepare(method, model, options, HistoryOptions((layout,), plan.root))
+    except (LabelsMissingError, OptionError) as error:
+        told = f"{method} {entry.name} on {layout}: {error}; or leave it out, by --method, --only and --layout"
+        raise type(error)(told) from error
+
+
+def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, progress: Progress) -> None:
+    job = _prepared(method, entry, layout, plan)
+    options = job.options
     what = f"{job.method.label} {entry.name} on {layout}: training"
     progress(what, 0, options.steps)
     train(
@@ -258,6 +274,7 @@ def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, pro
         options,
         folder,
         job.about,
+        tensorboard=plan.tensorboard,
         done=lambda step, loss: progress(what, step, options.steps),
     )
     progress(what, options.steps, options.steps)

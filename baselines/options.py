@@ -67,6 +67,12 @@ acting_option = click.option(
     help="How a trained model remembers: cached, or exact and slower.",
 )
 seeds_option = click.option("--seeds", type=COUNT, default=1, help="How often every task is played.")
+suite_option = click.option(
+    "--suite", type=Folder("`python -m generation teammates`"), metavar="FOLDER", help="Where learned teammates are."
+)
+tensorboard_option = click.option(
+    "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
+)
 films_option = click.option("--films/--no-films", default=True, help="A GIF per teammate family on the page.")
 root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
@@ -87,7 +93,7 @@ def variants(of: str) -> Names:
 
 def experiment_options(command: Any) -> Any:
     """What all experiments take."""
-    out = f"runs/{command.__name__.replace('_', '-')}" + ("-WHAT" if command.__name__ != "heldout_rl" else "")
+    out = f"runs/{command.__name__.replace('_', '-')}" + ("-WHAT" if command.__name__ in ("sweep", "ablate") else "")
     options = [
         click.option(
             "--method",
@@ -129,6 +135,7 @@ def experiment_options(command: Any) -> Any:
         protocol_option,
         acting_option,
         films_option,
+        tensorboard_option,
         click.option("--out", type=Folder(), metavar="FOLDER", help="Write all of it here.", show_default=out),
     ]
     for option in reversed(options):

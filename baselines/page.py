@@ -13,13 +13,13 @@ from tempfile import TemporaryDirectory
 from baselines.pictures import plot_gain, plot_sweep
 from baselines.report import LAYOUTS, Run, plot_curves, read_published
 from baselines.tables import AVERAGE, PAPER_TABLES, PaperTable, Point, Row, Score, fill, score, sweep
+from baselines.watching import Film, film_families
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of, json_hash
 from icrl4aht_data.headroom import HEURISTICS, has_headroom, read_headroom
 
-Picture = tuple[str, Path]
-"""A caption, and a PNG or GIF."""
-
+_FILMED = 3  # runs; a GIF takes up to 110 kB of the page
+_BEHIND = {"oracle": 1, "random": 2, "stay": 3}
 _SWEEPS = {"K": "Context length", "size": "Model scale and training budget"}
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1d2129; max-width: 1250px; margin: 2em auto; padding: 0 1.2em }
@@ -29,18 +29,19 @@ th, td { border: 1px solid #d5d8dd; padding: .25em .55em; text-align: left; vert
 th { background: #f1f3f6 } td.flat { background: #e8e8e8 } td.none { color: #999 }
 tr.first td, tr.first th { border-top: 2px solid #8a9099 }
 small { color: #5a6472; display: block } .norm { color: #1f5fa8 }
-figure { display: inline-block; margin: .5em 1em .5em 0 }
+figure { display: inline-block; margin: .5em 1em .5em 0; vertical-align: top } figure.film { width: 22em }
+td.long { min-width: 11em; max-width: 22em } td.long, figcaption { overflow-wrap: anywhere }
 img { max-width: 100%; height: auto } figcaption { font-size: 13px; color: #444 } code { font-size: 12px }
 """
 
 
-def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Picture] = (), notes: Sequence[str] = ()) -> Path:
+def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Film] = (), notes: Sequence[str] = ()) -> Path:
     """Write the page.
 
     Args:
         runs: merged, see `report.merge`; of any protocols, sweeps among them.
         path: ends in .html; replaced at once.
-        episodes: GIFs with captions.
+        episodes: by family; see `watching.film_families`.
         notes: what a reader must know of these runs, such as what was left out.
 
     Raises:
@@ -57,8 +58,7 @@ def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Picture] = ()
             own = [run for run in runs if run.protocol == protocol]
             parts += _protocol(protocol, own, Path(folder))
     if episodes:
-        figures = "".join(_figure(picture, caption) for caption, picture in episodes)
-        parts.append(f"<h2>An episode per family</h2>{figures}")
+        parts += _episodes(episodes)
     parts += [_settings(runs), _sources()]
     head = f'<meta charset="utf-8"><title>ICRL4AHT report</title><style>{_STYLE}</style>'
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,13 +70,28 @@ def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Picture] = ()
     return path
 
 
-def write_page_with_films(runs: Sequence[Run], path: Path, *, episodes: bool = True, notes: Sequence[str] = ()) -> Path:
-    """The same, with an episode of every family played for it."""
-    from baselines.watching import film_families
+def write_page_with_films(
+    runs: Sequence[Run], path: Path, *, episodes: bool = True, notes: Sequence[str] = (), suite: Path | None = None
+) -> Path:
+    """The same, with an episode beside every family played for it, of at most three runs.
 
+    `suite` is the folder that learned teammates' checkpoints are in.
+    """
+    shown = _worth_seeing(runs)[:_FILMED] if episodes else []
+    left = [run.label for run in runs if run not in shown]
+    if shown and left:
+        notes = [*notes, f"episodes are of {_FILMED} runs at most; there is none of: {', '.join(left)}"]
     with TemporaryDirectory() as folder:
-        films = film_families(runs, Path(folder)) if episodes else []
-        return write_page(runs, path, films, notes)
+        return write_page(runs, path, film_families(shown, Path(folder), suite), notes)
+
+
+def _worth_seeing(runs: Sequence[Run]) -> list[Run]:
+    """Trained agents first, each once before any twice; reference egos last, `stay` behind them all."""
+    before = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
+    ranked = [
+        (_BEHIND.get(run.agent, 0), nth, number) for number, (run, nth) in enumerate(zip(runs, before, strict=True))
+    ]
+    return [runs[number] for _, _, number in sorted(ranked)]
 
 
 def _introduction(runs: Sequence[Run], notes: Sequence[str]) -> str:
@@ -112,7 +127,10 @@ def _protocol(protocol: str, runs: list[Run], folder: Path) -> list[str]:
             parts += [f"<h3>Adaptation curves {name}</h3>", _figure(path, told)]
     path = folder / f"{protocol}-gain.png"
     plot_gain(runs, path)
-    told = "Mean over a track's cells, a dot per cell. The paper states no numbers: “small on average” (App. F)."
+    told = (
+        "Mean over a track's cells, a dot per cell; of the halves, where there are fewer than 40 episodes. The paper "
+        "states no numbers: “small on average” (App. F)."
+    )
     parts += ["<h3>Adaptation gain</h3>", _figure(path, told), _gain_table(runs)]
     return [*parts, "<h3>Headroom</h3>", _headroom_table(protocol)]
 
@@ -211,6 +229,20 @@ def _headroom_table(protocol: str) -> str:
     return told + _table(["family", *LAYOUTS], body)
 
 
+def _episodes(films: Sequence[Film]) -> list[str]:
+    told = (
+        "<p>The first episode of an evaluated task, when the ego remembers nothing yet. Ego blue, teammate red; the "
+        "frame is what the ego sees.</p>"
+    )
+    parts = ["<h2>An episode per family</h2>", told]
+    for family in dict.fromkeys(film.family for film in films):
+        parts.append(f"<h3>{'Learned teammates' if family == 'rl' else family}</h3>")
+        for film in films:
+            if film.family == family:
+                parts.append(_figure(film.path, film.told, " class=film"))
+    return parts
+
+
 def _settings(runs: Sequence[Run]) -> str:
     columns = [
         "agent", "layouts", "protocol", "episodes x steps", "seeds", "settings hash", "version", "trained on",
@@ -240,8 +272,12 @@ def _settings(runs: Sequence[Run]) -> str:
                 trained.get("manifest_sha256") or "",
                 source.folder,
             ]
-            body.append((False, [f"<td><code>{escape(value)}</code></td>" for value in values]))
+            body.append((False, [_code(value) for value in values]))
     return "<h2>Settings and hashes</h2>" + _table(columns, body)
+
+
+def _code(text: str) -> str:
+    return f"<td{' class=long' if len(text) > 30 else ''}><code>{escape(text)}</code></td>"
 
 
 def _sources() -> str:
@@ -264,8 +300,9 @@ def _table(columns: Iterable[str], body: Iterable[tuple[bool, Sequence[str]]]) -
     return f'<div class="wide"><table><tr>{head}</tr>{rows}</table></div>'
 
 
-def _figure(path: Path, caption: str) -> str:
-    kind = {".png": "png", ".gif": "gif"}[path.suffix]
-    content = base64.b64encode(path.read_bytes()).decode()
-    image = f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{content}">'
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+def _figure(path: Path | None, caption: str, look: str = "") -> str:
+    image = ""
+    if path is not None:
+        content = base64.b64encode(path.read_bytes()).decode()
+        image = f'<img alt="{escape(caption)}" src="data:image/{path.suffix.removeprefix(".")};base64,{content}">'
+    return f"<figure{look}>{image}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -13,7 +13,7 @@ from baselines.report import Run
 from baselines.tables import Point
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.figures import save_figure
+from icrl4aht_data.figures import legend_below, save_figure
 from icrl4aht_data.headroom import HEURISTICS
 
 
@@ -37,7 +37,7 @@ def plot_sweep(panels: Mapping[str, Mapping[str, Sequence[Point]]], what: str, p
         axis.set_xlabel(what)
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("mean return over families")
-    _legend(figure)
+    legend_below(figure)
     save_figure(figure, path)
 
 
@@ -62,17 +62,8 @@ def plot_gain(runs: Sequence[Run], path: Path) -> None:
                 axis.plot(np.full(len(gains), x), gains, ".", color=f"C{number}", markersize=4)
     axis.axhline(0, color="black", linewidth=0.8)
     axis.set_xticks(range(len(TRACKS)), [f"track {track}" for track in TRACKS])
+    axis.set_xlim(-0.5, len(TRACKS) - 0.5)
     axis.set_ylabel("last 20 - first 20 episodes")
     axis.grid(alpha=0.3, axis="y")
-    _legend(figure)
+    legend_below(figure)
     save_figure(figure, path)
-
-
-def _legend(figure: Figure) -> None:
-    entries = {
-        label: handle for axis in figure.axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    if entries:
-        figure.legend(
-            entries.values(), entries.keys(), loc="outside lower center", ncols=min(4, len(entries)), frameon=False
-        )

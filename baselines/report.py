@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from io import StringIO
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from baselines.evaluate import Result, read_result
 from icrl4aht_data.benchmark import FAMILIES, TRACKS
 from icrl4aht_data.cards import card_file
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.figures import save_figure
+from icrl4aht_data.figures import legend_below, save_figure
 from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.headroom import Cell, has_headroom, read_headroom
 from icrl4aht_data.tasks import Task, manifest_path, read_tasks
@@ -37,6 +38,7 @@ class Source(NamedTuple):
     layouts: tuple[str, ...]
     settings: dict[str, Any]
     trained: dict[str, Any] | None  # of a trained model: see `provenance.note_run`
+    tasks: Mapping[Cell, Task] = MappingProxyType({})  # of each cell the first that was played
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +57,10 @@ class Run:
         return self.cells[cell].mean(axis=1)
 
     def gain(self, cell: Cell) -> float:
-        """Mean return of the last 20 episodes minus that of the first 20 (paper, App. F)."""
+        """Mean return of the last 20 episodes minus that of the first 20 (paper, App. F); of the halves, if shorter."""
         returns = self.cells[cell]
-        return float(returns[:, -_ENDS:].mean() - returns[:, :_ENDS].mean())
+        ends = max(1, min(_ENDS, returns.shape[1] // 2))
+        return float(returns[:, -ends:].mean() - returns[:, :ends].mean())
 
     @cached_property
     def label(self) -> str:
@@ -96,6 +99,7 @@ def as_run(
     published = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
     known = {task.task_id: task for task in (*published, *tasks)}
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
+    first: dict[Cell, Task] = {}
     for result in results:
         if result.task_id not in known:
             raise OptionError(
@@ -103,14 +107,17 @@ def as_run(
                 f"does not have it; evaluate again, or put the manifest there"
             )
         task = known[result.task_id]
-        cells[task.layout.name, task.teammate_family].append(np.mean(result.returns, axis=0))
+        cell = task.layout.name, task.teammate_family
+        cells[cell].append(np.mean(result.returns, axis=0))
+        first.setdefault(cell, task)
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
-    arrays = {cell: np.array(cells[cell]) for cell in sorted(cells, key=_place)}
-    source = Source(where, tuple(dict.fromkeys(layout for layout, _ in arrays)), settings, trained)
+    arrays = {cell: np.array(cells[cell]) for cell in sorted(cells, key=place_of)}
+    source = Source(where, tuple(dict.fromkeys(layout for layout, _ in arrays)), settings, trained, first)
     return Run(settings["agent"], settings["protocol"]["name"], arrays, variant, sources=(source,))
 
 
-def _place(cell: Cell) -> tuple[int, int]:
+def place_of(cell: Cell) -> tuple[int, int]:
+    """Where a cell stands in the paper's order."""
     return _EVERY_LAYOUT.index(cell[0]), FAMILIES.index(cell[1])
 
 
@@ -124,7 +131,7 @@ def merge(runs: Sequence[Run]) -> list[Run]:
         if apart:
             other = merged[apart[0]]
             cells = other.cells | run.cells
-            ordered = {cell: cells[cell] for cell in sorted(cells, key=_place)}
+            ordered = {cell: cells[cell] for cell in sorted(cells, key=place_of)}
             merged[apart[0]] = replace(other, cells=ordered, sources=other.sources + run.sources)
         else:
             merged.append(replace(run, note=run.sources[0].folder) if same and run.sources else run)
@@ -270,12 +277,7 @@ def plot_curves(runs: list[Run], path: Path) -> None:
                 axis.set_ylabel(family)
             if i == len(families) - 1:
                 axis.set_xlabel("episode", fontsize=8)
-    entries = {
-        label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=min(len(entries), 5), frameon=False
-    )
+    legend_below(figure)
     save_figure(figure, path)
 
 

@@ -1,4 +1,4 @@
-"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, and checkpoints/ (Orbax)."""
+"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/ (Orbax), perhaps tensorboard/."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
 
 RUN_FORMAT = 1
-CONFIG, METRICS, TIMING, CURVES, CHECKPOINTS = (
+CONFIG, METRICS, TIMING, CURVES, CHECKPOINTS, TENSORBOARD = (
     "config.json",
     "metrics.jsonl",
     "timing.jsonl",
     "curves.png",
     "checkpoints",
+    "tensorboard",
 )
 
 logging.getLogger("absl").setLevel(logging.WARNING)  # Orbax tells of every step it takes

@@ -20,8 +20,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from baselines.curves import plot_run
+from baselines.events import Events, check_installed
 from baselines.method import Method
-from baselines.runs import CURVES, METRICS, TIMING, Checkpoints, append, forget_after, open_run, versions
+from baselines.runs import CURVES, METRICS, TENSORBOARD, TIMING, Checkpoints, append, forget_after, open_run, versions
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.prefetch import Batches
 
@@ -182,6 +183,7 @@ def train(
     about: Mapping[str, Any],
     *,
     devices: Any = None,
+    tensorboard: bool = False,
     done: Callable[[int, float], None] = lambda step, loss: None,
 ) -> State:
     """Train, or go on with what is in the folder; to its end.
@@ -193,17 +195,20 @@ def train(
         folder: config.json, metrics.jsonl (a function of the settings), timing.jsonl, curves.png, checkpoints/.
         about: the rest of config.json: what the run is of.
         devices: all by default.
+        tensorboard: also write the log for TensorBoard, into tensorboard/.
         done: called with a step and its loss whenever they are logged.
 
     Returns:
         The state after the last step.
 
     Raises:
-        OptionError: if the folder holds a run of other settings.
+        OptionError: if the folder holds a run of other settings, or tensorboardX is not installed.
     """
+    if tensorboard:
+        check_installed()
     trainer = Trainer(method, options, devices)
     config = {**versions(), "method": method.name, **about, "train": asdict(options)}
-    checkpoints = Checkpoints(folder)
+    checkpoints, events = Checkpoints(folder), None
     try:
         there = open_run(folder, config) and checkpoints.latest is not None
         state = _restored(checkpoints, trainer) if there else trainer.init()
@@ -211,6 +216,7 @@ def train(
         if writes:
             for name in (METRICS, TIMING):
                 forget_after(folder / name, first)
+            events = Events(folder / TENSORBOARD, folder / METRICS) if tensorboard else None
         clock = _Clock(first)
         with trainer.batches(data.train, first, options.steps) as batches:
             for number, batch in enumerate(batches, start=first + 1):
@@ -225,10 +231,14 @@ def train(
                 if writes and lines:
                     append(folder / METRICS, lines)
                     append(folder / TIMING, [clock.line(number, batches.waited)])
+                if events and lines:
+                    events.add(lines)
                 if number % options.save_every == 0 or last:
                     checkpoints.save(number, *_parts_of(state))
     finally:
         checkpoints.close()
+        if events:
+            events.close()
     if writes:
         plot_run(folder / METRICS, folder / CURVES, method.name)
     return state

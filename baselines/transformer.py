@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from baselines.attention import asked, causal
+
 Positions = Literal["none", "rope"]
 POSITIONS: tuple[Positions, ...] = ("none", "rope")
 """Where a token stands: not said, as published, or by rotary embedding (Su et al. 2021)."""
@@ -58,15 +60,17 @@ class Block(nn.Module):
         self,
         x_BxNxD: Float[Array, "B N D"],
         positions: Int[Array, " N"],
-        mask: Bool[Array, "#B 1 N N"] | None,
+        context: int,
         lengths: Int[Array, " B"] | None,
         deterministic: bool,
     ) -> Float[Array, "B N D"]:
-        """A mask says what each token (row) sees; None is causal. Tokens from `lengths` on are padding."""
-        q, k, v = self._qkv(x_BxNxD, positions)
-        attended = jax.nn.dot_product_attention(
-            q, k, v, mask=mask, is_causal=mask is None, key_value_seq_lengths=lengths
+        """See `Transformer.__call__`."""
+        (q, asked_q), (k, asked_k), (v, asked_v) = (
+            (x[:, :context], x[:, context:]) for x in self._qkv(x_BxNxD, positions)
         )
+        attended = causal(q, k, v, lengths)
+        if context < x_BxNxD.shape[1]:
+            attended = jnp.concatenate([attended, asked(asked_q, asked_k, asked_v, k, v)], axis=1)
         return self._join(x_BxNxD, attended, deterministic)
 
     def step(
@@ -128,7 +132,7 @@ class Transformer(nn.Module):
     remat: bool = False
 
     def setup(self) -> None:
-        block: Any = nn.remat(Block, static_argnums=(5,), methods=["__call__"]) if self.remat else Block
+        block: Any = nn.remat(Block, static_argnums=(3, 5), methods=["__call__"]) if self.remat else Block
         rope = self.positions == "rope"
         self.blocks = [block(self.width, self.heads, self.dropout, rope) for _ in range(self.layers)]
         self.norm = nn.LayerNorm()
@@ -138,22 +142,23 @@ class Transformer(nn.Module):
         x: Float[Array, "B N D"],
         *,
         lengths: Int[Array, " B"] | None = None,
-        mask: Bool[Array, "#B 1 N N"] | None = None,
-        positions: Int[Array, " N"] | None = None,
+        context: int | None = None,
         deterministic: bool = True,
     ) -> Float[Array, "B N D"]:
-        """Whole sequences; causal unless a mask says what each token (row) sees.
+        """Whole sequences: every token sees those up to itself.
 
         Args:
             x: tokens.
             lengths: of each sequence; what is behind is padding.
-            mask: instead of the causal one.
-            positions: of the tokens; 0..N-1 by default.
+            context: so many are a context, and behind it stand context + 1 queries: of these, number j sees the first j
+                tokens and itself, as if it stood behind them.
             deterministic: False for dropout, under the rng `dropout`.
         """
-        positions = jnp.arange(x.shape[1]) if positions is None else positions
+        length = x.shape[1]
+        context = length if context is None else context
+        positions = jnp.concatenate([jnp.arange(context), jnp.arange(length - context)])
         for block in self.blocks:
-            x = block(x, positions, mask, lengths, deterministic)
+            x = block(x, positions, context, lengths, deterministic)
         return self.norm(x)
 
     def step(

@@ -141,6 +141,22 @@ def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, 
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 
+def legend_below(figure: Figure) -> None:
+    """One legend for all axes, in as many columns as fit the figure's width."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    entries = {
+        label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for columns in range(min(5, len(entries)), 0, -1):
+        place = {"loc": "outside lower center", "ncols": columns}
+        legend = figure.legend(entries.values(), entries.keys(), fontsize=9, frameon=False, **place)
+        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        legend.remove()
+
+
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
     """Write a figure, in the format that the path's suffix names."""
     with file_in_place_of(path) as partial:

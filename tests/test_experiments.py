@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ from plays import random_release
 
 from baselines import experiments
 from baselines.cli import cli
+from baselines.evaluate import read_result
 from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, Plan, held_out_tasks, run_experiment
 from baselines.method import ModelOptions
+from baselines.report import LAYOUTS, read_run
 from baselines.runs import Checkpoints
+from baselines.watching import film_families
 from generation.learners.checkpoint import WEIGHTS, save_policy
 from generation.learners.network import ActorCritic, Widths
-from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.tasks import make_task, read_tasks, write_tasks
@@ -49,6 +53,7 @@ def test_the_settings_are_the_papers():
         for e in EXPERIMENTS["ablate ta"].entries
     ]
     assert auxiliary == [(False, False), (True, False), (False, True), (True, True)]
+    assert {TESTED_ON[layout] for layout in EXPERIMENTS["tracks"].layouts} == {*LAYOUTS}
     assert TESTED_ON["demo_wide"] == "demo_wide"
     assert (TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]) == ("asymm_right", "cramped_down")
 
@@ -101,6 +106,63 @@ def test_what_is_finished_is_not_done_again(swept, monkeypatch):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
 
 
+@pytest.fixture(scope="module")
+def asked(release, tmp_path_factory) -> Path:
+    """DPT, with all that it can be given."""
+    out = tmp_path_factory.mktemp("asked")
+    plan = dataclasses.replace(
+        SMALL,
+        root=str(release),
+        methods=("dpt",),
+        layouts=("demo_wide",),
+        values=("ta-next_obs",),
+        films=True,
+        tensorboard=True,
+    )
+    run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), out)
+    return out
+
+
+def test_dpt_is_trained_evaluated_and_reported(asked):
+    where = asked / "dpt-ta-next_obs" / "demo_wide"
+    losses = [json.loads(line) for line in (where / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert {"prior_accuracy", "next_obs_loss"} <= losses[-1].keys()
+    assert list((where / "run" / "tensorboard" / "train").iterdir())
+    lines = (asked / "report" / "report.csv").read_text().splitlines()
+    assert [line.split(",")[:6] for line in lines[1:]] == [["DPT+TA+next_obs", "seeded", "demo_wide", "H4", "1", "2"]]
+
+
+def test_the_page_shows_the_reported_agent(asked, tmp_path):
+    where = asked / "dpt-ta-next_obs" / "demo_wide"
+    (result,) = (read_result(path) for path in where.rglob("tasks/*.json"))
+    page = (asked / "report" / "report.html").read_text()
+    told = f"DPT+TA+next_obs beside H4/t0 on demo_wide: team return {result.returns[0][0]:g} in episode 1 of 2. "
+    assert f"{told}Task {result.task_id}, protocol seeded, seed 0." in page
+    assert page.count("data:image/gif") == 1
+
+    other = shutil.copytree(where, tmp_path / "other")
+    about = json.loads((other / "results" / "run.json").read_text())
+    for folder, why in ((tmp_path / "gone", "is gone"), (other / "run", "holds another model than these results")):
+        if folder.exists():
+            config = json.loads((folder / "config.json").read_text())
+            (folder / "config.json").write_text(json.dumps(config | {"package_version": "0.0.0"}))
+        (other / "results" / "run.json").write_text(json.dumps(about | {"run": str(folder)}))
+        (film,) = film_families([read_run(other / "results")], tmp_path)
+        assert film.path is None
+        assert "on demo_wide: no picture, " in film.told
+        assert f"{folder} {why}" in film.told
+
+
+def test_what_cannot_be_trained_on_fails_before_any_work(release, tmp_path):
+    random_release(tmp_path / "plain", layouts=("demo_wide",), teammates=1, streams=2, episodes=6, labels=False)
+    plan = dataclasses.replace(SMALL, root=str(tmp_path / "plain"), methods=("ad", "dpt"))
+    with pytest.raises(LabelsMissingError, match=r"dpt none on demo_wide: DPT needs expert actions.* leave it out, by"):
+        run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), tmp_path / "out")
+    with pytest.raises(OptionError, match=r"ad K1000 on demo_wide: context = 1000: the shortest history of .* has 600"):
+        run_experiment("sweep context", dataclasses.replace(plan, root=str(release)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
     asked = []
 
@@ -124,6 +186,8 @@ def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
     }
     rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
     assert plan == Plan(**options, **rest)
+    assert CliRunner().invoke(cli, ["tracks", *small], catch_exceptions=False).exit_code == 0
+    assert (asked[1][0], asked[1][2]) == ("tracks", Path("runs/tracks"))
 
 
 # Held-out teammates.
@@ -147,12 +211,14 @@ def suite(tmp_path_factory) -> Path:
 def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, "ModelOptions", lambda **own: ModelOptions(**(own | MODEL)))
     arguments = ["heldout-rl", "--suite", str(suite), "--method", "ad", "--layout", "cramped_up"]
-    small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "2", "--no-films"]
+    small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "2"]
     command = [*arguments, *small, "--root", str(release), "--out", str(tmp_path)]
     result = CliRunner().invoke(cli, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert "AD,seeded,cramped_up,rl,1,2," in (tmp_path / "report" / "report.csv").read_text()
-    assert "cramped_up, learned" in (tmp_path / "report" / "report.html").read_text()
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "cramped_up, learned" in page
+    assert "AD beside rl/t0 on cramped_up: team return" in page
     assert "| rl |" in (tmp_path / "report" / "report.md").read_text()
     about = json.loads((tmp_path / "ad-plain" / "cramped_up" / "results" / "run.json").read_text())
     assert about["config"]["histories"]["layouts"] == ["cramped_up"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cache
+from collections.abc import Iterator
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -12,11 +13,11 @@ import numpy as np
 import optax
 import pytest
 
+from baselines import attention
 from baselines.agents import Percept
 from baselines.context import (
     Transition,
     plain_view,
-    query_mask,
     state_view,
     step_of,
     steps_of,
@@ -172,15 +173,70 @@ def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positi
     assert of_query.all()
 
 
+def query_mask(context: int) -> np.ndarray:
+    """What each of [c_1 .. c_K, q_0 .. q_K] sees: a transition those up to itself, query j the first j and itself."""
+    to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
+    to_queries = np.concatenate([np.zeros((context, context + 1)), np.eye(context + 1)])
+    return np.concatenate([to_context, to_queries], axis=1).astype(bool)
+
+
 def test_the_query_stands_behind_its_context():
-    mask = np.asarray(query_mask(2, jnp.arange(3)))[0, 0].astype(int)
-    assert mask.tolist() == [
+    assert query_mask(2).astype(int).tolist() == [
         [1, 0, 0, 0, 0],
         [1, 1, 0, 0, 0],
         [0, 0, 1, 0, 0],
         [1, 0, 0, 1, 0],
         [1, 1, 0, 0, 1],
     ]
+
+
+def test_attention_is_that_of_the_mask(monkeypatch):
+    """To the rounding of float32, its gradient too; whole and in parts."""
+    q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
+
+    def of_mask(q, k, v):
+        return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
+
+    def ours(q, k, v):
+        context = attention.causal(q[:, :7], k[:, :7], v[:, :7])
+        queries = attention.asked(q[:, 7:], k[:, 7:], v[:, 7:], k[:, :7], v[:, :7])
+        return jnp.concatenate([context, queries], axis=1)
+
+    def results(attend):
+        return jax.jit(jax.value_and_grad(lambda *qkv: (attend(*qkv) * to).sum(), argnums=(0, 1, 2)))(q, k, v)
+
+    expected = results(of_mask)
+    for rows in (attention.ROWS, 5):
+        monkeypatch.setattr(attention, "ROWS", rows)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(ours), expected)
+
+
+def test_padding_is_not_seen(monkeypatch):
+    q, k, v = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2, 8, 2, 8)), jnp.float32)
+    lengths = jnp.array([3, 8])
+    expected = jax.nn.dot_product_attention(q, k, v, is_causal=True, key_value_seq_lengths=lengths)
+    for rows in (attention.ROWS, 5):
+        monkeypatch.setattr(attention, "ROWS", rows)
+        found = jax.jit(lambda q, k, v: attention.causal(q, k, v, lengths))(q, k, v)
+        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-6)
+
+
+def arrays_in(jaxpr: Any) -> Iterator[Any]:
+    """Everything that a computation makes."""
+    for equation in jaxpr.eqns:
+        yield from (out.aval for out in equation.outvars)
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda leaf: hasattr(leaf, "eqns")):
+            if hasattr(inner, "eqns"):
+                yield from arrays_in(inner)
+
+
+@pytest.mark.parametrize("name", ["ad", "dpt"])
+def test_long_contexts_make_no_square(name):
+    method, params = tiny(name, layers=1)
+    batch = ad_batch(rows=1, length=3072) if name == "ad" else dpt_batch(rows=1, context=3072)
+    made = jax.make_jaxpr(jax.grad(lambda p: method.loss(p, p, batch, jax.random.key(0))[0]))(params)
+    largest = max(array.size for array in arrays_in(made.jaxpr))
+    assert largest < TINY.heads * 3072 * 1024
 
 
 def test_slots_of_a_ring():

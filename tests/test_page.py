@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from matplotlib.figure import Figure
 
 from baselines import watching
 from baselines.cli import cli
 from baselines.evaluate import PROTOCOLS, get_protocol
-from baselines.page import write_page
+from baselines.page import write_page, write_page_with_films
 from baselines.report import LAYOUTS, Run, Source, merge, read_published
 from baselines.tables import AVERAGE, PAPER_TABLES, fill, score, sweep
+from baselines.watching import Film, ego_of
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.figures import legend_below
 from icrl4aht_data.headroom import HEURISTICS, read_headroom
 from icrl4aht_data.tasks import make_task, manifest_path, read_tasks, write_tasks
 
@@ -66,7 +71,8 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
     (tmp_path / "a.gif").write_bytes(GIF)
     path = tmp_path / "r" / "report.html"
     runs = [run("AD", LAYOUTS), run("random", LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
-    write_page(runs, path, [("H1 & an ego", tmp_path / "a.gif")], ["left out: <nothing>"])
+    films = [Film("H1", "H1 & an ego", tmp_path / "a.gif"), Film("rl", "no picture: <its run> is gone", None)]
+    write_page(runs, path, films, ["left out: <nothing>"])
     text = path.read_text()
     page = Outside(text)
     assert page.found == []
@@ -77,6 +83,7 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
         "Table 5. Offline Meta-RL Comparison",
         "left out: &lt;nothing&gt;",
         "H1 &amp; an ego",
+        "<h3>Learned teammates</h3>\n<figure class=film><figcaption>no picture: &lt;its run&gt; is gone",
         "paper 12.5 ± 11.3",
     ):
         assert told in text
@@ -119,6 +126,29 @@ def test_a_part_of_a_place_is_said_to_be_one():
     assert (partial.mean, partial.normalised) == (11.0, None)
 
 
+def test_short_runs_gain_from_half_to_half():
+    assert run("AD").gain(("demo_wide", "H1")) == 2
+    short = dataclasses.replace(run("AD"), cells={("demo_wide", "H1"): np.array([[1.0, 2, 3, 5, 8]])})
+    assert short.gain(("demo_wide", "H1")) == 6.5 - 1.5
+
+
+@pytest.mark.parametrize(
+    "labels", [("a", "b"), ("quite a long label",) * 6, ("no room for more than one of these",) * 3]
+)
+def test_legends_fit_their_figures(labels):
+    figure = Figure(figsize=(3.5, 3), layout="constrained")
+    axes = figure.add_subplot()
+    for number, label in enumerate(labels):
+        axes.plot([0, 1], label=f"{label} {number}")
+    legend_below(figure)
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == len(labels)
+    box = legend.get_window_extent()
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+
+
 def test_sweeps_have_the_papers_points_where_it_states_them():
     runs = [run("AD", ("test_wide",), variant=("K", k)) for k in (250, 500, 1000)]
     assert [(p.value, p.mean, p.published) for p in sweep(runs, "K")["test_wide"]["AD"]] == [
@@ -148,19 +178,53 @@ def test_models_of_different_layouts_are_one_agent():
     assert len(merge([one, run("AD", ("coord_simple",), variant=("K", 250))])) == 2
 
 
+def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
+    """Where the family leaves headroom; every agent before any twice, reference egos last."""
+    (tmp_path / "a.gif").write_bytes(GIF)
+    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    monkeypatch.setattr(watching, "ego_of", lambda source: source)
+    tasks = read_tasks(manifest_path("teammate", "test"))
+    played = {(task.layout.name, task.teammate_family): task for task in tasks}
+
+    def with_tasks(agent: str, **options) -> Run:
+        found = run(agent, ("coord_simple", "demo_wide"), families=("H1", "H4"), **options)
+        settings = SETTINGS | {"protocol": dataclasses.asdict(PROTOCOLS["seeded"])}
+        own = {cell: played[cell] for cell in found.cells}
+        return dataclasses.replace(found, sources=(found.sources[0]._replace(settings=settings, tasks=own),))
+
+    runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
+    runs.insert(3, with_tasks("AD", variant=("K", 250)))
+    text = write_page_with_films(runs, tmp_path / "report.html").read_text()
+    found = re.findall(r"<figcaption>([^<]+? beside \S+ on \S+): team return 7 ", text)
+    assert found == [
+        f"{agent} beside {mate} on demo_wide" for mate in ("H1/t4", "H4/t4") for agent in ("AD", "DPT", "AD, K = 250")
+    ]
+    assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
+    assert "An episode per family" not in write_page_with_films(runs, tmp_path / "r.html", episodes=False).read_text()
+
+
+def test_egos_that_cannot_be_made_again_say_why(tmp_path):
+    source = Source("runs/AD", ("demo_wide",), SETTINGS | {"details": {"step": 3}}, None)
+    with pytest.raises(OptionError, match="AD is neither a reference ego nor of a run folder"):
+        ego_of(source)
+    with pytest.raises(OptionError, match=r"its run folder .*/gone is gone"):
+        ego_of(source._replace(trained={"run": str(tmp_path / "gone")}))
+
+
 def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
     theta = next(t for t in read_tasks(manifest_path("teammate", "test")) if t.teammate_family == "H4").teammate
     write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 2, 5))
     played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
     assert CliRunner().invoke(cli, played, catch_exceptions=False).exit_code == 0
-    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) / 100)
+    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) + 1)
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "report.html").read_text()
-    assert Outside(text).images.count("data:image/gif") == 4
-    assert "H3/t0 on demo_wide beside the ego oracle" in text
+    assert Outside(text).images.count("data:image/gif") == 1
+    (task,) = read_tasks(tmp_path / "own.jsonl")
+    assert f"stay beside H4/t77 on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"not one of the published test tasks, and tasks\.jsonl beside the results"):
         CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import socket
+import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from plays import random_release
+from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 from test_models import FLAT, TINY, ad_batch
 from tiny import start
 
@@ -46,9 +49,10 @@ class Rows:
         return self.batch(0)
 
 
-def trained(folder: Path, die_at: int | None = None, name: str = "amago_offline") -> State:
-    method = get_method(name)(MODEL, FLAT)
-    return train(method, Data(Rows(0, die_at), {"held out": Rows(1)}), OPTIONS, folder, {})
+def trained(folder: Path, die_at: int | None = None, tensorboard: bool = False) -> State:
+    method = get_method("amago_offline")(MODEL, FLAT)
+    data = Data(Rows(0, die_at), {"held out": Rows(1)})
+    return train(method, data, OPTIONS, folder, {}, tensorboard=tensorboard)
 
 
 @pytest.fixture(scope="module")
@@ -62,17 +66,37 @@ def assert_same(one: Any, two: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
+def scalars(folder: Path) -> list[tuple[str, int, str, float]]:
+    """(part, step, name, value) of a run's event files, whose records are length, checksum, event, checksum."""
+    found = []
+    for path in folder.glob("tensorboard/*/*"):
+        content, at = path.read_bytes(), 0
+        while at < len(content):
+            (length,) = struct.unpack_from("<Q", content, at)
+            event = Event.FromString(content[at + 12 : at + 12 + length])
+            found += [(path.parent.name, event.step, value.tag, value.simple_value) for value in event.summary.value]
+            at += length + 16
+    return sorted(found)
+
+
 class TestResume:
     def test_a_killed_run_goes_on_to_the_same_bits(self, through, tmp_path):
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path, die_at=5)  # behind the checkpoint of step 3, and behind a logged line
+            trained(tmp_path, die_at=5, tensorboard=True)  # behind the checkpoint of step 3, and behind a logged line
         assert Checkpoints(tmp_path).latest == 3
         with (tmp_path / "metrics.jsonl").open("a") as log:
             log.write('{"step": 5, "cut o')
-        state = trained(tmp_path)
+        assert {step for _, step, *_ in scalars(tmp_path)} == {2, 3, 4}
+        state = trained(tmp_path, tensorboard=True)
         assert_same(state, through[1])
         assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
         assert (tmp_path / "config.json").read_bytes() == (through[0] / "config.json").read_bytes()
+        assert scalars(tmp_path) == sorted(
+            (line["part"], line["step"], name, np.float32(value))
+            for line in metrics(tmp_path)
+            for name, value in line.items()
+            if name not in ("part", "step")
+        )
 
     def test_a_finished_run_is_left_as_it_is(self, through):
         log = (through[0] / "metrics.jsonl").read_bytes()
@@ -100,6 +124,16 @@ class TestResume:
         assert config["train"]["steps"] == 7
         assert config["method"] == "amago_offline"
         assert not list(folder.rglob("*.pkl")) + list(folder.rglob("*.pickle"))
+
+    def test_tensorboard_asked_for_later_has_it_all(self, through):
+        trained(through[0], tensorboard=True)
+        assert {step for _, step, *_ in scalars(through[0])} == {2, 3, 4, 6, 7}
+
+    def test_tensorboard_that_is_not_installed(self, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "tensorboardX", None)
+        with pytest.raises(OptionError, match=r"needs tensorboardX: pip install icrl4aht-data\[tensorboard\]"):
+            trained(tmp_path / "run", tensorboard=True)
+        assert not (tmp_path / "run").exists()
 
     def test_other_settings_are_refused(self, through):
         method = get_method("amago_offline")(MODEL, FLAT)
