@@ -60,4 +60,4 @@ def check_installed() -> None:
     try:
         import tensorboardX  # noqa: F401
     except ImportError as error:
-        raise OptionError("TensorBoard's log needs tensorboardX: pip install icrl4aht-data[tensorboard]") from error
+        raise OptionError("TensorBoard's log needs tensorboardX: pip install 'icrl4aht-data[tensorboard]'") from error

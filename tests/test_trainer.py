@@ -131,7 +131,7 @@ class TestResume:
 
     def test_tensorboard_that_is_not_installed(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "tensorboardX", None)
-        with pytest.raises(OptionError, match=r"needs tensorboardX: pip install icrl4aht-data\[tensorboard\]"):
+        with pytest.raises(OptionError, match=r"needs tensorboardX: pip install 'icrl4aht-data\[tensorboard\]'"):
             trained(tmp_path / "run", tensorboard=True)
         assert not (tmp_path / "run").exists()
 
