@@ -115,15 +115,28 @@ class Handler(BaseHTTPRequestHandler):
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
 
     def _read_body(self) -> bytes:
+        """What the client sends, whole; one that is killed sends less, and then there is no request."""
         if self.headers.get("Transfer-Encoding", "").lower() != "chunked":
-            return self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            return self._read(int(self.headers.get("Content-Length") or 0))
         chunks = []
-        while size := int(self.rfile.readline().split(b";")[0] or b"0", 16):
-            chunks.append(self.rfile.read(size))
-            self.rfile.readline()
-        while self.rfile.readline().strip():  # trailers
+        while size := int(self._read_line().split(b";")[0], 16):
+            chunks.append(self._read(size))
+            self._read_line()
+        while self._read_line().strip():  # trailers
             pass
         return b"".join(chunks)
+
+    def _read(self, size: int) -> bytes:
+        found = self.rfile.read(size)
+        if len(found) < size:
+            raise ConnectionAbortedError(f"{self.path}: {len(found)} of {size} bytes came")
+        return found
+
+    def _read_line(self) -> bytes:
+        line = self.rfile.readline()
+        if not line.endswith(b"\n"):
+            raise ConnectionAbortedError(f"{self.path}: cut in a body of chunks")
+        return line
 
     def _send(self, request: Request, answer: Answer, fault: Fault | None) -> None:
         headers, etag = dict(answer.headers), answer.etag

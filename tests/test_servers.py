@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Iterator
 from http.client import HTTPConnection, HTTPResponse, IncompleteRead
@@ -239,3 +240,12 @@ def test_fsspec_reads_a_bucket(folder):
     with s3_server(folder / "shards", "other") as bucket:
         assert bucket.keys() == ["a b.h5"]
         assert fsspec.filesystem("s3").ls("other") == ["other/a b.h5"]
+
+
+@pytest.mark.parametrize("head", [b"Content-Length: 10", b"Transfer-Encoding: chunked"])
+def test_a_client_that_dies_before_its_body_has_asked_nothing(tmp_path, head):
+    with http_server(tmp_path) as server:
+        with socket.create_connection(server.server_address[:2]) as client:
+            client.sendall(b"POST /file HTTP/1.1\r\nHost: here\r\n" + head + b"\r\n\r\n")
+        client.close()
+    assert server.log == []
