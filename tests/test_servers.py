@@ -245,7 +245,7 @@ def test_fsspec_reads_a_bucket(folder):
 @pytest.mark.parametrize("head", [b"Content-Length: 10", b"Transfer-Encoding: chunked"])
 def test_a_client_that_dies_before_its_body_has_asked_nothing(tmp_path, head):
     with http_server(tmp_path) as server:
-        with socket.create_connection(server.server_address[:2]) as client:
+        with socket.create_connection(("127.0.0.1", server.server_address[1])) as client:
             client.sendall(b"POST /file HTTP/1.1\r\nHost: here\r\n" + head + b"\r\n\r\n")
         client.close()
     assert server.log == []
