@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import ACTIONS, STAY, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout
+
+if TYPE_CHECKING:
+    from baselines.histories import Run
 
 Acting = Literal["cached", "exact"]
 ACTING: tuple[Acting, ...] = ("cached", "exact")
@@ -169,11 +172,16 @@ def _of_run(folder: Path, acting: Acting) -> Agent:
     policy = learned(run.method, run.params, run.context, acting)()
 
     def make(layout: Layout) -> Policy:
-        if layout.obs_shape != run.obs_shape:
-            raise OptionError(
-                f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "
-                f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts"
-            )
+        check_fits(run, layout, folder)
         return policy
 
     return Agent(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})
+
+
+def check_fits(run: Run, layout: Layout, folder: Path) -> None:
+    """Raises OptionError: if a run's model cannot play on a layout; `folder` is named."""
+    if layout.obs_shape != run.obs_shape:
+        raise OptionError(
+            f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "
+            f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts"
+        )

@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import Progress
 
 from baselines.options import (
     AGENT,
@@ -43,6 +42,8 @@ from icrl4aht_data.commands import (
     Names,
     NewFile,
     Sections,
+    bars,
+    counted,
     examples,
     run,
     version_option,
@@ -134,8 +135,7 @@ def evaluate(
         )
     for name in {task.layout.name for task in tasks}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task(f"{ego.name}, {protocol}", total=len(tasks))
+    with bars() as show:
         evaluate_tasks(
             ego.name,
             ego.make,
@@ -145,7 +145,7 @@ def evaluate(
             suite=suite,
             out=out,
             details=ego.details,
-            done=lambda n: bars.advance(bar, n),
+            done=counted(show, f"{ego.name}, {protocol}", len(tasks)),
         )
     note_results(out, agent if ego.details else None, tasks if manifest else ())
     console.print(f"{len(tasks)} results in {out}; `python -m baselines report {out}` shows them")
@@ -219,8 +219,8 @@ def headroom(out: Path, protocol: tuple[str, ...]) -> None:
     """
     from baselines.headroom import measure, write_cards
 
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        runs = measure(out, protocol, bars)
+    with bars() as show:
+        runs = measure(out, protocol, show)
     for path in write_cards(runs):
         console.print(f"wrote {path}")
 
@@ -241,7 +241,7 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
     """
     import dataclasses
 
-    from baselines.agents import find_agent
+    from baselines.agents import check_fits
     from baselines.drift import measure
     from baselines.evaluate import get_protocol
     from baselines.histories import read_run
@@ -251,14 +251,13 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
     full = -(-trained.context // played.steps)
     played = dataclasses.replace(played, episodes=episodes or 3 * full)
     name = get_layout(layout or trained.layouts[0]).name
-    find_agent(str(run)).make(get_layout(name))  # a model that does not fit fails before any work
+    check_fits(trained, get_layout(name), run)
     tasks = [named_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task(f"{trained.label}, {family} on {name}", total=played.episodes)
+    with bars() as show:
         found = []
         for episode in measure(trained.method, trained.params, trained.context, tasks, played):
             found.append(episode)
-            bars.advance(bar)
+            show(f"{trained.label}, {family} on {name}", len(found), played.episodes)
     click.echo(f"{trained.label} on {name} beside {len(tasks)} teammates of {family}, K = {trained.context}")
     click.echo("episode  same action  total variation: mean     largest")
     for number, (distance, same) in enumerate(found):
@@ -355,11 +354,10 @@ def train(method: str, layouts: tuple[str, ...], root: Any, out: Path | None, **
     histories = HistoryOptions(layouts, root and str(root), order=options["order"], obs=options["obs"])
     job = prepare(method, model, training, histories)
     folder = out or Path("runs") / method
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task(method, total=training.steps)
+    with bars() as show:
 
         def done(step: int, loss: float) -> None:
-            bars.update(bar, completed=step, description=f"{method}, loss {loss:.3f}")
+            show(method, step, training.steps, f", loss {loss:.3f}")
 
         log = options["tensorboard"]
         run_training(job.method, job.data, job.options, folder, job.about, tensorboard=log, done=done)
@@ -438,15 +436,8 @@ def _experiment(name: str, out: Path | None, root: Any, suite: Path | None = Non
     if name == "sweep context" and "context" in training:
         raise OptionError(f"--context {training['context']}: `sweep context` varies it; choose by --only, such as K250")
     plan = Plan(root=root and str(root), suite=suite, train=training, **options)
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        running: dict[str, Any] = {}
-
-        def progress(task: str, done: int, of: int) -> None:
-            if task not in running:
-                running[task] = bars.add_task(task, total=of)
-            bars.update(running[task], completed=done)
-
-        found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), progress)
+    with bars() as show:
+        found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:
         click.echo(note)
     for path in found.report:
@@ -463,13 +454,10 @@ def control(out: Path) -> None:
     """
     from baselines.control import run_control, table
 
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        running: dict[str, Any] = {}
+    with bars() as show:
 
         def done(name: str, of: int, step: int, loss: float) -> None:
-            if name not in running:
-                running[name] = bars.add_task(name, total=of)
-            bars.update(running[name], completed=step, description=f"{name}, loss {loss:.3f}")
+            show(name, step, of, f", loss {loss:.3f}")
 
         checks = run_control(out, done=done)
     click.echo(table(checks))

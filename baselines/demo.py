@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 
 from baselines.agents import AGENTS, find_agent
 from baselines.evaluate import PROTOCOLS, Protocol, evaluate
@@ -20,6 +19,7 @@ from baselines.report import Run, read_run
 from baselines.trainer import TrainOptions, train
 from generation.teammates.instances import named_task
 from icrl4aht_data.benchmark import KEPT_STEPS
+from icrl4aht_data.commands import bars, counted
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.figures import plot_learning_curves
@@ -100,11 +100,10 @@ def run_demo(
 
 def _train(folder: Path, model: ModelOptions, options: TrainOptions, console: Console) -> None:
     job = prepare("ad", model, options, HistoryOptions((LAYOUT,)))
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task("AD", total=options.steps)
+    with bars() as show:
 
         def done(step: int, loss: float) -> None:
-            bars.update(bar, completed=step, description=f"AD, loss {loss:.3f}")
+            show("AD", step, options.steps, f", loss {loss:.3f}")
 
         train(job.method, job.data, job.options, folder, job.about, done=done)
     console.print(f"losses on what it trains on and on held-out histories: {folder / 'curves.png'}", highlight=False)
@@ -113,12 +112,8 @@ def _train(folder: Path, model: ModelOptions, options: TrainOptions, console: Co
 def _evaluate(name: str, tasks: Sequence[Task], protocol: Protocol, results: Path, console: Console) -> Run:
     agent = find_agent(name)
     folder = results / agent.name
-    with Progress(console=console, disable=not console.is_terminal) as bars:
-        bar = bars.add_task(agent.name, total=len(tasks))
-
-        def done(number: int) -> None:
-            bars.advance(bar, number)
-
+    with bars() as show:
+        done = counted(show, agent.name, len(tasks))
         evaluate(agent.name, agent.make, tasks, protocol, out=folder, details=agent.details, done=done)
     note_results(folder, name if agent.details else None)
     return read_run(folder)

@@ -28,6 +28,7 @@ from baselines.provenance import note_results
 from baselines.report import merge, read_run, write_report
 from baselines.trainer import TrainOptions, train
 from icrl4aht_data.benchmark import TRACKS, track_of, unknown
+from icrl4aht_data.commands import counted
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -288,13 +289,7 @@ def _evaluate(
     if plan.episodes is not None:
         protocol = replace(protocol, episodes=plan.episodes)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
-    what, finished = f"{agent.name} {entry.name} on {tasks[0].layout.name}: evaluation", 0
-
-    def done(number: int) -> None:
-        nonlocal finished
-        finished += number
-        progress(what, finished, len(tasks))
-
+    what = f"{agent.name} {entry.name} on {tasks[0].layout.name}: evaluation"
     evaluate(
         agent.name,
         agent.make,
@@ -304,6 +299,6 @@ def _evaluate(
         suite=plan.suite,
         out=folder / "results",
         details=details,
-        done=done,
+        done=counted(progress, what, len(tasks)),
     )
     note_results(folder / "results", folder / "run", tasks if own_tasks else ())

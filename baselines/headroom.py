@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.progress import Progress
 
 from baselines.agents import get_agent
 from baselines.evaluate import evaluate, get_protocol
 from baselines.report import LAYOUTS, Run, as_run, published_cells
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.cards import card_file, markdown_table
+from icrl4aht_data.commands import counted
 from icrl4aht_data.headroom import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.tasks import manifest_path, read_tasks
 
 _PAPER = ("random", "AD", "DPT")
 
 
-def measure(out: Path, protocols: Sequence[str], bars: Progress) -> list[Run]:
+def measure(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[Run]:
     """Evaluate every reference ego under every protocol, resumably, into out/<protocol>/<agent>."""
     tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
     runs = []
     for protocol in protocols:
         for agent in REFERENCES:
-            bar = bars.add_task(f"{agent}, {protocol}", total=len(tasks))
             results = evaluate(
                 agent,
                 get_agent(agent),
                 tasks,
                 get_protocol(protocol),
                 out=out / protocol / agent,
-                done=lambda n, bar=bar: bars.advance(bar, n),
+                done=counted(show, f"{agent}, {protocol}", len(tasks)),
             )
             runs.append(as_run(results))
     return runs

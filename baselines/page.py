@@ -16,7 +16,7 @@ from baselines.tables import AVERAGE, PAPER_TABLES, PaperTable, Point, Row, Scor
 from baselines.watching import Film, film_families
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of, json_hash
-from icrl4aht_data.headroom import HEURISTICS, has_headroom, read_headroom
+from icrl4aht_data.headroom import HEURISTICS, REFERENCES, has_headroom, read_headroom
 
 _FILMED = 3  # runs; a GIF takes up to 110 kB of the page
 _BEHIND = {"oracle": 1, "random": 2, "stay": 3}
@@ -221,9 +221,7 @@ def _headroom_table(protocol: str) -> str:
                 row.append('<td class="none">not measured</td>')
             else:
                 kind = "" if has_headroom(told) else "flat"
-                row.append(
-                    f'<td class="{kind}">{" / ".join(f"{told[a]:z.1f}" for a in ("stay", "random", "oracle"))}</td>'
-                )
+                row.append(f'<td class="{kind}">{" / ".join(f"{told[a]:z.1f}" for a in REFERENCES)}</td>')
         body.append((False, row))
     told = "<p>Mean return of the reference egos stay / random / oracle (scripted, full information).</p>"
     return told + _table(["family", *LAYOUTS], body)

@@ -16,7 +16,7 @@ import numpy as np
 
 from baselines.evaluate import Result, read_result
 from icrl4aht_data.benchmark import FAMILIES, TRACKS
-from icrl4aht_data.cards import card_file
+from icrl4aht_data.cards import card_file, markdown_table
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.figures import legend_below, save_figure
 from icrl4aht_data.files import parse_json, read_text
@@ -213,7 +213,7 @@ def markdown(runs: list[Run]) -> str:
             of_track = dict.fromkeys((*splits["test"], *splits["train"]))
             layouts = [layout for layout in of_track if any((layout, family) in cells for family in FAMILIES)]
             if layouts:
-                lines += ["", f"## {run.name}, track {track}", "", *_grid(cells, layouts)]
+                lines += ["", f"## {run.name}, track {track}", "", _grid(cells, layouts)]
     return "\n".join(lines) + "\n"
 
 
@@ -223,12 +223,9 @@ def families_of(cells: Iterable[Cell]) -> list[str]:
     return [family for family in FAMILIES if family in there]
 
 
-def _grid(cells: dict[Cell, dict[str, Any]], layouts: list[str]) -> list[str]:
-    lines = [f"| family | {' | '.join(layouts)} |", f"|---|{'---|' * len(layouts)}"]
-    for family in families_of(cells):
-        present = [cells.get((layout, family)) for layout in layouts]
-        lines.append(f"| {family} | {' | '.join(_cell_text(row) for row in present)} |")
-    return lines
+def _grid(cells: dict[Cell, dict[str, Any]], layouts: list[str]) -> str:
+    rows = [[family, *(_cell_text(cells.get((layout, family))) for layout in layouts)] for family in families_of(cells)]
+    return markdown_table(["family", *layouts], rows)
 
 
 def _cell_text(row: dict[str, Any] | None) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -210,6 +212,17 @@ def manifests(check: bool) -> None:
         console.print(f"{path}: {len(tasks)} tasks")
 
 
+def _layouts(shown: str) -> Callable[[Any], Any]:
+    return click.option(
+        "--layout",
+        "layouts",
+        type=LAYOUT,
+        multiple=True,
+        help="On this layout; again for more.",
+        show_default=shown,
+    )
+
+
 _algorithms = click.option(
     "--algorithm",
     "algorithms",
@@ -222,14 +235,7 @@ _algorithms = click.option(
 
 @cli.command(epilog=examples("python -m generation teammates --profile mini --layout cramped_up --algorithm fcp"))
 @_profile
-@click.option(
-    "--layout",
-    "layouts",
-    type=LAYOUT,
-    multiple=True,
-    help="On this layout; again for more.",
-    show_default="the profile's",
-)
+@_layouts("the profile's")
 @_algorithms
 @click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write them here.")
 @click.option("--seed", type=SEED, default=0, help="Of their training.")
@@ -246,14 +252,7 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
 
 
 @cli.command()
-@click.option(
-    "--layout",
-    "layouts",
-    type=LAYOUT,
-    multiple=True,
-    help="On this layout; again for more.",
-    show_default="all that are finished",
-)
+@_layouts("all that are finished")
 @_algorithms
 @click.option(
     "--suite",

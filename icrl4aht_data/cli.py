@@ -267,7 +267,7 @@ def verify(
     if source and not repair:
         raise click.UsageError("--from says where to repair from: give --repair with it")
     wanted = _wanted(filters)
-    with bars(quiet, "fetched", "files", "histories") as advance:
+    with bars(quiet) as advance:
         report = verify_release(root, deep=deep, quick=quick, advance=advance, **wanted)
         if repair and not report.ok:
             if root is None and source is None:
@@ -420,7 +420,7 @@ def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json:
 
     if len(source) > 1:
         raise click.UsageError("give one SOURCE at most, then OUT")
-    with bars(quiet, "files", "histories", "copying") as advance:
+    with bars(quiet) as advance:
         build_release(source[0] if source else None, out, link=link, advance=advance)
     files = list(read_manifest(out))
     size = sum((out / name).stat().st_size for name in files)
@@ -447,7 +447,7 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
     """
     from icrl4aht_data.upload import upload_release
 
-    with bars(quiet, "files", "histories") as advance:
+    with bars(quiet) as advance:
         done = upload_release(
             folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
         )

@@ -222,12 +222,31 @@ def examples(*lines: str) -> str:
 
 
 @contextmanager
-def bars(quiet: bool, *names: str) -> Iterator[Callable[[str, int, int], None]]:
-    """Progress of several things by name, on a terminal only."""
-    console = Console(stderr=True)
+def bars(quiet: bool = False) -> Iterator[Callable[..., None]]:
+    """Progress of several things, on a terminal only: call what is given with a name, how many are done, of how many,
+    and maybe a note."""
+    console, running = Console(stderr=True), {}
     with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as shown:
-        tasks = {name: shown.add_task(name, total=None) for name in names}
-        yield lambda what, done, total: shown.update(tasks[what], completed=done, total=total)
+
+        def show(what: str, done: int, of: int | None, note: str = "") -> None:
+            if what not in running:
+                running[what] = shown.add_task(what, total=of)
+            shown.update(running[what], completed=done, total=of, description=f"{what}{note}")
+
+        yield show
+
+
+def counted(show: Callable[..., None], what: str, of: int) -> Callable[[int], None]:
+    """For who says how many more are done: the same bar, from 0 on."""
+    total = 0
+
+    def more(number: int) -> None:
+        nonlocal total
+        total += number
+        show(what, total, of)
+
+    more(0)
+    return more
 
 
 def run(command: click.Command) -> None:

@@ -101,7 +101,7 @@ def test_what_is_finished_is_not_done_again(swept, monkeypatch):
     monkeypatch.setattr(experiments, "write_page_with_films", lambda *a, **k: out)
     run_experiment("sweep context", plan, out, lambda what, done, of: steps.append((what.split(": ")[1], done, of)))
     assert [(path, path.stat().st_mtime_ns) for path in results] == before
-    assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 1, 1)]
+    assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 0, 1), ("evaluation", 1, 1)]
     with pytest.raises(OptionError, match=r"train\.seed: the run has 0, asked for 3"):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
 
