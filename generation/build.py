@@ -66,7 +66,7 @@ def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) 
     tasks = profile.heuristic_tasks()
     if not profile.algorithms:
         return tasks
-    selections = build_suite(profile, suite, profile.layouts, profile.algorithms, seed, console)
+    selections = build_suite(profile, suite, profile.learned_on, profile.algorithms, seed, console)
     tasks += make_tasks(suite, selections, "train")
     if not tasks:
         raise CollectionError(

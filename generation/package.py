@@ -68,6 +68,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
     if task.teammate_family == "rl":
         provenance["suite"] = {
             "algorithms": list(profile.algorithms),
+            "layouts": list(profile.learned_on),
             "members": profile.teammates.members,
             "train": profile.teammates.train,
             "total_steps": profile.teammates.ppo.total_steps,

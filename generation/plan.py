@@ -101,11 +101,10 @@ def cost(profile: Profile, devices: int) -> Cost:
     Args:
         devices: the N of `hours_on_devices`; each does one task at a time.
     """
-    ego, count = profile.ego, profile.tasks_of_a_layout
-    tasks = count * len(profile.layouts)
+    ego, tasks = profile.ego, len(profile.task_layouts)
     learning = calibrate(ego, partial(task_learner, profile))
     task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
-    populations = [run.steps for run in runs(profile, profile.layouts, profile.algorithms, 0)]
+    populations = [run.steps for run in runs(profile, profile.learned_on, profile.algorithms, 0)]
     playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
     population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
     in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
@@ -119,7 +118,7 @@ def cost(profile: Profile, devices: int) -> Cost:
         environment_steps=tasks * ego.updates * ego.steps_per_update,
         recorded_transitions=tasks * ego.environments * ego.episodes * KEPT_STEPS,
         kept_transitions=kept,
-        artefact_bytes=count * artefact_bytes(profile.layouts, ego),
+        artefact_bytes=artefact_bytes(profile.task_layouts, ego),
         **{f"{kind}_bytes": round(kept * bytes_per_transition(kind)) for kind in KINDS},
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
         teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,

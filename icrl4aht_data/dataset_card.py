@@ -229,9 +229,14 @@ def _missing(release: _Release) -> Iterable[str]:
     """Which learned teammates are fewer than was wanted."""
     found = Counter((task.layout.name, task.teammate_kind) for task in release.tasks if task.split == "train")
     for suite in release.distinct("suite"):
+        learned_on = suite.get("layouts", release.info["layouts"])
+        without = [layout for layout in release.info["layouts"] if layout not in learned_on]
+        if without:
+            yield f"Learned on {', '.join(without)}: its profile has no learned teammates there, only presets of H4."
         few = [
             f"{algorithm} on {layout} ({found[layout, algorithm]} of {suite['train']})"
             for layout in release.info["layouts"]
+            if layout in learned_on
             for algorithm in suite["algorithms"]
             if found[layout, algorithm] < suite["train"]
         ]

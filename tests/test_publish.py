@@ -25,6 +25,7 @@ from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.dataset_card import dataset_card, evaluated_on, size_category
 from icrl4aht_data.descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
+from icrl4aht_data.info import read_info
 from icrl4aht_data.manifest import read_manifest, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publish import build_release, teammate_card
@@ -253,6 +254,16 @@ def test_a_provenance_of_another_form_is_named(damaged, provenance):
     (damaged / "meta/provenance.json").write_text(provenance)
     with pytest.raises(IndexFormatError, match=r"provenance\.json: not as `generation` writes it"):
         dataset_card(damaged)
+
+
+def test_the_card_says_where_learned_teammates_are_missing(damaged):
+    suite = {"algorithms": ["fcp"], "layouts": ["demo_wide"], "members": 2, "train": 3, "total_steps": 10**6}
+    path = damaged / "meta/provenance.json"
+    path.write_text(json.dumps({task: {"suite": suite | {"threshold": 20.0}} for task in json.loads(path.read_text())}))
+    card = dataset_card(damaged)
+    others = ", ".join(name for name in read_info(damaged)["layouts"] if name != "demo_wide")
+    assert f"* Learned on {others}: its profile has no learned teammates there, only presets of H4." in card
+    assert "fewer training teammates than its profile wanted of fcp on demo_wide (0 of 3)." in card
 
 
 def test_sizes_have_the_hubs_names():

@@ -54,6 +54,7 @@ class Profile:
     layouts: tuple[str, ...]
     presets: tuple[str, ...] = ()  # teammates that are the heuristic H4 utility_greedy
     algorithms: tuple[str, ...] = ()  # teammates that learned, `teammates.train` of each
+    learned_on: tuple[str, ...] = ()  # the layouts that have those
 
     def heuristic_tasks(self) -> list[Task]:
         """One training task per layout and preset, each with a seed of its own."""
@@ -64,9 +65,10 @@ class Profile:
         ]
 
     @property
-    def tasks_of_a_layout(self) -> int:
-        """How many training tasks a layout has, if its populations have teammates enough."""
-        return len(self.presets) + len(self.algorithms) * self.teammates.train
+    def task_layouts(self) -> tuple[str, ...]:
+        """The layout of each training task, if the populations have teammates enough."""
+        learned = self.learned_on * len(self.algorithms) * self.teammates.train
+        return self.layouts * len(self.presets) + learned
 
     @property
     def ego_hash(self) -> str:
@@ -97,17 +99,19 @@ def load_profile(name: str) -> Profile:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         _only(content, "", {"ego", "teammates", "release", "tasks"})
         _only(content["release"], "release.", {"keep", "data_version"})
-        _only(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
+        _only(content["tasks"], "tasks.", {"layouts", "presets", "algorithms", "learned_on"})
         tasks = content["tasks"]
+        layouts = _layouts("tasks.layouts", tasks["layouts"])
         profile = Profile(
             name=path.stem,
             ego=_ppo("ego", content["ego"], PPOConfig()),
             teammates=_teammates(content.get("teammates", {})),
             data_version=check_version(_typed("release.data_version", content["release"]["data_version"], str)),
             keep=_typed("release.keep", content["release"]["keep"], int),
-            layouts=tuple(get_layout(layout).name for layout in _names("tasks.layouts", tasks["layouts"])),
+            layouts=layouts,
             presets=_names("tasks.presets", tasks.get("presets", [])),
             algorithms=_names("tasks.algorithms", tasks.get("algorithms", [])),
+            learned_on=_layouts("tasks.learned_on", tasks.get("learned_on", list(layouts))),
         )
         profile.heuristic_tasks()
     except tomllib.TOMLDecodeError as error:
@@ -119,10 +123,12 @@ def load_profile(name: str) -> Profile:
     for name in profile.algorithms:
         if name not in ALGORITHMS:
             raise OptionError(f"{path}: {unknown('algorithm', name, ALGORITHMS)}")
-    if not (profile.layouts and profile.tasks_of_a_layout):
+    if not profile.task_layouts:
         raise OptionError(
             f"{path}: expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms"
         )
+    if not set(profile.learned_on) <= set(layouts):
+        raise OptionError(f"{path}: tasks.learned_on = {list(profile.learned_on)}: expected some of tasks.layouts")
     if not 0 < profile.keep <= profile.ego.environments:
         raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
     if profile.ego.episodes < 5:
@@ -164,6 +170,10 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
     if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
         raise OptionError(f"{key} = {names!r}: expected names, none twice")
     return tuple(names)
+
+
+def _layouts(key: str, value: Any) -> tuple[str, ...]:
+    return tuple(get_layout(name).name for name in _names(key, value))
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
