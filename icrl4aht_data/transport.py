@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import re
 import threading
@@ -18,11 +19,13 @@ from urllib.parse import urlsplit
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
 
 T = TypeVar("T")
+_log = logging.getLogger(__name__)
 
 _PASSING = {408, 425, 429, 500, 502, 503, 504}
 _LASTING = (FileNotFoundError, PermissionError, Icrl4ahtError, ImportError, NotImplementedError, MemoryError, TypeError)
 _TIMEOUT = 30  # seconds without a byte, or until a connection
 _TOTAL = 300  # seconds for a request, of a server that sends a byte now and then
+_LONG_WAIT = 2.0  # seconds between attempts, from which on a wait is told
 _WHOLE = 64 * 2**20  # bytes taken from a server that gives all of a file instead of a range
 
 
@@ -184,6 +187,7 @@ class Store:
             retry=tenacity.retry_if_exception(_passes),
             stop=tenacity.stop_after_attempt(self.patience.attempts),
             wait=self._wait,
+            before_sleep=lambda state: self._say(name, state),
             reraise=True,
         )
         try:
@@ -198,6 +202,13 @@ class Store:
                 what = f"{_in_words(_cause(error))}{tried}"
                 raise RemoteError(f"{self.url}/{name}: {what}; what has arrived is kept: try again to go on") from error
             raise RemoteError(f"{self.url}/{name}: the remote has no such file", missing=True) from error
+
+    def _say(self, name: str, state: Any) -> None:
+        """What is waited for, where the wait is long enough to wonder."""
+        seconds = state.next_action.sleep
+        if seconds >= _LONG_WAIT:
+            what = _in_words(_cause(state.outcome.exception()))
+            _log.warning("%s/%s: %s; trying again in %.0f s", self.url, name, what, seconds)
 
     def _wait(self, state: Any) -> float:
         error = state.outcome.exception()

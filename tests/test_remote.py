@@ -22,7 +22,7 @@ from icrl4aht_data.cli import cli
 from icrl4aht_data.download import ORIGIN, fetch_planned, plan_download, repair
 from icrl4aht_data.errors import OfflineError, OptionError, RemoteError, RootNotFoundError, UnknownNameError
 from icrl4aht_data.shard import chunk_table_path
-from icrl4aht_data.transport import Patience
+from icrl4aht_data.transport import Patience, Store
 
 HASTY = Patience(attempts=2, first=0.01)
 
@@ -49,6 +49,20 @@ def served(request, lite) -> Iterator[str]:
 
 def in_part(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(("first", "told"), [(0.001, []), (2.0, ["2 s", "4 s"])])
+def test_a_long_wait_is_told(first, told, monkeypatch, caplog):
+    monkeypatch.setattr("tenacity.nap.time.sleep", lambda seconds: None)
+    store = Store("https://nowhere.test/release", Patience(attempts=3, first=first))
+
+    def refuse():
+        raise ConnectionError("no such host")
+
+    with pytest.raises(RemoteError, match=r"no such host \(3 attempts\)"):
+        store.patiently("meta/info.json", refuse)
+    start = "https://nowhere.test/release/meta/info.json: ConnectionError: no such host; trying again in "
+    assert caplog.messages == [start + wait for wait in told]
 
 
 def test_a_remote_release_reads_as_its_local_twin(served, lite):
