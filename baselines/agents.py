@@ -20,7 +20,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 
 if TYPE_CHECKING:
-    from baselines.histories import Run
+    from baselines.histories import Trained
 
 Acting = Literal["cached", "exact"]
 ACTING: tuple[Acting, ...] = ("cached", "exact")
@@ -107,9 +107,7 @@ def random(layout: Layout) -> Policy:
     return Policy((), lambda params, key: (), act, "observation")
 
 
-def learned(
-    method: Method, params: Any, context: int, acting: Acting = "cached", greedy: bool = True
-) -> Callable[[], Policy]:
+def learned(method: Method, params: Any, context: int, acting: Acting = "cached", greedy: bool = True) -> Policy:
     """The ego of a trained model; its memory lives through the task.
 
     Args:
@@ -127,7 +125,7 @@ def learned(
         action = logits.argmax() if greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory
 
-    return lambda: Policy(params, lambda params, key: method.start(context, acting == "cached"), act, "percept")
+    return Policy(params, lambda params, key: method.start(context, acting == "cached"), act, "percept")
 
 
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
@@ -166,10 +164,10 @@ def find_agent(name: str, acting: Acting = "cached") -> Agent:
 
 
 def _of_run(folder: Path, acting: Acting) -> Agent:
-    from baselines.histories import read_run
+    from baselines.histories import read_trained
 
-    run = read_run(folder)
-    policy = learned(run.method, run.params, run.context, acting)()
+    run = read_trained(folder)
+    policy = learned(run.method, run.params, run.context, acting)
 
     def make(layout: Layout) -> Policy:
         check_fits(run, layout, folder)
@@ -178,7 +176,7 @@ def _of_run(folder: Path, acting: Acting) -> Agent:
     return Agent(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})
 
 
-def check_fits(run: Run, layout: Layout, folder: Path) -> None:
+def check_fits(run: Trained, layout: Layout, folder: Path) -> None:
     """Raises OptionError: if a run's model cannot play on a layout; `folder` is named."""
     if layout.obs_shape != run.obs_shape:
         raise OptionError(

@@ -165,8 +165,10 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: b
     """Put results beside the paper's.
 
     RESULTS are folders that `evaluate` has made. Prints the paper's tables with its numbers beside ours, and writes
-    them as Markdown, CSV and curves. Results of one agent on different layouts are put together.
+    them as Markdown, CSV and curves, and of trained models a card. Results of one agent on different layouts are put
+    together.
     """
+    from baselines.model_card import write_model_cards
     from baselines.report import markdown, merge, read_run, write_report
 
     loaded = merge([read_run(run) for run in runs])
@@ -174,7 +176,8 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: b
     if html:
         from baselines.page import write_page_with_films
 
-        paths.append(write_page_with_films(loaded, html, episodes=films, suite=suite))
+        paths.append(write_page_with_films(loaded, html, films=films, suite=suite))
+    paths += write_model_cards(loaded, paths[0].parent)
     click.echo(markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")
@@ -244,10 +247,10 @@ def drift(run: Path, layout: str | None, family: str, protocol: str, episodes: i
     from baselines.agents import check_fits
     from baselines.drift import measure
     from baselines.evaluate import get_protocol
-    from baselines.histories import read_run
+    from baselines.histories import read_trained
     from generation.teammates.instances import INSTANCES, named_task
 
-    trained, played = read_run(run), get_protocol(protocol)
+    trained, played = read_trained(run), get_protocol(protocol)
     full = -(-trained.context // played.steps)
     played = dataclasses.replace(played, episodes=episodes or 3 * full)
     name = get_layout(layout or trained.layouts[0]).name

@@ -108,7 +108,7 @@ def _bandit_checks(
         return float((means.max(axis=1, keepdims=True) - got).sum(axis=1).mean())
 
     def ours(context: int) -> float:
-        policy = learned(method, state.params, context, greedy=False)()
+        policy = learned(method, state.params, context, greedy=False)
         return regret(worlds.play(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
 
     theirs = regret(worlds.play_bandits(choose, means, size.bandit_steps, rng)[0])
@@ -141,7 +141,7 @@ def ad_in_dark_room(folder: Path, size: Size, done: Callable[[int, float], None]
 
     def share(context: int) -> np.ndarray:
         """Of the best return, by episode."""
-        policy = learned(method, state.params, context, greedy=False)()
+        policy = learned(method, state.params, context, greedy=False)
         _, rewards = worlds.play(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
         returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)
         return (returns / best[:, None]).mean(axis=0)

@@ -32,7 +32,7 @@ from icrl4aht_data.commands import counted
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.schema import TASKS as RELEASE_TASKS
+from icrl4aht_data.schema import TASKS
 from icrl4aht_data.tasks import Task, manifest_path, read_tasks
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
@@ -163,7 +163,7 @@ def run_experiment(name: str, plan: Plan, out: Path, progress: Progress = lambda
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"
-    report.append(write_page_with_films(runs, page, episodes=plan.films, notes=notes, suite=plan.suite))
+    report.append(write_page_with_films(runs, page, films=plan.films, notes=notes, suite=plan.suite))
     return Done(report, notes)
 
 
@@ -241,7 +241,7 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
     release = load_icrl4aht(root, layout=layout).root
     met = {
         task.teammate["theta"]["sha256"]: task.task_id
-        for task in read_tasks(release / RELEASE_TASKS)
+        for task in read_tasks(release / TASKS)
         if task.teammate["kind"] == "rl" and task.split == "train"
     }
     for task in tasks:

@@ -10,7 +10,7 @@ import numpy as np
 
 from baselines.agents import get_agent
 from baselines.evaluate import evaluate, get_protocol
-from baselines.report import LAYOUTS, Run, as_run, published_cells
+from baselines.report import TEST_LAYOUTS, Run, as_run, published_cells
 from icrl4aht_data.benchmark import TRACKS
 from icrl4aht_data.cards import card_file, markdown_table
 from icrl4aht_data.commands import counted
@@ -61,7 +61,7 @@ def _markdown(table: dict[str, dict[str, dict[str, dict[str, float]]]]) -> str:
         "raise the return, so a method's score there says nothing about adaptation.",
     ]
     for protocol, layouts in table.items():
-        names = [layout for layout in LAYOUTS if layout in layouts]
+        names = [layout for layout in TEST_LAYOUTS if layout in layouts]
         cells = {(layout, family): cell for layout in names for family, cell in layouts[layout].items()}
         lines += ["", f"## Protocol `{protocol}`", "", headroom_table(cells, names)]
     if "published" in table:
@@ -76,7 +76,7 @@ def published_table(layouts: dict[str, dict[str, dict[str, float]]]) -> str:
         layouts: layout -> family -> reference ego -> mean return.
     """
     rows = []
-    for layout in (name for name in LAYOUTS if name in layouts):
+    for layout in (name for name in TEST_LAYOUTS if name in layouts):
         cells = layouts[layout]
         ours = {agent: np.mean([cell[agent] for cell in cells.values()]) for agent in REFERENCES}
         paper = {name: np.mean([published_cells(name)[layout][family][0] for family in cells]) for name in _PAPER}

@@ -152,7 +152,7 @@ def _rank(seed: int, *name: object) -> bytes:
     return hashlib.blake2b(repr((seed, *name)).encode(), digest_size=8).digest()
 
 
-class Run(NamedTuple):
+class Trained(NamedTuple):
     """A trained model."""
 
     method: Method
@@ -165,7 +165,7 @@ class Run(NamedTuple):
     hash: str  # of its settings
 
 
-def read_run(folder: Path) -> Run:
+def read_trained(folder: Path) -> Trained:
     """A run's model, at its last checkpoint.
 
     Raises:
@@ -192,4 +192,4 @@ def read_run(folder: Path) -> Run:
         checkpoints.close()
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
-    return Run(method, found.params, found.step, context, names, layouts[0].obs_shape, label, json_hash(config))
+    return Trained(method, found.params, found.step, context, names, layouts[0].obs_shape, label, json_hash(config))

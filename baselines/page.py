@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from baselines.pictures import plot_gain, plot_sweep
-from baselines.report import LAYOUTS, Run, plot_curves, read_published
+from baselines.report import TEST_LAYOUTS, Run, plot_curves, read_published
 from baselines.tables import AVERAGE, PAPER_TABLES, PaperTable, Point, Row, Score, fill, score, sweep
 from baselines.watching import Film, film_families
 from icrl4aht_data.errors import OptionError
@@ -35,13 +35,13 @@ img { max-width: 100%; height: auto } figcaption { font-size: 13px; color: #444 
 """
 
 
-def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Film] = (), notes: Sequence[str] = ()) -> Path:
+def write_page(runs: Sequence[Run], path: Path, films: Sequence[Film] = (), notes: Sequence[str] = ()) -> Path:
     """Write the page.
 
     Args:
         runs: merged, see `report.merge`; of any protocols, sweeps among them.
         path: ends in .html; replaced at once.
-        episodes: by family; see `watching.film_families`.
+        films: by family; see `watching.film_families`.
         notes: what a reader must know of these runs, such as what was left out.
 
     Raises:
@@ -57,8 +57,8 @@ def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Film] = (), n
         for protocol in protocols:
             own = [run for run in runs if run.protocol == protocol]
             parts += _protocol(protocol, own, Path(folder))
-    if episodes:
-        parts += _episodes(episodes)
+    if films:
+        parts += _films(films)
     parts += [_settings(runs), _sources()]
     head = f'<meta charset="utf-8"><title>ICRL4AHT report</title><style>{_STYLE}</style>'
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,13 +71,13 @@ def write_page(runs: Sequence[Run], path: Path, episodes: Sequence[Film] = (), n
 
 
 def write_page_with_films(
-    runs: Sequence[Run], path: Path, *, episodes: bool = True, notes: Sequence[str] = (), suite: Path | None = None
+    runs: Sequence[Run], path: Path, *, films: bool = True, notes: Sequence[str] = (), suite: Path | None = None
 ) -> Path:
     """The same, with an episode beside every family played for it, of at most three runs.
 
     `suite` is the folder that learned teammates' checkpoints are in.
     """
-    shown = _worth_seeing(runs)[:_FILMED] if episodes else []
+    shown = _worth_seeing(runs)[:_FILMED] if films else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
         notes = [*notes, f"episodes are of {_FILMED} runs at most; there is none of: {', '.join(left)}"]
@@ -166,7 +166,7 @@ def _score(score: Score) -> str:
 
 def _other_cells(runs: list[Run], protocol: str) -> list[str]:
     """Cells of no paper table: learned teammates, training layouts."""
-    usual = {(layout, family) for layout in LAYOUTS for family in HEURISTICS}
+    usual = {(layout, family) for layout in TEST_LAYOUTS for family in HEURISTICS}
     cells = list(dict.fromkeys(cell for run in runs for cell in run.cells if cell not in usual))
     if not cells:
         return []
@@ -215,7 +215,7 @@ def _headroom_table(protocol: str) -> str:
     body = []
     for family in HEURISTICS:
         row = [_th(family)]
-        for layout in LAYOUTS:
+        for layout in TEST_LAYOUTS:
             told = measured.get((layout, family))
             if told is None:
                 row.append('<td class="none">not measured</td>')
@@ -224,10 +224,10 @@ def _headroom_table(protocol: str) -> str:
                 row.append(f'<td class="{kind}">{" / ".join(f"{told[a]:z.1f}" for a in REFERENCES)}</td>')
         body.append((False, row))
     told = "<p>Mean return of the reference egos stay / random / oracle (scripted, full information).</p>"
-    return told + _table(["family", *LAYOUTS], body)
+    return told + _table(["family", *TEST_LAYOUTS], body)
 
 
-def _episodes(films: Sequence[Film]) -> list[str]:
+def _films(films: Sequence[Film]) -> list[str]:
     told = (
         "<p>The first episode of an evaluated task, when the ego remembers nothing yet. Ego blue, teammate red; the "
         "frame is what the ego sees.</p>"

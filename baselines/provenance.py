@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from baselines.report import ABOUT, TASKS
+from baselines.report import ABOUT, OWN_TASKS
 from baselines.runs import read_config
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of, json_hash, write_json
@@ -25,7 +25,7 @@ def note_results(results: Path, run: str | Path | None = None, tasks: Sequence[T
     if run is not None:
         note_run(Path(run), results)
     if tasks:
-        path = results / TASKS
+        path = results / OWN_TASKS
         known = {task.task_id: task for task in read_tasks(path)} if path.exists() else {}
         with file_in_place_of(path) as partial:
             write_tasks(partial, (known | {task.task_id: task for task in tasks}).values())

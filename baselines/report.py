@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from io import StringIO
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.evaluate import Result, read_result
-from icrl4aht_data.benchmark import FAMILIES, TRACKS
+from icrl4aht_data.benchmark import FAMILIES, LAYOUTS, TRACKS
 from icrl4aht_data.cards import card_file, markdown_table
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.figures import legend_below, save_figure
@@ -23,9 +23,8 @@ from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.headroom import Cell, has_headroom, read_headroom
 from icrl4aht_data.tasks import Task, manifest_path, read_tasks
 
-LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
-_EVERY_LAYOUT = tuple(dict.fromkeys(name for s in TRACKS.values() for names in s.values() for name in names))
-TASKS, ABOUT = "tasks.jsonl", "run.json"
+TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
+OWN_TASKS, ABOUT = "tasks.jsonl", "run.json"
 """Beside results: tasks that are not the published ones; what the evaluated model was trained on."""
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 _RESAMPLES = 10_000
@@ -84,7 +83,7 @@ def read_run(folder: Path) -> Run:
         raise OptionError(
             f"{folder}: no results in {folder / 'tasks'}; run `python -m baselines evaluate --out {folder}`"
         )
-    own = read_tasks(folder / TASKS) if (folder / TASKS).exists() else []
+    own = read_tasks(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
     about = parse_json(read_text(folder / ABOUT)) if (folder / ABOUT).exists() else None
     return as_run(results, str(folder), own, about)
 
@@ -103,8 +102,8 @@ def as_run(
     for result in results:
         if result.task_id not in known:
             raise OptionError(
-                f"{where}: {result.task_id!r} is not one of the published test tasks, and {TASKS} beside the results "
-                f"does not have it; evaluate again, or put the manifest there"
+                f"{where}: {result.task_id!r} is not one of the published test tasks, and {OWN_TASKS} beside the "
+                f"results does not have it; evaluate again, or put the manifest there"
             )
         task = known[result.task_id]
         cell = task.layout.name, task.teammate_family
@@ -118,7 +117,7 @@ def as_run(
 
 def place_of(cell: Cell) -> tuple[int, int]:
     """Where a cell stands in the paper's order."""
-    return _EVERY_LAYOUT.index(cell[0]), FAMILIES.index(cell[1])
+    return LAYOUTS.index(cell[0]), FAMILIES.index(cell[1])
 
 
 def merge(runs: Sequence[Run]) -> list[Run]:
@@ -208,13 +207,19 @@ def markdown(runs: list[Run]) -> str:
         "Mean ± std over the instances' means; below it the published number of the same agent, where there is one."
     ]
     for run in runs:
-        cells = {(row["layout"], row["family"]): row for row in rows(run)}
-        for track, splits in TRACKS.items():
-            of_track = dict.fromkeys((*splits["test"], *splits["train"]))
-            layouts = [layout for layout in of_track if any((layout, family) in cells for family in FAMILIES)]
-            if layouts:
-                lines += ["", f"## {run.name}, track {track}", "", _grid(cells, layouts)]
+        for track, table in tables(run):
+            lines += ["", f"## {run.name}, track {track}", "", table]
     return "\n".join(lines) + "\n"
+
+
+def tables(run: Run) -> Iterator[tuple[str, str]]:
+    """Of each track that was played, its name and its table, a column a layout."""
+    cells = {(row["layout"], row["family"]): row for row in rows(run)}
+    for track, splits in TRACKS.items():
+        of_track = dict.fromkeys((*splits["test"], *splits["train"]))
+        layouts = [layout for layout in of_track if any((layout, family) in cells for family in FAMILIES)]
+        if layouts:
+            yield track, _grid(cells, layouts)
 
 
 def families_of(cells: Iterable[Cell]) -> list[str]:
@@ -257,7 +262,7 @@ def plot_curves(runs: list[Run], path: Path) -> None:
     from matplotlib.figure import Figure
 
     every = [cell for run in runs for cell in run.cells]
-    layouts = [layout for layout in _EVERY_LAYOUT if any(cell[0] == layout for cell in every)]
+    layouts = [layout for layout in LAYOUTS if any(cell[0] == layout for cell in every)]
     families = families_of(every)
     figure = Figure(figsize=(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6), layout="constrained")
     axes = figure.subplots(len(families), len(layouts), squeeze=False, sharex=True)

@@ -26,18 +26,19 @@ import click
 import h5py
 import jax
 
+from benchmarks.histories import folder_size
 from generation.artefact import last_timing
 from generation.collect import make_learner, run_task
 from generation.learners.network import Widths
 from generation.profiles import Profile, load_profile
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark import EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.convert import PUBLISHED_CHUNK
 from icrl4aht_data.dataset import Dataset, History
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import HISTORIES, KINDS, TASKS
 from icrl4aht_data.tasks import Task, read_tasks
 
-_PAPER_CHUNK = 4096
 _PAPER_DTYPES = {
     "obs": "float32",
     "actions": "int32",
@@ -133,26 +134,21 @@ def sizes(streams: int) -> dict[str, Any]:
     tasks = read_tasks(dataset.root / TASKS)
     chosen = {task.task_id: dataset.filter(task_id=task.task_id)[:streams] for task in tasks}
     new = [
-        NewTask(task, {}, len(chosen[task.task_id]), lambda part=chosen[task.task_id]: map(_as_new, part))
+        NewTask(task, {}, len(chosen[task.task_id]), lambda part=chosen[task.task_id]: map(NewHistory.copied, part))
         for task in tasks
     ]
     transitions = sum(history.entry.T for part in chosen.values() for history in part)
     with tempfile.TemporaryDirectory() as folder:
-        found = {"paper": _folder_size(_paper_format(Path(folder) / "paper", chosen)) / transitions}
+        found = {"paper": folder_size(_paper_format(Path(folder) / "paper", chosen)) / transitions}
         for kind in KINDS:
             root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
-            found[kind] = _folder_size(root) / transitions
+            found[kind] = folder_size(root) / transitions
     return {
         "histories": sum(map(len, chosen.values())),
         "transitions": transitions,
         **{f"{name}_bytes_per_transition": round(size, 3) for name, size in found.items()},
         **{f"{kind}_smaller_by": round(found["paper"] / found[kind], 2) for kind in KINDS},
     }
-
-
-def _as_new(history: History) -> NewHistory:
-    names = [field.name for field in history.entry.stored_fields("lite")]
-    return NewHistory(history.entry.env_idx, {name: history.read(name) for name in names})
 
 
 def _paper_format(root: Path, chosen: dict[str, Dataset]) -> Path:
@@ -162,7 +158,7 @@ def _paper_format(root: Path, chosen: dict[str, Dataset]) -> Path:
         with h5py.File(root / f"{part[0].entry.layout}.h5", "a") as file, (root / HISTORIES).open("a") as index:
             for history, (name, array) in _paper_fields(part):
                 group = file.require_group(str(history.entry.history_id))
-                chunk = (min(_PAPER_CHUNK, len(array)), *array.shape[1:])
+                chunk = (min(PUBLISHED_CHUNK, len(array)), *array.shape[1:])
                 group.create_dataset(name, data=array, chunks=chunk, compression="gzip", compression_opts=6)
             index.writelines(json.dumps(entry.to_json()) + "\n" for entry in part.entries)
     return root
@@ -172,10 +168,6 @@ def _paper_fields(part: Dataset) -> Iterator[tuple[History, tuple[str, Any]]]:
     for history in part:
         for name, dtype in _PAPER_DTYPES.items():
             yield history, (name, history.read(name).astype(dtype))
-
-
-def _folder_size(root: Path) -> int:
-    return sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
 
 
 @click.command()

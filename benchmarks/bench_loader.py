@@ -6,8 +6,8 @@ All read the same histories (made from the bundled ones, each shifted by whole e
     fair        the same data in chunks of 500, read_direct into a preallocated batch
     ours        ram, mmap, stream (with and without decoded chunks kept); states, uint8, float32; batch buffers reused
 
-Readers take turns, round by round; a ratio is the median over rounds of the ratio within a round. Targets are those of
-the project's issue, printed beside what was measured. One JSON line each.
+Readers take turns, round by round; a ratio is the median over rounds of the ratio within a round. Targets are printed
+beside what was measured. One JSON line each.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import click
 import h5py
 import numpy as np
 
-from benchmarks.histories import write_many
+from benchmarks.histories import folder_size, write_many
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.convert import to_published, to_release
 from icrl4aht_data.dataset import Dataset
@@ -51,10 +51,6 @@ def say(**facts: Any) -> None:
 def resident() -> int:
     """Bytes of memory that this process has now."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def folder_size(path: Path) -> int:
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
 def make_data(folder: Path, layout: str, histories: int) -> None:

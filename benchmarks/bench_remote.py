@@ -5,7 +5,7 @@
     stream      one AD batch without downloading: requests a window, share of the bytes of the layout's shards
     repair      after flipped bits: share of the shard that is fetched again
 
-One JSON line each. Exits with 1 if a target of the project's issue is missed or data come out otherwise than locally.
+One JSON line each. Exits with 1 if a target is missed or data come out otherwise than locally.
 """
 
 from __future__ import annotations

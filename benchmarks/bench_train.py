@@ -33,13 +33,12 @@ from baselines.trainer import Trainer, TrainOptions
 from generation.teammates.base import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS, TRACKS, track_of
-from icrl4aht_data.convert import HISTORIES_H5, to_published
+from icrl4aht_data.benchmark import TRACKS, track_of
+from icrl4aht_data.convert import FROM_PUBLISHED, HISTORIES_H5, to_published
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling import ADBatch, ADSampler
 
-_OUR_ACTIONS = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
 _TARGET_RATIO, _TARGET_MINUTES = 20, 30
 
 
@@ -64,7 +63,7 @@ def published_batches(folder: Path, draw: ADSampler) -> Generator[ADBatch]:
 
 def _window(group: Any, start: int, length: int) -> dict[str, np.ndarray]:
     before = max(start - 1, 0)
-    actions = _OUR_ACTIONS[group["actions"][before : start + length]]
+    actions = FROM_PUBLISHED[group["actions"][before : start + length]]
     rewards = group["rewards"][before : start + length].astype(np.float32)
     if start == 0:
         actions, rewards = np.append(np.int32(0), actions), np.append(np.float32(0), rewards)
@@ -153,7 +152,7 @@ def compare_acting(layout: Layout, model: ModelOptions, context: int, steps: int
 
 
 def _ego(method: Method, params: Any, context: int, acting: Acting) -> Any:
-    policy = learned(method, params, context, acting)()
+    policy = learned(method, params, context, acting)
     return lambda layout: policy
 
 

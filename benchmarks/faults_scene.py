@@ -23,7 +23,6 @@ from icrl4aht_data.dataset import Dataset, Options
 from icrl4aht_data.download import ORIGIN, fetch_planned, plan_download
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.index import read_index
-from icrl4aht_data.manifest import read_manifest
 from icrl4aht_data.remote import open_root
 from icrl4aht_data.schema import MANIFEST, held_fields
 from icrl4aht_data.shard import Shards
@@ -244,8 +243,3 @@ def _hash(some: Iterable[np.ndarray]) -> bytes:
     for array in some:
         digest.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())
     return digest.digest()
-
-
-def listed(folder: Path) -> list[str]:
-    """The files of a release, its manifest included."""
-    return [*read_manifest(folder), MANIFEST]

@@ -35,3 +35,8 @@ def _shifted(source: Dataset, histories: int) -> Iterator[NewHistory]:
             for field in held_fields("lite")
         }
         yield NewHistory(number, arrays)
+
+
+def folder_size(folder: Path) -> int:
+    """Bytes of all its files."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -39,12 +39,12 @@ def build_suite(
     Returns:
         What the filter left of each population that was asked for.
     """
-    names = _names(layouts or profile.layouts)
+    names = _names(layouts)
     for name in algorithms:
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
-    todo = runs(profile, names, algorithms or ALGORITHMS, seed)
+    todo = runs(profile, names, algorithms, seed)
     wanted = [(run.layout.name, run.algorithm) for run in todo]
     for wait in (False, True):
         todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
@@ -140,9 +140,9 @@ def report_diversity(
         )
     for name in names:
         layout = get_layout(name)
-        for algorithm in algorithms or ALGORITHMS:
+        for algorithm in algorithms:
             _report_population(suite, layout, algorithm, greedy, console)
-        _report_distances(suite, layout, algorithms or ALGORITHMS, console)
+        _report_distances(suite, layout, algorithms, console)
 
 
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:

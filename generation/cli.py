@@ -87,7 +87,7 @@ def cli() -> None:
     "--workers",
     type=COUNT,
     help="Tasks at a time on the Ray made here.",
-    show_default="as many as cores",
+    show_default="one per GPU, or per core",
 )
 @click.option("--retries", type=COUNT_OR_NONE, default=0, help="Of a task that failed.")
 @click.option("--fail-fast", is_flag=True, help="Begin no task after one has failed.")
@@ -228,6 +228,7 @@ _algorithms = click.option(
     "algorithms",
     type=Names("algorithm", lambda: ALGORITHMS),
     multiple=True,
+    default=ALGORITHMS,
     help="fcp, brdiv, lbrdiv or comedi; again for more.",
     show_default="all",
 )
@@ -248,7 +249,9 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
     from generation.build_suite import build_suite
     from generation.profiles import load_profile
 
-    build_suite(load_profile(profile_name), suite, layouts, algorithms, seed, console)
+    ask_for_determinism()
+    profile = load_profile(profile_name)
+    build_suite(profile, suite, layouts or profile.learned_on, algorithms, seed, console)
 
 
 @cli.command()

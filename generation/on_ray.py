@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -48,13 +48,17 @@ def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> G
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
                 for reference in ready:
                     yield _outcome(ray, reference, pending.pop(reference), options)
-                for task in pending.values():
-                    timing = last_timing(job.folder(task))
-                    if timing:
-                        board.running(task.task_id, int(timing["update"]) + 1, timing["steps_per_second"])
+                _show(job, pending.values(), board)
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
+
+
+def _show(job: Job, tasks: Iterable[Task], board: Board) -> None:
+    for task in tasks:
+        timing = last_timing(job.folder(task))
+        if timing:
+            board.running(task.task_id, int(timing["update"]) + 1, timing["steps_per_second"])
 
 
 def _work(job: Job, task: Task) -> str:

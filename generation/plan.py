@@ -189,6 +189,4 @@ def bytes_per_transition(kind: Kind) -> float:
 
 
 def _first_history(task: Task) -> list[NewHistory]:
-    history = load_icrl4aht(task_id=task.task_id)[0]
-    names = [field.name for field in history.entry.stored_fields("lite")]
-    return [NewHistory(history.entry.env_idx, {name: history.read(name) for name in names})]
+    return [NewHistory.copied(load_icrl4aht(task_id=task.task_id)[0])]

@@ -6,7 +6,7 @@ import json
 import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -109,34 +109,42 @@ def collect_tasks(
         else:
             todo.append(task)
     missing = {task.task_id for task in todo}
-    execute = _executor(options)
     failures = FailureLog(out / FAILED)
-    with Board(console, len(todo), profile.ego.updates) as board:
-        for wait in (False, True):
-            job = Job(profile, artefacts, suite, wait)
-            busy: list[Task] = []
-            with closing(execute(job, todo, board, options)) as outcomes:
-                for outcome in outcomes:
-                    if outcome.status == "busy":
-                        console.print(f"{_label(outcome.task, tasks)}: another collector is at it")
-                        busy.append(outcome.task)
-                        continue
-                    board.ended(outcome.task.task_id)
-                    console.print(f"{_label(outcome.task, tasks)}: {_in_words(outcome, job.folder(outcome.task))}")
-                    if outcome.status == "done":
-                        missing.remove(outcome.task.task_id)
-                        failures.forget([outcome.task.task_id])
-                    else:
-                        failures.add(outcome)
-                        if options.fail_fast:
-                            raise CollectionError(f"{failures.path}: the first failure: {outcome.error}")
-            todo = busy
+    job = Job(profile, artefacts, suite, wait=False)
+    with Board(console, len(todo), profile.ego.updates) as board, closing(_outcomes(job, todo, board, options)) as ends:
+        for outcome in ends:
+            label = _label(outcome.task, tasks)
+            if outcome.status == "busy":
+                console.print(f"{label}: another collector is at it")
+                continue
+            board.ended(outcome.task.task_id)
+            console.print(f"{label}: {_in_words(outcome, job.folder(outcome.task))}")
+            if outcome.status == "done":
+                missing.remove(outcome.task.task_id)
+                failures.forget([outcome.task.task_id])
+                continue
+            failures.add(outcome)
+            if options.fail_fast:
+                raise CollectionError(f"{failures.path}: the first failure: {outcome.error}")
     failures.forget({task.task_id for task in tasks} - missing)
     if missing:
         raise CollectionError(
             f"{len(missing)} of {len(tasks)} tasks have no artefact: {', '.join(sorted(missing))}; "
             f"{failures.path} says why, and the same command tries them again"
         )
+
+
+def _outcomes(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
+    """Of every task; those that another collector is at come again at the end, when it has been waited for."""
+    execute = _executor(options)
+    for wait in (False, True):
+        busy: list[Task] = []
+        with closing(execute(replace(job, wait=wait), tasks, board, options)) as outcomes:
+            for outcome in outcomes:
+                if outcome.status == "busy":
+                    busy.append(outcome.task)
+                yield outcome
+        tasks = busy
 
 
 class FailureLog:

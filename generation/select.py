@@ -12,7 +12,7 @@ from filelock import FileLock
 
 from generation.learners.checkpoint import WEIGHTS
 from generation.suite import Checkpoint, checkpoints
-from icrl4aht_data.benchmark import ALGORITHMS, TRACKS, track_of
+from icrl4aht_data.benchmark import ALGORITHMS, LAYOUTS, TRACKS, track_of
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import file_in_place_of
 from icrl4aht_data.manifest import file_hash
@@ -76,8 +76,7 @@ def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list
 
 def layout_number(layout: str) -> int:
     """A layout's place among all, for seeds."""
-    every = [name for splits in TRACKS.values() for names in splits.values() for name in names]
-    return list(dict.fromkeys(every)).index(layout)
+    return LAYOUTS.index(layout)
 
 
 def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[str, Any]:

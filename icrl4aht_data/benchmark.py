@@ -27,6 +27,9 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """track -> split -> layouts (paper, App. A)."""
 
+LAYOUTS = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
+"""Every layout of the benchmark, in the paper's order; its place here goes into seeds."""
+
 SPLITS = ("train", "test", "heldout")
 """`heldout` has the training layouts and learned teammates that `train` does not have (paper, App. F)."""
 
@@ -67,7 +70,7 @@ def track_of(layout: str) -> str:
     for track, splits in TRACKS.items():
         if any(layout in layouts for layouts in splits.values()):
             return track
-    raise unknown("layout", layout, [name for splits in TRACKS.values() for s in splits.values() for name in s])
+    raise unknown("layout", layout, LAYOUTS)
 
 
 def check_place(track: object, split: object, layout: object) -> None:

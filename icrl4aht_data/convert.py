@@ -71,7 +71,8 @@ PUBLISHED_FIELDS = (
 """Fields of an index line (paper, App. D.3)."""
 
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)
-_FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
+FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
+"""Action id of the published files -> ours."""
 
 Advance = Callable[[int, int], None]
 """Called with how many histories are done, and how many there are."""
@@ -351,7 +352,7 @@ class _Group:
             found = read_dataset(member(self._file, f"{self.line['h5_group']}/{name}"), expected)
         array = self._whole(name, found)
         if name in ACTION_FIELDS:
-            return _FROM_PUBLISHED[array]
+            return FROM_PUBLISHED[array]
         if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self._kept_steps))):
             raise PublishedFormatError(
                 f"{self._where}: dones: expected an end every {self._kept_steps} steps, found {array.sum()} in {steps} "

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -43,6 +43,9 @@ from icrl4aht_data.shard_writer import stored_bytes, write_shard
 from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import NamedTask, Task, write_tasks
 
+if TYPE_CHECKING:
+    from icrl4aht_data.dataset import History
+
 CARD = "README.md"
 """What a release is, for people."""
 
@@ -65,6 +68,12 @@ class NewHistory:
 
     env_idx: int
     arrays: Mapping[str, np.ndarray]
+
+    @classmethod
+    def copied(cls, history: History) -> NewHistory:
+        """What a history of any release is to a lite one."""
+        names = [field.name for field in history.entry.stored_fields("lite")]
+        return cls(history.entry.env_idx, {name: history.read(name) for name in names})
 
 
 @dataclass(frozen=True)

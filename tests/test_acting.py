@@ -17,7 +17,7 @@ from baselines.agents import find_agent
 from baselines.cli import cli
 from baselines.drift import measure
 from baselines.evaluate import PROTOCOLS, evaluate
-from baselines.histories import HistoryOptions, prepare, read_run
+from baselines.histories import HistoryOptions, prepare, read_trained
 from baselines.method import SIZES, ModelOptions
 from baselines.methods import get_method, kitchen
 from baselines.runs import Checkpoints, open_run, versions
@@ -55,7 +55,7 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
     assert agent.name == label
     (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(result.returns) == (1, 2)
-    run = read_run(runs / name)
+    run = read_trained(runs / name)
     assert result.settings["details"] == {"run": run.hash, "step": 2, "context": 30, "acting": acting}
     with pytest.raises(OptionError, match="holds a result of other settings"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)

@@ -18,7 +18,7 @@ from baselines.cli import cli
 from baselines.evaluate import read_result
 from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, Plan, held_out_tasks, run_experiment
 from baselines.method import ModelOptions
-from baselines.report import LAYOUTS, read_run
+from baselines.report import TEST_LAYOUTS, read_run
 from baselines.runs import Checkpoints
 from baselines.watching import film_families
 from generation.learners.checkpoint import WEIGHTS, save_policy
@@ -53,7 +53,7 @@ def test_the_settings_are_the_papers():
         for e in EXPERIMENTS["ablate ta"].entries
     ]
     assert auxiliary == [(False, False), (True, False), (False, True), (True, True)]
-    assert {TESTED_ON[layout] for layout in EXPERIMENTS["tracks"].layouts} == {*LAYOUTS}
+    assert {TESTED_ON[layout] for layout in EXPERIMENTS["tracks"].layouts} == {*TEST_LAYOUTS}
     assert TESTED_ON["demo_wide"] == "demo_wide"
     assert (TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]) == ("asymm_right", "cramped_down")
 

@@ -200,7 +200,7 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
         f"{agent} beside {mate} on demo_wide" for mate in ("H1/t4", "H4/t4") for agent in ("AD", "DPT", "AD, K = 250")
     ]
     assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
-    assert "An episode per family" not in write_page_with_films(runs, tmp_path / "r.html", episodes=False).read_text()
+    assert "An episode per family" not in write_page_with_films(runs, tmp_path / "r.html", films=False).read_text()
 
 
 def test_egos_that_cannot_be_made_again_say_why(tmp_path):

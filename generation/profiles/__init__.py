@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,8 @@ from icrl4aht_data.tasks import Task, make_task
 
 FOLDER = Path(__file__).parent
 
-_MAY_BE_ZERO: dict[str, str] = {
-    "entropy": "0 or more",
-    "value": "0 or more",
-    "warmup": "0 to 1",
-    "discount": "0 to 1",
-    "gae_lambda": "0 to 1",
-}
+_FROM_ZERO_TO: dict[str, float] = {"entropy": inf, "value": inf, "warmup": 1, "discount": 1, "gae_lambda": 1}
+"""The largest value of what may be zero; everything else is positive."""
 
 
 @dataclass(frozen=True)
@@ -158,10 +154,18 @@ def _ppo(section: str, table: dict[str, Any], defaults: PPOConfig) -> PPOConfig:
         if known.name in table and known.name != "widths":
             key = f"{section}.{known.name}"
             value = _typed(key, table[known.name], int if known.type == "int" else float)
-            expected = _MAY_BE_ZERO.get(known.name, "a positive number")
-            if value < 0 or (value == 0 and known.name not in _MAY_BE_ZERO) or ("1" in expected and value > 1):
-                raise OptionError(f"{key} = {value}: expected {expected}")
+            _check_range(key, value, _FROM_ZERO_TO.get(known.name))
     return replace(defaults, **table)
+
+
+def _check_range(key: str, value: float, most: float | None) -> None:
+    """`most` is the largest value of what may be zero; None of what may not."""
+    if most is None:
+        fits, expected = value > 0, "a positive number"
+    else:
+        fits, expected = 0 <= value <= most, "0 or more" if most == inf else f"0 to {most}"
+    if not fits:
+        raise OptionError(f"{key} = {value}: expected {expected}")
 
 
 def _names(key: str, value: Any) -> tuple[str, ...]:
