@@ -17,9 +17,10 @@ import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, EGO
 from icrl4aht_data.cache import free_memory
-from icrl4aht_data.dataset import MINI, History, Names
+from icrl4aht_data.dataset import MINI, Names
 from icrl4aht_data.download import ORIGIN, chosen_files
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError
+from icrl4aht_data.history import History
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, read_manifest
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
