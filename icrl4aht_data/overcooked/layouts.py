@@ -22,6 +22,12 @@ EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
 FACINGS = ("up", "down", "right", "left")
 """Facing names in the order of the observation's facing channels."""
 
+STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
+"""Facing name -> (dx, dy) to the cell ahead."""
+
+FACING_OF = np.array([FACINGS.index(name) for name in ACTIONS if name in FACINGS])
+"""int64 (4,): the facing that a directional action (up, down, left, right) turns to."""
+
 PLATE, COOKED = 1, 2
 """Flag bits of an item byte. The counts of the layout's piled ingredients follow, two bits each."""
 
@@ -32,7 +38,6 @@ NOWHERE = 255
 """Table entry for 'no such column' or 'not in view'."""
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
-_STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
 _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
 
 
@@ -149,7 +154,7 @@ class Layout:
         seen, queue = {start}, deque([start])
         while queue:
             cell = queue.popleft()
-            for dx, dy in _STEP.values():
+            for dx, dy in STEP.values():
                 x, y = cell % self.width + dx, cell // self.width + dy
                 inside = 0 <= x < self.width and 0 <= y < self.height
                 neighbour = y * self.width + x
@@ -170,7 +175,7 @@ class Layout:
         """uint8 (cells, 4): the cell that an agent on a walkable cell faces, by facing; 0 elsewhere."""
         table = np.zeros((self.cells, 4), np.uint8)
         for facing, name in enumerate(FACINGS):
-            dx, dy = _STEP[name]
+            dx, dy = STEP[name]
             table[self.walkable, facing] = self.walkable.nonzero()[0] + dy * self.width + dx
         return table
 
