@@ -34,6 +34,12 @@ PLATE, COOKED = 1, 2
 WINDOW = 5
 """Side of the square observation window."""
 
+VISIBLE = WINDOW * WINDOW
+"""Cells of it."""
+
+CENTRE = VISIBLE // 2
+"""The one among them, in reading order, on which the agent stands that sees them."""
+
 NOWHERE = 255
 """Table entry for 'no such column' or 'not in view'."""
 
@@ -209,13 +215,21 @@ class Layout:
     @cached_property
     def window(self) -> np.ndarray:
         """int16 (cells, 25): the cells of the 5 x 5 window centred on a cell, in reading order; -1 outside the map."""
-        table = np.full((self.cells, WINDOW * WINDOW), -1, np.int16)
+        table = np.full((self.cells, VISIBLE), -1, np.int16)
         reach = WINDOW // 2
         for cell in range(self.cells):
-            for k in range(WINDOW * WINDOW):
+            for k in range(VISIBLE):
                 x, y = cell % self.width + k % WINDOW - reach, cell // self.width + k // WINDOW - reach
                 if 0 <= x < self.width and 0 <= y < self.height:
                     table[cell, k] = y * self.width + x
+        return table
+
+    @cached_property
+    def place_in_window(self) -> np.ndarray:
+        """uint8 (cells, cells): where in the first cell's window the second one is, or NOWHERE."""
+        table = np.full((self.cells, self.cells), NOWHERE, np.uint8)
+        cell, place = np.nonzero(self.window >= 0)
+        table[cell, self.window[cell, place]] = place
         return table
 
     def __repr__(self) -> str:
