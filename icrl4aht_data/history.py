@@ -13,7 +13,7 @@ from icrl4aht_data.cache import new_array
 from icrl4aht_data.errors import LabelsMissingError, NotStoredError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.paint import paint
-from icrl4aht_data.schema import FIELDS, Entry, Field, episode_returns
+from icrl4aht_data.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.shard import Shard
 
 Obs = Literal["float32", "uint8", "state"]
@@ -43,6 +43,11 @@ class History:
             f"return {e.return_start:.1f} -> {e.return_end:.1f})"
         )
 
+    @property
+    def kind(self) -> Kind:
+        """Of the release: "full", "lite" or "observations"."""
+        return self._shard.kind
+
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
 
@@ -55,7 +60,7 @@ class History:
         rows = self.entry.rows(field)
         start, stop, _ = slice(start, stop).indices(rows)
         stop = max(start, stop)
-        if self._shard.kind in field.absent:
+        if self.kind in field.absent:
             return self._painted(start, stop, np.uint8)
         if self._shard.is_remote:
             bring(self._shard.lacking(self._shard.needed(self.entry.history_id, field, start, stop)))
@@ -70,7 +75,7 @@ class History:
         if name not in FIELDS:
             raise unknown("field", name, FIELDS)
         field = FIELDS[name]
-        if field.row == "state" and self._shard.kind in field.absent:
+        if field.row == "state" and self.kind in field.absent:
             raise NotStoredError(
                 f"{self._shard.path}: no {name}: this release has observations only, which do not determine the state; "
                 f"what needs states, such as replay and drawing, needs a full or lite release"
@@ -169,6 +174,6 @@ class LazyArray:
         return self[:].astype(dtype or self.dtype, copy=False)
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        if self._name == "obs" and self._history._shard.kind in FIELDS["obs"].absent:
+        if self._name == "obs" and self._history.kind in FIELDS["obs"].absent:
             return self._history._painted(start, max(start, stop), self.dtype)
         return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)
