@@ -48,8 +48,8 @@ from icrl4aht_data.commands import (
     run,
     version_option,
 )
-from icrl4aht_data.dataset import OBS
 from icrl4aht_data.errors import EmptySelectionError, OptionError
+from icrl4aht_data.history import OBS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.sampling import CONTEXT_ORDERS
 

@@ -15,9 +15,10 @@ from baselines.method import Method, ModelOptions
 from baselines.methods import get_method, kitchen
 from baselines.runs import Checkpoints, read_config
 from baselines.trainer import Data, TrainOptions
-from icrl4aht_data.dataset import Dataset, Obs, load_icrl4aht
+from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import json_hash
+from icrl4aht_data.history import Obs
 from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.sampling import ContextOrder

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Int, Key, UInt8
 from generation.teammates.base import Policy
 from generation.teammates.paths import Paths, Scene
 from icrl4aht_data.benchmark import EGO, INTERACT, STAY, TEAMMATE
-from icrl4aht_data.overcooked.layouts import COOKED, GOAL, PILE, PLATE, PLATES, POT, WALL, Layout
+from icrl4aht_data.overcooked.layouts import COOKED, FACING_OF, GOAL, PILE, PLATE, PLATES, POT, WALL, Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
 
 FAR = 1000
@@ -33,7 +33,6 @@ NEVER = 10_000
 PATIENCE = 10
 """Steps without a change in the pots after which the ego stops waiting for the teammate."""
 
-_FACING_OF = np.array([0, 1, 3, 2])  # action up, down, left, right -> facing up, down, right, left
 _DISH = np.uint8(PLATE | COOKED)
 
 
@@ -88,7 +87,7 @@ def _ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray
     ends = np.repeat(layout.moves[None, :, :4].astype(int), count, axis=0)  # (O, cells, actions)
     ends = np.where(ends == obstacles[:, None, None], np.arange(cells)[:, None], ends)
     while True:
-        after = time[np.arange(count)[:, None, None], ends, _FACING_OF]  # (O, cells, actions, cells)
+        after = time[np.arange(count)[:, None, None], ends, FACING_OF]  # (O, cells, actions, cells)
         shorter = np.minimum(time, after.min(axis=2, keepdims=True) + 1)
         if np.array_equal(shorter, time):
             return time, np.where(time == 0, INTERACT, after.argmin(axis=2)[:, :, None]).astype(np.int32)

@@ -34,7 +34,8 @@ from generation.profiles import Profile, load_profile
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark import EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.convert import PUBLISHED_CHUNK
-from icrl4aht_data.dataset import Dataset, History
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.history import History
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import HISTORIES, KINDS, TASKS
 from icrl4aht_data.tasks import Task, read_tasks

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
-from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 from rich.table import Table
 
 from icrl4aht_data.benchmark import KEPT_STEPS
@@ -22,6 +22,7 @@ from icrl4aht_data.commands import (
     Root,
     Sections,
     bars,
+    counted,
     examples,
     filter_options,
     json_option,
@@ -217,11 +218,8 @@ def download(
     plan = plan_download(str(root), to=to, **_wanted(filters))
     facts = plan.to_json()
     if not dry_run:
-        console = Console(stderr=True)
-        columns = (*Progress.get_default_columns(), DownloadColumn(), TransferSpeedColumn())
-        with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
-            bar = bars.add_task("download", total=plan.size)
-            traffic = fetch_planned(plan, lambda size: bars.advance(bar, size))
+        with bars(quiet, of_bytes=True) as show:
+            traffic = fetch_planned(plan, counted(show, "download", plan.size))
         facts |= {"fetched_bytes": traffic.bytes, "requests": traffic.requests}
     if as_json:
         click.echo(json.dumps(facts, indent=2))
@@ -341,13 +339,9 @@ def convert(
     """
     from icrl4aht_data import convert as forms
 
-    console = Console(stderr=True)
-    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as bars:
-        bar = bars.add_task("histories", total=None)
-
-        def advance(done: int, total: int) -> None:
-            bars.update(bar, completed=done, total=total)
-
+    with bars(quiet) as show:
+        advance = partial(show, "histories")
+        advance(0, None)  # how many there are is known only later
         if isinstance(source, Path) and (source / forms.HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, and whole")

@@ -15,7 +15,7 @@ import numpy as np
 from icrl4aht_data.benchmark import ACTIONS, FAMILIES, check_place, unknown
 from icrl4aht_data.cache import cached_arrays, content_hash
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
-from icrl4aht_data.files import LINE_BYTES, parse_json, plain_size
+from icrl4aht_data.files import LINE_BYTES, errors_of, parse_json, plain_size
 from icrl4aht_data.manifest import LARGEST
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.schema import FINITE, JSON_TYPES, LONGEST, Entry, is_name
@@ -114,15 +114,11 @@ def read_columns(path: Path) -> Columns:
     Raises:
         IndexFormatError: names the file and the line.
     """
-    try:
+    with errors_of(path):
         size = plain_size(path, LARGEST)
         if size < _UNCACHED:
             return Columns(_parse(path))
         key = f"index-{_VERSION}-{content_hash(path)}"
-    except FileNotFoundError as error:
-        raise IndexFormatError(f"{path}: missing; fetch the release again") from error
-    except OSError as error:
-        raise IndexFormatError(f"{path}: cannot be read: {error.strerror}") from error
     parsed: dict[str, np.ndarray] = {}
 
     def build(folder: Path) -> None:
@@ -157,17 +153,12 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
 
 def _blocks(path: Path) -> Iterator[bytes]:
     """The file in blocks of whole lines, without the last line's end."""
-    try:
-        with path.open("rb") as stream:
-            while text := stream.read(_BLOCK):
-                text += stream.readline(LINE_BYTES)
-                if len(text) - text.rfind(b"\n", 0, -1) > LINE_BYTES:
-                    raise IndexFormatError(f"{path}: a line has more than {LINE_BYTES:,} bytes")
-                yield text.removesuffix(b"\n")
-    except FileNotFoundError as error:
-        raise IndexFormatError(f"{path}: missing; fetch the release again") from error
-    except OSError as error:
-        raise IndexFormatError(f"{path}: cannot be read: {error.strerror}") from error
+    with errors_of(path), path.open("rb") as stream:
+        while text := stream.read(_BLOCK):
+            text += stream.readline(LINE_BYTES)
+            if len(text) - text.rfind(b"\n", 0, -1) > LINE_BYTES:
+                raise IndexFormatError(f"{path}: a line has more than {LINE_BYTES:,} bytes")
+            yield text.removesuffix(b"\n")
 
 
 class _Merged:

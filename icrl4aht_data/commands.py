@@ -9,6 +9,7 @@ import errno
 import math
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 
 from icrl4aht_data.benchmark import FAMILIES, SPLITS, TRACKS, unknown
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError
@@ -222,11 +223,17 @@ def examples(*lines: str) -> str:
 
 
 @contextmanager
-def bars(quiet: bool = False) -> Iterator[Callable[..., None]]:
+def bars(quiet: bool = False, of_bytes: bool = False) -> Iterator[Callable[..., None]]:
     """Progress of several things, on a terminal only: call what is given with a name, how many are done, of how many,
-    and maybe a note."""
+    and maybe a note.
+
+    Args:
+        quiet: show nothing.
+        of_bytes: what is counted are bytes: show them, and their speed.
+    """
     console, running = Console(stderr=True), {}
-    with Progress(console=console, disable=quiet or not console.is_terminal, transient=True) as shown:
+    columns = (*Progress.get_default_columns(), *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()))
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as shown:
 
         def show(what: str, done: int, of: int | None, note: str = "") -> None:
             if what not in running:
@@ -237,13 +244,14 @@ def bars(quiet: bool = False) -> Iterator[Callable[..., None]]:
 
 
 def counted(show: Callable[..., None], what: str, of: int) -> Callable[[int], None]:
-    """For who says how many more are done: the same bar, from 0 on."""
-    total = 0
+    """For who says how many more are done, from any thread: the same bar, from 0 on."""
+    total, lock = 0, threading.Lock()
 
     def more(number: int) -> None:
         nonlocal total
-        total += number
-        show(what, total, of)
+        with lock:
+            total += number
+            show(what, total, of)
 
     more(0)
     return more

@@ -74,7 +74,7 @@ _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np
 FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
 """Action id of the published files -> ours."""
 
-Advance = Callable[[int, int], None]
+HistoriesDone = Callable[[int, int], None]
 """Called with how many histories are done, and how many there are."""
 
 
@@ -82,7 +82,7 @@ def _quiet(done: int, total: int) -> None:
     pass
 
 
-def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Advance = _quiet) -> Path:
+def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: HistoriesDone = _quiet) -> Path:
     """The selection as a release of that kind, histories in order, numbered anew from 0.
 
     Args:
@@ -136,7 +136,12 @@ def _errors_as(what: str) -> Iterator[None]:
 
 
 def to_published(
-    dataset: Dataset, target: Path, *, chunk: int = PUBLISHED_CHUNK, states: bool = True, advance: Advance = _quiet
+    dataset: Dataset,
+    target: Path,
+    *,
+    chunk: int = PUBLISHED_CHUNK,
+    states: bool = True,
+    advance: HistoriesDone = _quiet,
 ) -> Path:
     """The selection as the published code's two files, numbered anew from 0.
 
@@ -199,7 +204,7 @@ def from_published(
     tasks: Path | None = None,
     data_version: str = "0.1.0",
     kept_steps: int = KEPT_STEPS,
-    advance: Advance = _quiet,
+    advance: HistoriesDone = _quiet,
 ) -> Kind:
     """A release from a folder with the published code's two files.
 

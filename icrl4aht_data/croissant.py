@@ -14,7 +14,7 @@ from typing import Any
 from icrl4aht_data.cards import card_file
 from icrl4aht_data.dataset_card import TWIN
 from icrl4aht_data.descriptions import ARRAY_TEXTS, ENTRY_TEXTS
-from icrl4aht_data.index import read_info
+from icrl4aht_data.info import read_info
 from icrl4aht_data.schema import FIELDS, JSON_TYPES
 
 CROISSANT = "croissant.json"

@@ -24,13 +24,12 @@ from icrl4aht_data.benchmark import (
 from icrl4aht_data.cards import card_file, fill, markdown_table
 from icrl4aht_data.descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 from icrl4aht_data.errors import IndexFormatError
-from icrl4aht_data.files import parse_json, read_text
 from icrl4aht_data.headroom import headroom_table, read_headroom
 from icrl4aht_data.index import read_index
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.statistics import STREAMS_RECORDED, layout_statistics, statistics_rows
-from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.tasks import Task, read_provenance, read_tasks
 
 PROTOCOL = "published"
 """The evaluation protocol whose headroom is shown: that of the paper's numbers."""
@@ -86,7 +85,7 @@ def dataset_card(root: Path) -> str:
         ReleaseError: if the release cannot be read.
     """
     index = read_index(root)
-    provenance = parse_json(read_text(root / PROVENANCE))
+    provenance = read_provenance(root / PROVENANCE)
     try:
         return _card(_Release(root, index.info, list(index.entries), read_tasks(root / TASKS), provenance))
     except (AttributeError, KeyError, TypeError) as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.files import file_in_place_of, holds, parse_json, read_text, write_json
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.manifest import file_hash, inside, read_manifest
-from icrl4aht_data.remote import HubRemote, Remote, Root, alone, is_address, open_root
+from icrl4aht_data.remote import Advance, HubRemote, Remote, Root, alone, is_address, open_root
 from icrl4aht_data.schema import MANIFEST
 from icrl4aht_data.shard import chunk_table_name
 from icrl4aht_data.transport import Patience, Traffic
@@ -25,9 +25,6 @@ ORIGIN = ".origin.json"
 
 _PLAIN = re.compile(r"(hf|s3|https?)://[^:\s]+(:\d+)?(/[^:\s]*)?")
 """Addresses that a note may send us to; fsspec knows others, of this machine's own files, or in chains."""
-
-Advance = Callable[[int], None]
-"""Called with the bytes that have arrived since the last call."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ WEIGHTS = ("uniform", "length")
 """How histories are weighted in a draw: equally, or by the steps they offer. Or one number for each history."""
 
 Episodes = tuple[int | None, int | None]
-"""First and last-but-one episode, as a slice has them: (None, 10) the first ten, (-10, None) the last ten."""
+"""The first episode, and the one behind the last, as a slice has them: (None, 10) the first ten, (-10, None) the last
+ten."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class EmptySelectionError(Icrl4ahtError, ValueError):
 
 
 class OptionError(Icrl4ahtError, ValueError):
-    """An option has an impossible value (a window of no steps, a selection that spans layouts)."""
+    """An option has an impossible value (a window of no steps, layouts whose observations differ in shape)."""
 
 
 class LabelsMissingError(Icrl4ahtError):

@@ -29,7 +29,7 @@ def plain_size(path: Path, most: int) -> int:
     Raises:
         IndexFormatError: if it is missing, no plain file, or longer than `most`.
     """
-    with _errors_of(path):
+    with errors_of(path):
         status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise IndexFormatError(f"{path}: not a plain file")
@@ -45,7 +45,7 @@ def read_text(path: Path) -> str:
         IndexFormatError: if it is missing, unreadable, too long or not UTF-8.
     """
     plain_size(path, TEXT_BYTES)
-    with _errors_of(path):
+    with errors_of(path):
         return path.read_text(encoding="utf-8")
 
 
@@ -56,7 +56,7 @@ def read_lines(path: Path) -> Iterator[str]:
         IndexFormatError: the same.
     """
     plain_size(path, 2**62)
-    with _errors_of(path), path.open("rb") as stream:
+    with errors_of(path), path.open("rb") as stream:
         number = 0
         while line := stream.readline(LINE_BYTES):
             number += 1
@@ -66,7 +66,12 @@ def read_lines(path: Path) -> Iterator[str]:
 
 
 @contextmanager
-def _errors_of(path: Path) -> Iterator[None]:
+def errors_of(path: Path) -> Iterator[None]:
+    """What reading a file raises becomes an error that names it.
+
+    Raises:
+        IndexFormatError: if it is missing, cannot be read, or is not UTF-8.
+    """
     try:
         yield
     except FileNotFoundError as error:

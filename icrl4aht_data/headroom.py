@@ -14,7 +14,7 @@ REFERENCES = ("stay", "random", "oracle")
 HEURISTICS = FAMILIES[1:]
 """The teammate families of the test tasks."""
 
-_NO_HEADROOM = 1.0  # a cell whose best reference ego is within this of `stay` leaves the ego nothing to do
+_NO_HEADROOM = 1.0  # a cell where `oracle` is within this of `stay` leaves an ego nothing to do
 
 Cell = tuple[str, str]
 """(layout, family)."""
@@ -27,7 +27,7 @@ def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
 
 
 def has_headroom(references: Mapping[str, float]) -> bool:
-    """Whether a reference ego of this cell gets more than one that only stays."""
+    """Whether the oracle gets more in this cell than an ego that only stays, by over a point."""
     return references["oracle"] - references["stay"] > _NO_HEADROOM
 
 

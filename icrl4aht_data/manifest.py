@@ -95,16 +95,23 @@ def files_below(folder: Path) -> Iterator[str]:
     folders = [""]
     while folders:
         at = folders.pop()
-        try:
-            with os.scandir(folder / at) as found:
-                for entry in found:
-                    if entry.is_dir(follow_symlinks=False):
-                        folders.append(f"{at}{entry.name}/")
-                    else:
-                        yield at + entry.name
-        except OSError:
-            if at:
-                yield at
+        entries = _entries(folder / at)
+        if entries is None and at:
+            yield at
+        for name, is_folder in entries or ():
+            if is_folder:
+                folders.append(f"{at}{name}/")
+            else:
+                yield at + name
+
+
+def _entries(folder: Path) -> list[tuple[str, bool]] | None:
+    """What is in a folder: names, and whether each is a folder; None if it cannot be read."""
+    try:
+        with os.scandir(folder) as found:
+            return [(entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
+    except OSError:
+        return None
 
 
 def is_inside(name: str) -> bool:

@@ -173,15 +173,7 @@ def _maker(
     """Number -> batch, and the buffer that the consumer has to give back before it is filled again, if any."""
 
     def make(i: int) -> tuple[Any, Any]:
-        buffer = None
-        if free is not None:
-            while True:
-                try:
-                    buffer = free.get(timeout=_POLL) or sampler.empty()
-                    break
-                except queue.Empty:
-                    if ended.is_set():
-                        raise _Ended from None
+        buffer = None if free is None else _free_buffer(sampler, free, ended)
         batch = sampler.batch(i, buffer)
         if put is None:
             return batch, buffer
@@ -191,6 +183,15 @@ def _maker(
         return on_device, None
 
     return make
+
+
+def _free_buffer(sampler: Sampler, free: queue.Queue, ended: threading.Event) -> Any:
+    while True:
+        try:
+            return free.get(timeout=_POLL) or sampler.empty()
+        except queue.Empty:
+            if ended.is_set():
+                raise _Ended from None
 
 
 def _produce(numbers: Iterator[int], make: Callable, made: queue.Queue, ended: threading.Event) -> None:

@@ -32,7 +32,7 @@ from icrl4aht_data.manifest import file_hash, read_manifest, write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.release import CARD, folder_in_place_of
 from icrl4aht_data.schema import INFO, MANIFEST, TEAMMATES
-from icrl4aht_data.verify import Advance, verify_release
+from icrl4aht_data.verify import NamedProgress, verify_release
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
 _POLICY = "policy.json"
@@ -44,7 +44,7 @@ def build_release(
     *,
     link: bool = False,
     published: datetime.date | None = None,
-    advance: Advance = lambda what, done, total: None,
+    advance: NamedProgress = lambda what, done, total: None,
 ) -> Path:
     """Write a release folder that holds everything of another, and what a published one has beside it.
 
@@ -89,7 +89,7 @@ def build_release(
     return target
 
 
-def check_whole(root: Path, advance: Advance = lambda what, done, total: None) -> None:
+def check_whole(root: Path, advance: NamedProgress = lambda what, done, total: None) -> None:
     """Verify a release.
 
     Raises:

@@ -44,7 +44,7 @@ from icrl4aht_data.statistics import layout_statistics
 from icrl4aht_data.tasks import NamedTask, Task, write_tasks
 
 if TYPE_CHECKING:
-    from icrl4aht_data.dataset import History
+    from icrl4aht_data.history import History
 
 CARD = "README.md"
 """What a release is, for people."""

@@ -31,7 +31,7 @@ from icrl4aht_data.errors import (
     RemoteError,
     RootNotFoundError,
 )
-from icrl4aht_data.files import file_in_place_of, holds, plain_size
+from icrl4aht_data.files import TEXT_BYTES, file_in_place_of, holds, plain_size
 from icrl4aht_data.info import read_info
 from icrl4aht_data.manifest import LARGEST, file_hash, git_hash, inside, parse_manifest, read_manifest
 from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
@@ -40,7 +40,6 @@ from icrl4aht_data.transport import HubStore, Patience, Store, offline
 _OPENED = (INFO, HISTORIES, TASKS, PROVENANCE)
 """What opening a release reads."""
 
-_MANIFEST_BYTES = 64 * 2**20
 _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]+))?/?")
 _AT_ONCE = 8
 
@@ -285,8 +284,8 @@ def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
 
 def _manifest_from_hub(url: str, revision: str | None) -> tuple[Path, bytes]:
     """The manifest's place and text, for which the Hub's cache alone vouches: a blob's name there is its hash."""
-    path = _from_hub(url, MANIFEST, revision, _MANIFEST_BYTES)
-    plain_size(path, _MANIFEST_BYTES)
+    path = _from_hub(url, MANIFEST, revision, TEXT_BYTES)
+    plain_size(path, TEXT_BYTES)
     text, blob = path.read_bytes(), path.resolve()
     git = git_hash(text)
     if len(blob.name) == len(git) and blob.name != git:
@@ -343,8 +342,8 @@ def _open_address(url: str, to: Path | None, patience: Patience | None) -> Remot
 def _asked_manifest(url: str, store: Store) -> bytes:
     try:
         size = store.size(MANIFEST)
-        if size > _MANIFEST_BYTES:
-            raise IndexFormatError(f"{url}/{MANIFEST}: expected at most {_MANIFEST_BYTES:,} bytes, found {size:,}")
+        if size > TEXT_BYTES:
+            raise IndexFormatError(f"{url}/{MANIFEST}: expected at most {TEXT_BYTES:,} bytes, found {size:,}")
         return store.read(MANIFEST, 0, size)
     except RemoteError as error:
         if error.missing:
@@ -354,7 +353,7 @@ def _asked_manifest(url: str, store: Store) -> bytes:
 
 def _kept_manifest(url: str, folder: Path) -> bytes:
     try:
-        plain_size(folder / MANIFEST, _MANIFEST_BYTES)
+        plain_size(folder / MANIFEST, TEXT_BYTES)
         return (folder / MANIFEST).read_bytes()
     except (OSError, IndexFormatError) as error:
         raise OfflineError(f"{url}: offline, and nothing of this release is here; go online to fetch it") from error

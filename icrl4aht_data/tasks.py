@@ -163,7 +163,9 @@ def read_provenance(path: Path) -> dict[str, dict[str, Any]]:
         raise IndexFormatError(f"{path}: {error}") from error
     notes = content.values() if isinstance(content, dict) else [content]
     if not all(isinstance(note, dict) and isinstance(note.get("teammate", {}), dict) for note in notes):
-        raise IndexFormatError(f"{path}: expected an object of objects, one for each task")
+        raise IndexFormatError(
+            f"{path}: not as `generation` writes it: expected an object of objects, one for each task"
+        )
     return content
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, UploadError
-from icrl4aht_data.index import read_info
+from icrl4aht_data.info import read_info
 from icrl4aht_data.manifest import file_hash, git_hash, read_manifest
 from icrl4aht_data.publish import check_whole
 from icrl4aht_data.schema import MANIFEST
-from icrl4aht_data.verify import Advance
+from icrl4aht_data.verify import NamedProgress
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -76,7 +76,7 @@ def upload_release(
     private: bool = False,
     dry_run: bool = False,
     show: bool = False,
-    advance: Advance = lambda what, done, total: None,
+    advance: NamedProgress = lambda what, done, total: None,
 ) -> Upload:
     """Upload a release, compare what the repository then holds with its manifest, and tag that commit.
 

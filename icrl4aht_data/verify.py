@@ -17,9 +17,10 @@ import numpy as np
 
 from icrl4aht_data.benchmark import ACTIONS, EGO
 from icrl4aht_data.cache import free_memory
-from icrl4aht_data.dataset import MINI, History, Names
+from icrl4aht_data.dataset import MINI, Names
 from icrl4aht_data.download import ORIGIN, chosen_files
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError
+from icrl4aht_data.history import History
 from icrl4aht_data.index import Index, read_index
 from icrl4aht_data.manifest import LARGEST, file_hash, files_below, inside, read_manifest
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -109,7 +110,7 @@ def _plain(text: str) -> str:
     return text if text.isprintable() else text.encode("unicode_escape").decode()
 
 
-Advance = Callable[[str, int, int], None]
+NamedProgress = Callable[[str, int, int], None]
 """Called with what is being checked, how many are done, and how many there are."""
 
 
@@ -118,7 +119,7 @@ def verify_release(
     *,
     deep: bool = False,
     quick: bool = False,
-    advance: Advance = lambda what, done, total: None,
+    advance: NamedProgress = lambda what, done, total: None,
     **wanted: Names,
 ) -> Report:
     """Check a release; never raises for what is wrong in it.
@@ -162,7 +163,7 @@ def verify_release(
     return report
 
 
-def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Names]) -> None:
+def _verify(origin: Root, report: Report, advance: NamedProgress, wanted: dict[str, Names]) -> None:
     listed = _manifest(origin, report)
     chosen, unreadable = set(listed), None
     try:
@@ -198,7 +199,7 @@ def _verify(origin: Root, report: Report, advance: Advance, wanted: dict[str, Na
         _check_shards(index, shards, report, advance)
 
 
-def _fetch(remote: Remote, names: list[str], report: Report, advance: Advance) -> None:
+def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgress) -> None:
     for number, name in enumerate(names, start=1):  # one by one, so that each that cannot be had is named
         try:
             remote.fetch([name])
@@ -319,7 +320,7 @@ def _manifest(origin: Root, report: Report) -> dict[str, str]:
 
 
 def _check_files(
-    origin: Root, expected: dict[str, str], listed: Collection[str], report: Report, advance: Advance
+    origin: Root, expected: dict[str, str], listed: Collection[str], report: Report, advance: NamedProgress
 ) -> None:
     """Whether the files that are expected are here as the manifest has them, and no others.
 
@@ -360,7 +361,7 @@ def _is_covered(root: Path, name: str) -> bool:
     return int(table["size"].sum(dtype=np.int64)) == (root / name).stat().st_size
 
 
-def _check_shards(index: Index, shards: list[str], report: Report, advance: Advance) -> None:
+def _check_shards(index: Index, shards: list[str], report: Report, advance: NamedProgress) -> None:
     local = Root(index.root)  # what could not be fetched has been reported
     members = {name: [index.entries[row] for row in index.entries.shard_rows(name).tolist()] for name in shards}
     total = sum(map(len, members.values()))
@@ -416,7 +417,7 @@ def _check_chunks(shard: Shard, report: Report) -> set[int]:
 def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator[str]:
     entry = history.entry
     layout = get_layout(entry.layout)
-    dones, rewards, replayable = history.read("dones"), history.read("rewards"), history._shard.kind in KINDS
+    dones, rewards, replayable = history.read("dones"), history.read("rewards"), history.kind in KINDS
     counted = entry.episodes == entry.T // kept_steps and not (replayable and entry.T % kept_steps)
     if not counted or not np.array_equal(dones, episode_ends(entry.T, kept_steps)):
         yield f"dones: expected {entry.episodes} episodes of {kept_steps} steps, found {dones.sum()} in {entry.T} steps"
@@ -457,7 +458,7 @@ def _place_problems(layout: Layout, history: History) -> Iterator[str]:
 
 def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
     states, ends = history.read("state"), history.read("episode_end_state")
-    if history._shard.kind == "full":
+    if history.kind == "full":
         wrong = np.flatnonzero((history.read("obs") != observe(layout, states, EGO)).any(axis=(1, 2, 3)))
         if len(wrong):
             yield f"obs: {len(wrong)} steps differ from what their state shows, first step {wrong[0]}"

@@ -20,7 +20,7 @@ from scenes import scene
 
 from icrl4aht_data.benchmark import ACTIONS, DOWN, INTERACT, LEFT, RIGHT, STAY, UP
 from icrl4aht_data.overcooked import rules
-from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, Layout
+from icrl4aht_data.overcooked.layouts import FACING_OF, FACINGS, LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, unpack
 
@@ -498,3 +498,9 @@ def test_shaped_rewards_are_each_agents_own():
     record = scene(ASYMM, *places, hands=[ZERO, PLATE], pot_items=[ZERO, SOUP_000], recipe=RECIPE_000)
     after = act(ASYMM, record, INTERACT, INTERACT)
     assert (after.shaped, after.reward) == ([3, 5], 0)
+
+
+def test_a_move_turns_to_the_facing_that_tables_give_it():
+    record = scene(CRAMPED, (1, 1, "up"), ASIDE)
+    turned = [FACINGS.index(act(CRAMPED, record, move).places[0][2]) for move in (UP, DOWN, LEFT, RIGHT)]
+    assert turned == FACING_OF.tolist()

@@ -17,7 +17,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from icrl4aht_data.benchmark import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.layouts import BUTTON, COOKED, GOAL, INDICATOR, PLATE, PLATES, POT, WALL, Layout
+from icrl4aht_data.overcooked.layouts import (
+    BUTTON,
+    COOKED,
+    FACING_OF,
+    GOAL,
+    INDICATOR,
+    PLATE,
+    PLATES,
+    POT,
+    STEP,
+    WALL,
+    Layout,
+)
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
 
 UNREACHABLE = 10_000
@@ -25,8 +37,7 @@ UNREACHABLE = 10_000
 
 _SEARCH_ORDER = (RIGHT, DOWN, LEFT, UP)
 _ACCESS_ORDER = ("up", "down", "left", "right")
-_FACING_OF = np.array([0, 1, 3, 2])  # action up, down, left, right -> facing up, down, right, left
-_ACTION_OF_FACING = np.argsort(_FACING_OF)
+_ACTION_OF_FACING = np.argsort(FACING_OF)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +51,9 @@ class Paths:
         """int32 (cells, 4): the cell above, below, left and right of each cell, -1 outside the map."""
         layout = self.layout
         table = np.full((layout.cells, 4), -1, np.int32)
-        steps = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
         for cell in range(layout.cells):
             for k, name in enumerate(_ACCESS_ORDER):
-                x, y = cell % layout.width + steps[name][0], cell // layout.width + steps[name][1]
+                x, y = cell % layout.width + STEP[name][0], cell // layout.width + STEP[name][1]
                 if 0 <= x < layout.width and 0 <= y < layout.height:
                     table[cell, k] = y * layout.width + x
         return table

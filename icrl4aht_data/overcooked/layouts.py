@@ -22,17 +22,28 @@ EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
 FACINGS = ("up", "down", "right", "left")
 """Facing names in the order of the observation's facing channels."""
 
+STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
+"""Facing name -> (dx, dy) to the cell ahead."""
+
+FACING_OF = np.array([FACINGS.index(name) for name in ACTIONS if name in FACINGS])
+"""int64 (4,): the facing that a directional action (up, down, left, right) turns to."""
+
 PLATE, COOKED = 1, 2
 """Flag bits of an item byte. The counts of the layout's piled ingredients follow, two bits each."""
 
 WINDOW = 5
 """Side of the square observation window."""
 
+VISIBLE = WINDOW * WINDOW
+"""Cells of it."""
+
+CENTRE = VISIBLE // 2
+"""The one among them, in reading order, on which the agent stands that sees them."""
+
 NOWHERE = 255
 """Table entry for 'no such column' or 'not in view'."""
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
-_STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
 _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
 
 
@@ -149,7 +160,7 @@ class Layout:
         seen, queue = {start}, deque([start])
         while queue:
             cell = queue.popleft()
-            for dx, dy in _STEP.values():
+            for dx, dy in STEP.values():
                 x, y = cell % self.width + dx, cell // self.width + dy
                 inside = 0 <= x < self.width and 0 <= y < self.height
                 neighbour = y * self.width + x
@@ -170,7 +181,7 @@ class Layout:
         """uint8 (cells, 4): the cell that an agent on a walkable cell faces, by facing; 0 elsewhere."""
         table = np.zeros((self.cells, 4), np.uint8)
         for facing, name in enumerate(FACINGS):
-            dx, dy = _STEP[name]
+            dx, dy = STEP[name]
             table[self.walkable, facing] = self.walkable.nonzero()[0] + dy * self.width + dx
         return table
 
@@ -204,13 +215,21 @@ class Layout:
     @cached_property
     def window(self) -> np.ndarray:
         """int16 (cells, 25): the cells of the 5 x 5 window centred on a cell, in reading order; -1 outside the map."""
-        table = np.full((self.cells, WINDOW * WINDOW), -1, np.int16)
+        table = np.full((self.cells, VISIBLE), -1, np.int16)
         reach = WINDOW // 2
         for cell in range(self.cells):
-            for k in range(WINDOW * WINDOW):
+            for k in range(VISIBLE):
                 x, y = cell % self.width + k % WINDOW - reach, cell // self.width + k // WINDOW - reach
                 if 0 <= x < self.width and 0 <= y < self.height:
                     table[cell, k] = y * self.width + x
+        return table
+
+    @cached_property
+    def place_in_window(self) -> np.ndarray:
+        """uint8 (cells, cells): where in the first cell's window the second one is, or NOWHERE."""
+        table = np.full((self.cells, self.cells), NOWHERE, np.uint8)
+        cell, place = np.nonzero(self.window >= 0)
+        table[cell, self.window[cell, place]] = place
         return table
 
     def __repr__(self) -> str:

@@ -23,22 +23,21 @@ import numpy as np
 
 from icrl4aht_data.overcooked.layouts import (
     BUTTON,
+    CENTRE,
     GOAL,
     INDICATOR,
     NOWHERE,
     PILE,
     PLATES,
     POT,
+    VISIBLE,
     WALL,
-    WINDOW,
     Layout,
 )
 from icrl4aht_data.overcooked.rules import look_up
 from icrl4aht_data.overcooked.state import Array, unpack
 
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
-_VISIBLE = WINDOW * WINDOW
-_CENTRE = _VISIBLE // 2
 
 # A visible cell is one 32-bit word: item 8 bits, pot timer 5, recipe 6, delivery 1, static 6, piles 3 (one for each
 # piled type). A second word holds the agents on it: self 13 bits (position 1, facing 4, hand 8), then other 13 bits.
@@ -48,7 +47,6 @@ _AGENT_BITS = 13
 
 class _Tables(NamedTuple):
     view: np.ndarray  # int32 (cells, 25): column of the cell's changing word | fixed word's bits from _FIXED up
-    relative: np.ndarray  # uint8 (cells * cells,): where in the first cell's window the second one is, or NOWHERE
     shift: np.ndarray  # uint32 (C,)
     mask: np.ndarray  # uint32 (C,); 0 for an ingredient type without a pile
     agent_channels: int
@@ -104,10 +102,10 @@ def _words(layout: Layout, record: Array, agent: int) -> tuple[Array, Array]:
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    relative = look_up(tables.relative, xp.astype(me, xp.int32) * layout.cells + other)
-    place = xp.arange(_VISIBLE, dtype=xp.uint8)
+    relative = look_up(layout.place_in_window.reshape(-1), xp.astype(me, xp.int32) * layout.cells + other)
+    place = xp.arange(VISIBLE, dtype=xp.uint8)
     none = xp.zeros_like(cells)
-    agents = xp.where(place == _CENTRE, bodies[..., agent, None], none) | xp.where(
+    agents = xp.where(place == CENTRE, bodies[..., agent, None], none) | xp.where(
         place == relative[..., None], bodies[..., 1 - agent, None] << _AGENT_BITS, none
     )
     return agents, cells
@@ -137,12 +135,7 @@ def _tables(layout: Layout) -> _Tables:
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - _FIXED + bit)
-    inside = layout.window >= 0
-    view = np.where(inside, (column | fixed << 8)[layout.window], 0)
-
-    relative = np.full((layout.cells, layout.cells), NOWHERE, np.uint8)
-    cell, place = inside.nonzero()
-    relative[cell, layout.window[cell, place]] = place
+    view = np.where(layout.window >= 0, (column | fixed << 8)[layout.window], 0)
 
     agent = [(0, 1), *((1 + facing, 1) for facing in range(4)), *_item_bits(layout, 5)]
     shifts = [
@@ -158,7 +151,7 @@ def _tables(layout: Layout) -> _Tables:
         *([(_DELIVERY, 1)] if layout.indicates_delivery else []),
     ]
     shift, mask = np.array(shifts, np.uint32).T
-    return _Tables(view.astype(np.int32), relative.reshape(-1), shift, mask, 2 * len(agent))
+    return _Tables(view.astype(np.int32), shift, mask, 2 * len(agent))
 
 
 def _item_bits(layout: Layout, first: int) -> list[tuple[int, int]]:

@@ -12,14 +12,12 @@ from functools import lru_cache
 import numpy as np
 
 from icrl4aht_data.benchmark import EGO
-from icrl4aht_data.overcooked.layouts import NOWHERE, WINDOW, Layout
-from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.layouts import CENTRE, NOWHERE, VISIBLE, Layout
+from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.threads import in_slices
 
 _SLAB = 8192  # steps painted at a time: fewer cost more in calls than they save in cache misses
-_VISIBLE = WINDOW * WINDOW
-_CENTRE = _VISIBLE // 2
 _IMPOSSIBLE = -(2**40)
 _TIMERS = 32  # what a timer's five bits hold
 
@@ -39,7 +37,7 @@ def paint(layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1)
     if not out.flags.c_contiguous:
         raise ValueError("expected out to be C-contiguous")
     records = record.reshape(-1, record.shape[-1])
-    flat = out.reshape(len(records), _VISIBLE, layout.channels)
+    flat = out.reshape(len(records), VISIBLE, layout.channels)
     painter = _painter(layout, out.dtype.str)
 
     def part(start: int, stop: int) -> None:
@@ -57,14 +55,12 @@ class _Painter:
     def __init__(self, layout: Layout, dtype: str) -> None:
         self._layout, self._dtype = layout, np.dtype(dtype)
         self._columns = columns(layout)
-        self._agent = 7 + layout.ingredient_types  # channels of one agent
-        self._first = 2 * self._agent + 6 + layout.ingredient_types  # of the channels of what changes on a cell
+        fixed = fixed_channels(layout)
+        self._agent: int = fixed.start // 2  # channels of one agent: two agents come before what is fixed
+        self._first: int = fixed.stop  # of the channels of what changes on a cell
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.unique(np.array([0, *layout.recipe_items], np.uint8))
-        relative = np.full((layout.cells, layout.cells), NOWHERE, np.intp)
-        cell, place = np.nonzero(layout.window >= 0)
-        relative[cell, layout.window[cell, place]] = place
-        self._relative = relative
+        self._relative = layout.place_in_window.astype(np.intp)
         self._background = self._make_background()
         self._bodies = _as_items(self._make_bodies())
         self._patches = _as_items(self._make_patches())
@@ -87,11 +83,11 @@ class _Painter:
 
     def _paint_agents(self, positions: np.ndarray, facings: np.ndarray, hands: np.ndarray, cells: np.ndarray) -> None:
         mine = _as_items(cells[:, : self._agent])
-        mine[_CENTRE::_VISIBLE] = self._bodies.take(((facings & 255) << 8) + (hands & 255))
+        mine[CENTRE::VISIBLE] = self._bodies.take(((facings & 255) << 8) + (hands & 255))
         place = self._place.take(positions)
         seen = np.flatnonzero(place != NOWHERE)
         theirs = _as_items(cells[:, self._agent : 2 * self._agent])
-        theirs[seen * _VISIBLE + place[seen]] = self._bodies.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
+        theirs[seen * VISIBLE + place[seen]] = self._bodies.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
 
     def _paint_things(self, record: np.ndarray, positions: np.ndarray, cells: np.ndarray) -> None:
         """What lies on counters, glows on buttons and is in pots, where there is anything and it is in view."""
@@ -105,7 +101,7 @@ class _Painter:
         patch = self._kind.take(thing) + flat.take(start + self._low.take(thing))
         pots = np.flatnonzero(self._is_pot.take(thing))
         patch[pots] += flat.take(start[pots] + self._high.take(thing[pots])).astype(np.intp) << 8
-        _as_items(cells[:, self._first :])[row * _VISIBLE + place] = self._patches.take(patch)
+        _as_items(cells[:, self._first :])[row * VISIBLE + place] = self._patches.take(patch)
 
     def _make_lookups(self) -> None:
         """Tables by a pair of bytes, negative for one that the rules do not make; and what each thing's patch is."""
@@ -142,8 +138,8 @@ class _Painter:
         record[..., 0], record[..., 1] = self._floor[0], self._floor[-1]
         record[..., self._columns.facings] = np.arange(4)[:, None, None]
         record[..., self._columns.hands] = np.arange(256)[:, None]
-        obs = observe(self._layout, record, EGO).reshape(4 * 256, _VISIBLE, -1)
-        return obs[:, _CENTRE, : self._agent].astype(self._dtype)
+        obs = observe(self._layout, record, EGO).reshape(4 * 256, VISIBLE, -1)
+        return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
         """(512 + 32 * 256, C - first): what changes on a cell, by counter item, by glowing recipe, by pot content."""
@@ -161,7 +157,7 @@ class _Painter:
                 seats = [seat for seat in self._floor if self._relative[seat, cell] != NOWHERE]
                 if seats:
                     record[rows, :, 0] = seats[0]
-                    obs = observe(layout, record[rows], EGO).reshape(-1, 256, _VISIBLE, layout.channels)
+                    obs = observe(layout, record[rows], EGO).reshape(-1, 256, VISIBLE, layout.channels)
                     table[rows] = obs[:, :, self._relative[seats[0], cell], self._first :]
                     break
         return table.reshape(-1, table.shape[-1])

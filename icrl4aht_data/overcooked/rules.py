@@ -118,7 +118,7 @@ def _move(layout: Layout, xp, state: State, actions: Array) -> State:
     # With two agents, undoing until no conflict remains has a closed form: if the wanted cells coincide both go
     # back, which leaves no further conflict; exchanging cells sends both back too.
     undo = (new0 == new1) | ((new0 == old1) & (new1 == old0))
-    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # up, down, left, right -> up, down, right, left
+    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # FACING_OF, without a table
     return state._replace(
         positions=xp.where(undo[..., None], state.positions, moved),
         facings=xp.where(actions < len(FACINGS), facing, state.facings),
