@@ -273,8 +273,9 @@ def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
 
 
 def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    two = across(lite[0], tmp_path, [{"PROCESS": "0"}, {"PROCESS": "1"}], f"127.0.0.1:{port}")
+    with socket.socket() as held:  # which JAX's coordinator may share, and nothing else takes
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        held.bind(("127.0.0.1", 0))
+        port = held.getsockname()[1]
+        two = across(lite[0], tmp_path, [{"PROCESS": "0"}, {"PROCESS": "1"}], f"127.0.0.1:{port}")
     assert_close(two, on_one_device)
