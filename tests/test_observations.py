@@ -11,10 +11,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from batches import CACHES, assert_equal, samplers
 from click.testing import CliRunner
-from plays import make_tasks, play, random_release
-from test_index import long_index
-from test_loader import CACHES, assert_equal, samplers
+from plays import long_index, make_tasks, play, random_release
 
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS

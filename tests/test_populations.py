@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled, same_bytes
 
 from generation.env import Environment
 from generation.learners.brdiv import BRDiv
@@ -26,8 +27,6 @@ from icrl4aht_data.benchmark import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 
-FAST = {"xla_backend_optimization_level": 0}  # small programs: compiling is their cost
-
 LAYOUT = get_layout("cramped_up")
 EPISODE = 6
 CONFIG = PPOConfig(
@@ -41,22 +40,8 @@ CONFIG = PPOConfig(
 )
 
 
-def compiled(function):
-    return jax.jit(function, compiler_options=FAST)
-
-
 def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any) -> Population:
     return Population(Environment(LAYOUT, max_steps=EPISODE), algorithm, config, **options)
-
-
-def same_bytes(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(raw(one)), jax.tree.leaves(raw(other)), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
-
-
-def raw(tree: Any) -> Any:
-    """Typed keys as their words."""
-    return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
 
 
 # Who sits where.

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flat_world import FLAT, TINY, ad_batch
 from plays import random_release
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
-from test_models import FLAT, TINY, ad_batch
 from tiny import start
 
 from baselines.histories import HistoryOptions, hold_out, prepare

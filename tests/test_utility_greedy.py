@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled
 from scenes import random_records, scene
 
 from generation.teammates import utility_greedy
@@ -44,7 +45,6 @@ TEST_THETAS = [
 """H4-t0..t4 (spec/teammates.md, section 4)."""
 
 SEARCH = (RIGHT, DOWN, LEFT, UP)
-FAST = {"xla_backend_optimization_level": 0}  # these programs are compiled to run once
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 FACED_BY = {0: UP, 1: DOWN, 2: RIGHT, 3: LEFT}  # facing -> the action that turns there
 
@@ -85,7 +85,7 @@ def _scan(layout: Layout, slot: int, noise: Noise, steps: int):
         return jax.lax.scan(step, (record, policy.init(params, key)), recipes)[1]
 
     batch = jax.vmap(jax.vmap(one, (None, 0, 1, 0), 1), (0, None, None, None), 1)
-    return jax.jit(batch, compiler_options=FAST)
+    return compiled(batch)
 
 
 def play(
@@ -319,7 +319,7 @@ def test_equals_plain_rules_on_random_states(layout, slot):
     keys = jax.random.wrap_key_data(jnp.stack([jnp.asarray(rolls, jnp.uint32), jnp.zeros(n, jnp.uint32)], axis=1))
     policy = build(layout, {"family": "utility_greedy", "theta": DEFAULTS}, slot)
     memory = Memory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
-    act = jax.jit(jax.vmap(policy.act), compiler_options=FAST)
+    act = compiled(jax.vmap(policy.act))
     actions, after = act(params, memory, records, keys)
     found = [Plain(*row) for row in np.stack([after.intent, actions, after.wait], axis=1).tolist()]
     expected = [plain_rules(layout, thetas[of[i]], records[i], slot, int(last[i]), int(rolls[i])) for i in range(n)]
@@ -339,7 +339,7 @@ def _act(slot: int):
     """H4 in cramped_up, eight at once: memory, records (8, S) -> actions (8,), memory."""
     policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot)
     keys = jax.random.split(jax.random.key(0), 8)
-    act = jax.jit(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)), compiler_options=FAST)
+    act = compiled(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)))
     return lambda memory, records: act(policy.params, memory, records, keys)
 
 

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from plays import make_tasks, play, random_release
+from plays import SHARD, make_tasks, play, random_release
 
 from icrl4aht_data import verify_release
 from icrl4aht_data.cli import cli
@@ -18,8 +18,6 @@ from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import Kind
 from icrl4aht_data.shard import chunk_table_path
 from icrl4aht_data.tasks import make_task
-
-SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 
 
 def problems(root, deep=False):
