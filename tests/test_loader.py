@@ -220,14 +220,17 @@ class TestOptions:
                     np.testing.assert_array_equal(getattr(query, name)[row], observe(layout, record, 0))
 
     def test_windows_are_uniform_over_histories_and_starts(self, lite):
-        """Pearson's statistic of 60,000 draws into 6 x 101 cells; its mean is 605, its deviation 35."""
-        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=20_000, length=20, seed=11)
-        counts = np.zeros((6, 101))
-        for i in range(3):
+        """Pearson's statistic of 60,000 draws into 6 x 101 cells, and of histories and of starts alone: its mean is one
+        less than the cells, its variance twice that."""
+        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=500, length=20, seed=11)
+        table = np.zeros((6, 101))
+        for i in range(120):
             ids, starts = sampler.windows(i)
-            np.add.at(counts, (ids - 6, starts), 1)
-        expected = 60_000 / counts.size
-        assert abs(((counts - expected) ** 2 / expected).sum() - 605) < 5 * 35
+            np.add.at(table, (ids - 6, starts), 1)
+        for counts in (table, table.sum(axis=0), table.sum(axis=1)):
+            expected, freedom = 60_000 / counts.size, counts.size - 1
+            statistic = ((counts - expected) ** 2 / expected).sum()
+            assert abs(statistic - freedom) < 5 * np.sqrt(2 * freedom), (counts.shape, statistic)
 
 
 class TestBuffers:

@@ -180,18 +180,6 @@ def test_the_draws_are_fixed_for_good(lite):
     assert starts.tolist() == [95, 99, 25, 19, 71, 13]
 
 
-def test_windows_are_uniform_over_histories_and_starts(lite):
-    sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=500, length=LENGTH, seed=11)
-    drawn = [sampler.windows(i) for i in range(120)]
-    ids, starts = (np.concatenate(part) for part in zip(*drawn, strict=True))
-    for values, cells in ((ids - 6, 6), (starts, 120 - LENGTH + 1)):
-        counts = np.bincount(values, minlength=cells)
-        assert len(counts) == cells
-        expected = len(values) / cells
-        chi_square = ((counts - expected) ** 2 / expected).sum()
-        assert chi_square < cells - 1 + 5 * np.sqrt(2 * (cells - 1)), (cells, chi_square)
-
-
 def test_length_and_iteration(lite):
     sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)
     assert len(sampler) == 720 // 120 == len(list(sampler))
