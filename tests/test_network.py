@@ -22,7 +22,7 @@ seen. A wrong tap, gate or bias is off by the size of the values themselves."""
 
 
 class PlainActorCritic(nn.Module):
-    """The network of spec/pipeline.md, section 1, from Flax's own layers; a loop over time."""
+    """The network of the paper (App. B.1 and C.2.1) from Flax's own layers; a loop over time."""
 
     widths: Widths
 
@@ -182,7 +182,7 @@ def test_a_reset_at_the_first_step_drops_the_given_hidden_state(small, apply):
 
 
 def test_initial_weights(small):
-    """Orthogonal of the scales in spec/pipeline.md, section 1; every bias zero."""
+    """Orthogonal, of the published code's scales; every bias zero."""
     init = compiled(small.network.init)
     params = init(jax.random.key(0), small.hidden, small.obs, small.reset)
     tree = plain_names(params, small.network.widths)["params"]

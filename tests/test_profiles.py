@@ -95,7 +95,7 @@ def test_paper_profile_has_the_papers_numbers():
 
 
 def test_paper_profile_keeps_146_episodes():
-    """T = 146 x 100 = 14,600 (spec/pipeline.md, section 2), though 228 whole updates are 58,368 steps: the 146th
+    """T = 146 x 100 = 14,600 (paper, App. D.1), though 228 whole updates are 58,368 steps: the 146th
     episode has its first 100, and the state after them."""
     assert load_profile("paper").ego.updates == 228
     assert load_profile("paper").ego.episodes == 146

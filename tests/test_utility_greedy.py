@@ -25,7 +25,7 @@ from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL
 from icrl4aht_data.overcooked.state import ingredient_count, start, unpack
 
 PUBLISHED_PLAY = "030512503051250305125325124444444444444450530512503051250305"
-"""H4-t0..t4 on test_simple in the published ids (spec/teammates.md, section 7)."""
+"""H4-t0..t4 on test_simple in the published ids, by an independent simulator of the published teammates."""
 
 NAMES = (
     *("w_deliver", "w_pickup_cooked", "w_get_plate", "w_add_ingredient", "w_fetch_ingredient", "w_stage_on_counter"),
@@ -42,7 +42,7 @@ TEST_THETAS = [
         (9.0, 7.0, 6.0, 8.0, 7.0, 8.0, 6.0, 0.0, 0.4, 0.3, 0.9),
     )
 ]
-"""H4-t0..t4 (spec/teammates.md, section 4)."""
+"""H4-t0..t4 of the published manifests."""
 
 SEARCH = (RIGHT, DOWN, LEFT, UP)
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
@@ -138,7 +138,7 @@ def test_two_deliveries_in_100_steps_beside_a_motionless_ego(name):
     np.testing.assert_array_equal((rewards > 0).sum(axis=0), 2)
     np.testing.assert_array_equal(rewards.sum(axis=0), 40)
     first, second = np.sort(rewards.argsort(axis=0, kind="stable")[-2:], axis=0) + 1
-    assert 36 <= first.min() <= first.max() <= 50  # spec/teammates.md, section 6
+    assert 36 <= first.min() <= first.max() <= 50  # as in 150 games of that simulator
     assert 74 <= second.min() <= second.max() <= 92
 
 
