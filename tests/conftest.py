@@ -6,14 +6,18 @@ import os
 import shutil
 from pathlib import Path
 
+import h5py
 import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from plays import random_release
+from published import KEPT, publish
 from tiny import PAIR, TINY
 
 from generation.cli import cli
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.convert import from_published, to_published
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -84,3 +88,29 @@ def pair(built) -> Path:
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return built / "pair"
+
+
+@pytest.fixture(scope="session")
+def theirs(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
+    """Hand-written published files. Read only."""
+    folder = tmp_path_factory.mktemp("theirs") / "files"
+    return folder, publish(folder)
+
+
+@pytest.fixture(scope="session")
+def ours(theirs, tmp_path_factory) -> Path:
+    """The release of observations made of `theirs`. Read only."""
+    root = tmp_path_factory.mktemp("ours") / "release"
+    assert from_published(theirs[0], root, kept_steps=KEPT) == "observations"
+    return root
+
+
+@pytest.fixture(scope="session")
+def twin(lite, tmp_path_factory) -> Path:
+    """`lite` by way of published files without states. Read only."""
+    folder = tmp_path_factory.mktemp("twin")
+    to_published(load_icrl4aht(lite[0]), folder / "files", states=False)
+    with h5py.File(folder / "files" / "histories.h5") as file:
+        assert not any("state" in name for group in file.values() for name in group)
+    assert from_published(folder / "files", folder / "release", kept_steps=KEPT) == "observations"
+    return folder / "release"

@@ -17,17 +17,14 @@ from typing import Any
 
 import h5py
 import numpy as np
+from plays import SHARD
 
+from icrl4aht_data.download import ORIGIN
 from icrl4aht_data.manifest import write_manifest
-from icrl4aht_data.schema import CHUNK_DTYPE, MANIFEST
+from icrl4aht_data.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.tasks import Task, task_id
 
-SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 TABLE = "meta/chunks/teammate/coord_simple/train-00000-of-00001.npy"
-INFO, HISTORIES, TASKS, PROVENANCE = (
-    f"meta/{name}" for name in ("info.json", "histories.jsonl", "tasks.jsonl", "provenance.json")
-)
-ORIGIN = ".origin.json"
 TERABYTE = 2**40
 
 Spoil = Callable[[Path], object]

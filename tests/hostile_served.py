@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hostile_folders import HISTORIES, INFO, SHARD, TABLE, TASKS, listed, sparse
+from hostile_folders import TABLE, listed, sparse
+from plays import SHARD
 from servers import Faults, IgnoreRange, Long, Redirect, http_server
 
 from icrl4aht_data import transport
 from icrl4aht_data.download import fetch_planned, plan_download
-from icrl4aht_data.schema import MANIFEST
+from icrl4aht_data.schema import HISTORIES, INFO, MANIFEST, TASKS
 
 ENDLESS = 2**40
 

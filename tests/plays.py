@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 
+from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark import TRACKS, track_of
+from icrl4aht_data.dataset import MINI
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import Kind
+from icrl4aht_data.schema import Entry, Kind
 from icrl4aht_data.tasks import Task, make_task
+
+SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
+"""The first shard of `random_release`."""
 
 
 def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -90,11 +96,20 @@ def random_release(
     return written
 
 
-def equal_batches(first: tuple, second: tuple) -> bool:
-    """Whether two batches have the same arrays, and lack the same ones."""
-    for ours, theirs in zip(first, second, strict=True):
-        if (ours is None) != (theirs is None):
-            return False
-        if ours is not None and not np.array_equal(ours, theirs):
-            return False
-    return True
+def long_index(root: Path, lines: int = 3000) -> list[Entry]:
+    """A release's meta with that many lines, more than are parsed at once; no shards."""
+    source = load_icrl4aht(MINI).entries
+    rng = np.random.default_rng(0)
+    made = []
+    for number in range(lines):
+        line = source[(5 * (number // 40)) % len(source)].to_json()
+        line |= {"history_id": number, "env_idx": int(rng.integers(1024)), "score": float(rng.normal()), "h5_row": None}
+        line["task_id"] += f"_{number // 40}"
+        line["shard"] = line["shard"].replace("00000-of-00001", f"{number // 500:05}-of-00006")
+        made.append(line | ({"h5_row": number % 500} if number % 3 else {}))
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(
+        json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
+    )
+    (root / "meta" / "histories.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))
+    return [Entry.from_json(line) for line in made]

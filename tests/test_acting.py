@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from flat_world import drawn
 from servers import http_server
-from test_models import drawn
 
 from baselines.agents import find_agent
 from baselines.cli import cli

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from plays import SHARD
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import (
@@ -23,8 +24,6 @@ from icrl4aht_data.errors import (
     UnknownNameError,
 )
 from icrl4aht_data.shard import chunk_table_path
-
-SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 
 
 def read_all(root):

@@ -9,8 +9,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from batches import digest
 from click.testing import CliRunner
-from test_sampling import digest
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS

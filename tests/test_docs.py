@@ -43,6 +43,17 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES)
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 
+def run_snippets(page: str, names: dict[str, Any]) -> None:
+    """From top to bottom, here; each prints what stands behind it. Tracebacks have the page's line numbers."""
+    text = PAGES[page]
+    for snippet in re.finditer(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", text, re.DOTALL):
+        lines_before = "\n" * text.count("\n", 0, snippet.start(1))
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(lines_before + snippet[1], f"docs/{page}.md", "exec"), names)
+        assert printed.getvalue() == (snippet[2] or "")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Runs a page's snippets from top to bottom, once, in a folder like a checkout; gives the names that they leave."""
@@ -57,14 +68,8 @@ def run(tmp_path_factory):
             names: dict[str, Any] = {}
             folder = tmp_path_factory.mktemp(page)
             (folder / "icrl4aht_data").symlink_to(ROOT / "icrl4aht_data")
-            text = PAGES[page]
             with contextlib.chdir(folder):
-                for snippet in re.finditer(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", text, re.DOTALL):
-                    lines_before = "\n" * text.count("\n", 0, snippet.start(1))
-                    printed = io.StringIO()
-                    with contextlib.redirect_stdout(printed):
-                        exec(compile(lines_before + snippet[1], f"docs/{page}.md", "exec"), names)
-                    assert printed.getvalue() == (snippet[2] or "")
+                run_snippets(page, names)
             return names
 
         yield run

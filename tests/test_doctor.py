@@ -15,6 +15,7 @@ from pathlib import Path
 import h5py
 import pytest
 from click.testing import CliRunner
+from plays import SHARD
 
 from icrl4aht_data import doctor, requirements
 from icrl4aht_data.cli import cli
@@ -150,11 +151,11 @@ def test_offline(elsewhere, monkeypatch):
 
 
 def test_a_damaged_bundled_release(elsewhere, monkeypatch, damaged):
-    shard = damaged / "data/teammate/coord_simple/train-00000-of-00001.h5"
+    shard = damaged / SHARD
     shard.write_bytes(shard.read_bytes()[:-1])
     monkeypatch.setattr(doctor, "MINI", damaged)
     ((problem, step),) = problems().items()
-    assert problem.startswith("the bundled release, data/teammate/coord_simple/train-00000-of-00001.h5: ")
+    assert problem.startswith(f"the bundled release, {SHARD}: ")
     assert "pip install --force-reinstall --no-deps icrl4aht-data" in step
     (damaged / "meta/info.json").unlink()
     assert any("meta/info.json" in problem for problem in problems())

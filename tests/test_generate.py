@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
+from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 
@@ -13,7 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from tiny import LEARNED, TINY, artefact, start
+from tiny import LEARNED, TINY, artefact
 
 from generation import artefact as artefacts
 from generation import build, collect, package, run, select, suite
@@ -249,18 +252,41 @@ def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
         recover_teammate(load_icrl4aht(root), 0)
 
 
+HOLD = """
+import filelock, select, sys
+with filelock.FileLock(sys.argv[1]):
+    print(flush=True)
+    select.select([sys.stdin], [], [], 60)
+"""
+"""Holds a lock until its standard input is closed, or for a minute."""
+
+
+class Heard(StringIO):
+    """Calls `then` once it has been told `message`."""
+
+    def __init__(self, message: str, then: Callable[[], object]) -> None:
+        super().__init__()
+        self.message, self.then = message, then
+
+    def write(self, text: str) -> int:
+        count = super().write(text)
+        if self.message in self.getvalue():
+            self.then()
+        return count
+
+
 def test_a_population_that_another_process_trains_is_waited_for(learned, monkeypatch):
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     lock = learned / "suite/demo_wide/.brdiv.lock"
-    other = start(
-        "-c", f"import filelock, time\nwith filelock.FileLock({str(lock)!r}): print(flush=True); time.sleep(2)"
-    )
-    assert other.stdout is not None
-    other.stdout.readline()
-    output = StringIO()
     profile = load_profile(str(learned / "learned.toml"))
-    selections = build_suite(profile, learned / "suite", [], ["brdiv", "fcp"], 0, Console(file=output))
-    other.communicate()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"\n"
+        output = Heard("another process is training it", other.stdin.close)
+        selections = build_suite(profile, learned / "suite", [], ["brdiv", "fcp"], 0, Console(file=output))
     lines = [line for line in output.getvalue().splitlines() if " on demo_wide: " in line][:3]
     assert [line.partition(": ")[2] for line in lines] == [
         "another process is training it",

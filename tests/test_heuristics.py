@@ -49,14 +49,14 @@ test_simple (5,2) 000 assembly_line 4 344425134444124444444443142444443444124434
 test_simple (5,2) 000 utility_greedy 0 030512503051250305125325124444444444444450530512503051250305
 """
 """layout, the teammate's start, recipe, family, instance, 60 actions in the published ids; the ego stands at (1, 1),
-both face up, and the recipe stays (spec/teammates.md, section 7)."""
+both face up, and the recipe stays. By an independent simulator of the published teammates."""
 PLAYS = [line.split() for line in PUBLISHED_PLAY.split("\n")[1:-1]]
 
 PUBLISHED_MEANS = {
     "coord_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.2, 0.0], H4: [40.0] * 5},
     "test_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.8, 0.0], H4: [40.0] * 5},
 }
-"""Mean returns of t0..t4 beside an ego that always stays, 500 episodes of 100 steps (spec/teammates.md, section 7)."""
+"""Mean returns of t0..t4 beside an ego that always stays, 500 episodes of 100 steps, by the same simulator."""
 
 NOISE = """
 0 1 0.403646 0.557784 0.155612 0.673338
@@ -68,7 +68,7 @@ NOISE = """
 3808005281 3946009514 0.226624 0.606609 0.665490 0.032333
 3331961082 2320838513 0.669757 0.632860 0.953956 0.912423
 """
-"""The two words of a step's key and u1..u4, from step 0 (spec/teammates.md, section 1.6)."""
+"""The two words of a step's key and u1..u4, from step 0, as the published code draws them (JAX 0.5.3)."""
 
 
 def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
@@ -466,7 +466,7 @@ utility_greedy train default,delivery_focused 8-18 6-14 *8 3-8 *8 *4.5 *12 *7 0.
 utility_greedy test prep_focused,high_inertia,distance_sensitive 5-12 3-8 *8 7-12 *8 *4.5 *12 *7 0.6-1.2 0.5-0.9 *1
 """
 """Family, split, presets, and of every parameter the range low-high, the list, *width of the full range around the
-preset's value, or . for that value (spec/teammates.md, section 3)."""
+preset's value, or . for that value: the published code's, for the splits of the paper's App. B.3."""
 
 
 @pytest.mark.parametrize("line", RANGES.split("\n")[1:-1])

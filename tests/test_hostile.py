@@ -30,7 +30,7 @@ from icrl4aht_data.manifest import parse_manifest
 from icrl4aht_data.verify import Report
 
 HERE = Path(__file__).parent
-TOGETHER = 120  # seconds for all cases of a kind
+TOGETHER = 480  # seconds for all cases of a kind
 TAKEN = 64 * 2**20  # bytes of disk
 
 

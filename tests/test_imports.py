@@ -10,6 +10,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+NOBODY_MAY_USE = {"benchmarks", "tests", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
+FORBIDDEN = {
+    "icrl4aht_data": {"generation", "baselines", "jax", "flax", "optax"},
+    "generation": {"baselines"},
+    "baselines": set(),
+}
 BASELINES_MAY_USE = ("generation.env", "generation.teammates", "generation.learners.network")
 HEAVY = ("jax", "flax", "optax", "matplotlib", "PIL", "torch", "datasets", "huggingface_hub", "grain", "pyarrow")
 
@@ -28,17 +34,14 @@ def imported(path: Path) -> set[str]:
 
 def wrong_arrows(package: str, modules: set[str]) -> list[str]:
     """The imports that point the wrong way."""
-    if package == "icrl4aht_data":
-        forbidden = ("generation", "baselines", "benchmarks", "tests", "jax", "flax", "optax")
-        return [m for m in modules if m.split(".")[0] in forbidden]
-    if package == "generation":
-        return [m for m in modules if m.split(".")[0] in ("baselines", "benchmarks", "tests")]
-    return [
-        m for m in modules if m.startswith("generation") and m != "generation" and not m.startswith(BASELINES_MAY_USE)
-    ]
+    wrong = {m for m in modules if m.split(".")[0] in FORBIDDEN[package] | NOBODY_MAY_USE}
+    if package == "baselines":
+        inner = {m for m in modules if m.startswith("generation") and m != "generation"}
+        wrong |= {m for m in inner if not m.startswith(BASELINES_MAY_USE)}
+    return sorted(wrong)
 
 
-@pytest.mark.parametrize("package", ["icrl4aht_data", "generation", "baselines"])
+@pytest.mark.parametrize("package", FORBIDDEN)
 def test_imports_point_down(package):
     for path in sorted((ROOT / package).rglob("*.py")):
         on_demand = {"jax", "jax.numpy"} if path.name == "prefetch.py" else set()  # when a device is asked for
@@ -49,6 +52,12 @@ def test_a_wrong_arrow_is_seen():
     assert wrong_arrows("icrl4aht_data", {"numpy", "jax.numpy"}) == ["jax.numpy"]
     assert wrong_arrows("generation", {"baselines.ad", "icrl4aht_data"}) == ["baselines.ad"]
     assert wrong_arrows("baselines", {"generation.collect", "generation.env"}) == ["generation.collect"]
+    for package in FORBIDDEN:
+        assert wrong_arrows(package, {"benchmarks.bench_env", "tests", "plays", "numpy"}) == [
+            "benchmarks.bench_env",
+            "plays",
+            "tests",
+        ]
 
 
 def test_importing_the_reader_loads_nothing_heavy():

@@ -14,31 +14,12 @@ from typing import cast
 
 import numpy as np
 import pytest
+from plays import long_index
 
-from icrl4aht_data import cache, columns, load_icrl4aht
-from icrl4aht_data.dataset import MINI
+from icrl4aht_data import cache, columns
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
 from icrl4aht_data.index import read_index
 from icrl4aht_data.schema import Entry
-
-
-def long_index(root: Path, lines: int = 3000) -> list[Entry]:
-    """A release's meta with that many lines, more than are parsed at once; no shards."""
-    source = load_icrl4aht(MINI).entries
-    rng = np.random.default_rng(0)
-    made = []
-    for number in range(lines):
-        line = source[(5 * (number // 40)) % len(source)].to_json()
-        line |= {"history_id": number, "env_idx": int(rng.integers(1024)), "score": float(rng.normal()), "h5_row": None}
-        line["task_id"] += f"_{number // 40}"
-        line["shard"] = line["shard"].replace("00000-of-00001", f"{number // 500:05}-of-00006")
-        made.append(line | ({"h5_row": number % 500} if number % 3 else {}))
-    (root / "meta").mkdir(parents=True)
-    (root / "meta" / "info.json").write_text(
-        json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
-    )
-    (root / "meta" / "histories.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))
-    return [Entry.from_json(line) for line in made]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import assert_equal
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows
@@ -17,11 +18,6 @@ from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows
 @pytest.fixture
 def sampler(lite):
     return load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=4, length=25, seed=6)
-
-
-def assert_equal(one, two) -> None:
-    for name, array in one._asdict().items():
-        np.testing.assert_array_equal(array, getattr(two, name), err_msg=name)
 
 
 class TestPlainLoop:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled
 from scenes import random_records
 
 from generation.env import Environment, EnvState
@@ -22,8 +23,6 @@ from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
-
-FAST = {"xla_backend_optimization_level": 0}  # small programs: compiling is their cost
 
 LAYOUT = get_layout("cramped_up")
 WIDTHS = Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8)
@@ -68,7 +67,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, seat: int) -> np.n
     obs = observe(LAYOUT, record, seat)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(TABLES)
-    apply = jax.jit(network.apply, compiler_options=FAST)
+    apply = compiled(network.apply)
     outputs: Any = apply(params, network.initial_hidden(TABLES), obs, jnp.asarray(reset))
     return np.asarray(outputs[1], np.float64)
 
@@ -76,7 +75,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, seat: int) -> np.n
 def played(policy: Any, record: np.ndarray, seat: int) -> np.ndarray:
     """Its actions (T, N) at three tables in these states, one after the other."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, seat, TABLES)
-    act = jax.jit(player.act, compiler_options=FAST)
+    act = compiled(player.act)
     zero = jnp.zeros(TABLES, jnp.int32)
     state = EnvState(jax.random.split(jax.random.key(0), TABLES), zero, zero, jnp.asarray(record[0]))
     memory, actions = player.begin(state), []
@@ -102,7 +101,7 @@ def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_p
 def test_the_memory_is_carried_and_matters(suite):
     """The hidden state after other states gives other logits in the same last state, and it starts from zero."""
     policy = learned.build(LAYOUT, suite / "b")
-    act = jax.jit(policy.act, compiler_options=FAST)
+    act = compiled(policy.act)
     obs = observe(LAYOUT, states(STEPS, 5)[:, 0], TEAMMATE)
     start = policy.init(policy.params, jax.random.key(0))
     np.testing.assert_array_equal(start, np.zeros(8))
@@ -126,7 +125,7 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
     def draws(policy):
         many = jax.vmap(policy.act, in_axes=(None, None, None, 0))
         hidden = policy.init(policy.params, jax.random.key(0))
-        return np.asarray(jax.jit(many, compiler_options=FAST)(policy.params, hidden, obs, keys)[0])
+        return np.asarray(compiled(many)(policy.params, hidden, obs, keys)[0])
 
     shares = np.bincount(draws(sampled), minlength=len(ACTIONS)) / 3000
     bound = 5 * (probability * (1 - probability) / 3000) ** 0.5 + 1e-3

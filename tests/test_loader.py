@@ -13,31 +13,15 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from plays import random_release
+from batches import CACHES, assert_equal, samplers
+from plays import SHARD, random_release
 
 from icrl4aht_data import Curriculum, load_icrl4aht
 from icrl4aht_data.errors import OptionError, ShardCorruptError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.shard import chunk_table_path
-from icrl4aht_data.store import Cache, choose
+from icrl4aht_data.store import choose
 from icrl4aht_data.threads import in_slices
-
-CACHES: tuple[Cache, ...] = ("ram", "mmap", "stream")
-
-
-def assert_equal(one, two) -> None:
-    for name, array in one._asdict().items():
-        np.testing.assert_array_equal(array, getattr(two, name), err_msg=name)
-
-
-def samplers(dataset, **options):
-    """One of each kind and order."""
-    return [
-        dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
-        dataset.ad(batch_size=6, length=130, **options),  # longer than the histories
-        dataset.dpt(batch_size=6, context=17, **options),
-        dataset.dpt(batch_size=6, context=17, order="random", teammate_actions=True, **options),
-    ]
 
 
 class TestHolding:
@@ -99,10 +83,9 @@ class TestHolding:
     @pytest.mark.parametrize("cache", CACHES)
     def test_damage_is_named_not_sampled(self, damaged, cache, tmp_path, monkeypatch):
         monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))  # without what the whole release left
-        shard = "data/teammate/coord_simple/train-00000-of-00001.h5"
-        data = bytearray((damaged / shard).read_bytes())
-        data[int(np.load(chunk_table_path(damaged, shard))["offset"][0])] ^= 1
-        (damaged / shard).write_bytes(data)
+        data = bytearray((damaged / SHARD).read_bytes())
+        data[int(np.load(chunk_table_path(damaged, SHARD))["offset"][0])] ^= 1
+        (damaged / SHARD).write_bytes(data)
         sampler = load_icrl4aht(damaged, layout="coord_simple", cache=cache).ad(batch_size=64, length=9)
         with pytest.raises(ShardCorruptError, match="chunk 0 of state in history 0"):
             sampler[0]
@@ -237,14 +220,17 @@ class TestOptions:
                     np.testing.assert_array_equal(getattr(query, name)[row], observe(layout, record, 0))
 
     def test_windows_are_uniform_over_histories_and_starts(self, lite):
-        """Pearson's statistic of 60,000 draws into 6 x 101 cells; its mean is 605, its deviation 35."""
-        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=20_000, length=20, seed=11)
-        counts = np.zeros((6, 101))
-        for i in range(3):
+        """Pearson's statistic of 60,000 draws into 6 x 101 cells, and of histories and of starts alone: its mean is one
+        less than the cells, its variance twice that."""
+        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=500, length=20, seed=11)
+        table = np.zeros((6, 101))
+        for i in range(120):
             ids, starts = sampler.windows(i)
-            np.add.at(counts, (ids - 6, starts), 1)
-        expected = 60_000 / counts.size
-        assert abs(((counts - expected) ** 2 / expected).sum() - 605) < 5 * 35
+            np.add.at(table, (ids - 6, starts), 1)
+        for counts in (table, table.sum(axis=0), table.sum(axis=1)):
+            expected, freedom = 60_000 / counts.size, counts.size - 1
+            statistic = ((counts - expected) ** 2 / expected).sum()
+            assert abs(statistic - freedom) < 5 * np.sqrt(2 * freedom), (counts.shape, statistic)
 
 
 class TestBuffers:
@@ -337,8 +323,7 @@ class TestPrefetch:
             assert len(made) <= 4  # one taken, two waiting, one in hand
 
     def test_an_exception_reaches_the_consumer(self, damaged):
-        shard = "data/teammate/coord_simple/train-00000-of-00001.h5"
-        (damaged / shard).write_bytes((damaged / shard).read_bytes()[:3000])
+        (damaged / SHARD).write_bytes((damaged / SHARD).read_bytes()[:3000])
         sampler = load_icrl4aht(damaged, layout="coord_simple").ad(batch_size=8, length=9)
         for prefetch in (0, 2):
             batches = sampler.batches(prefetch=prefetch)

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled
 
 from generation.learners.network import ActorCritic, Widths
 
 STEPS, TABLES, CHANNELS = 4, 3, 40
-FAST = {"xla_backend_optimization_level": 0}  # these programs are compiled to run once
 
 TOLERANCE = 1e-5
 """Relative to the largest value. Both forms add up the same float32 products in another order, at most some 1,000 in a
@@ -22,7 +22,7 @@ seen. A wrong tap, gate or bias is off by the size of the values themselves."""
 
 
 class PlainActorCritic(nn.Module):
-    """The network of spec/pipeline.md, section 1, from Flax's own layers; a loop over time."""
+    """The network of the paper (App. B.1 and C.2.1) from Flax's own layers; a loop over time."""
 
     widths: Widths
 
@@ -108,7 +108,7 @@ def small() -> Case:
 
 @pytest.fixture(scope="module")
 def apply(small):
-    return jax.jit(small.network.apply, compiler_options=FAST)
+    return compiled(small.network.apply)
 
 
 def assert_close(found: Any, expected: Any, what: str = "") -> None:
@@ -137,7 +137,7 @@ def test_outputs_and_gradients_equal_the_plain_form(which, request):
             last, logits, values = outputs
             return jnp.sum(weights[..., :6] * logits) + jnp.sum(weights[..., 6] * values) + jnp.sum(last), outputs
 
-        return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True), compiler_options=FAST)
+        return compiled(jax.grad(total, argnums=(0, 1), has_aux=True))
 
     (gradient, to_hidden), outputs = both(case.network)(case.params, case.hidden)
     (plain_gradient, plain_to_hidden), plain_outputs = both(plain)(names, case.hidden)
@@ -182,8 +182,8 @@ def test_a_reset_at_the_first_step_drops_the_given_hidden_state(small, apply):
 
 
 def test_initial_weights(small):
-    """Orthogonal of the scales in spec/pipeline.md, section 1; every bias zero."""
-    init = jax.jit(small.network.init, compiler_options=FAST)
+    """Orthogonal, of the published code's scales; every bias zero."""
+    init = compiled(small.network.init)
     params = init(jax.random.key(0), small.hidden, small.obs, small.reset)
     tree = plain_names(params, small.network.widths)["params"]
     scales = {"pointwise_0": 2**0.5, "spatial_0": 2**0.5, "spatial_1": 2**0.5}

@@ -5,111 +5,24 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from plays import make_tasks, play, random_release
-from test_index import long_index
-from test_loader import CACHES, assert_equal, samplers
+from batches import CACHES, assert_equal, samplers
+from plays import long_index, make_tasks, play, random_release
+from published import KEPT, SHARD
 
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
-from icrl4aht_data.benchmark import ACTIONS, PUBLISHED_ACTIONS
-from icrl4aht_data.cli import cli
 from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.convert import PUBLISHED_FIELDS, from_published, to_published, to_release
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
 from icrl4aht_data.interop import hf_episodes
-from icrl4aht_data.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.release import NewHistory, NewTask, write_release
 from icrl4aht_data.schema import KINDS
-from icrl4aht_data.shard import chunk_table_path
 from icrl4aht_data.tasks import write_tasks
-
-KEPT = 20
-_IDS = {name: number for number, name in enumerate(PUBLISHED_ACTIONS)}
-_SHARD = "data/teammate/demo_wide/train-00000-of-00001.h5"
-
-
-def publish(folder: Path) -> list[dict[str, np.ndarray]]:
-    """Published files as their authors write them: no states, no tasks, optional fields, an unfinished last episode.
-
-    Returns:
-        Each history's arrays, actions in our order.
-    """
-    rng = np.random.default_rng(0)
-    plans = [("demo_wide", "a", 120), ("demo_wide", "a", 130), ("coord_simple", "b", 60), ("demo_wide", "c", 50)]
-    written = []
-    folder.mkdir()
-    with h5py.File(folder / "histories.h5", "w") as file, (folder / "histories_index.jsonl").open("w") as index:
-        for number, (name, task, steps) in enumerate(plans):
-            layout = get_layout(name)
-            arrays = play(layout, 7, KEPT, rng)
-            kept = {"obs": observe(layout, arrays["state"], 0)[:steps]}
-            kept |= {field: arrays[field][:steps] for field in ("actions", "rewards", "dones")}
-            kept |= {"teammate_actions": arrays["teammate_actions"][:steps]} if task != "c" else {}
-            kept |= {"expert_actions": arrays["expert_actions"][:steps]} if task != "b" else {}
-            written.append(kept)
-            for field, array in kept.items():
-                stored = array.astype("f4" if field in ("obs", "rewards") else "?" if field == "dones" else "i4")
-                if field.endswith("actions"):
-                    stored = np.array([_IDS[ACTIONS[a]] for a in array], "i4")
-                file.create_dataset(f"/{number}/{field}", data=stored, compression="gzip", chunks=True)
-            line = {
-                "history_id": number,
-                "task_id": f"task_{task}",
-                "env_idx": 10 + number,
-                "T": steps,
-                "obs_shape": list(layout.obs_shape),
-                "action_dim": 6,
-                "track": "teammate",
-                "split": "train",
-                "layout": layout.alias if task == "c" else name,
-                "teammate_family": "H2" if task == "c" else "rl",
-                "teammate_kind": "some_variant",
-                "h5_group": f"/{number}",
-                "has_teammate_actions": task != "c",
-                "has_expert_actions": task != "b",
-            }
-            index.write(json.dumps(line) + "\n")
-    return written
-
-
-@pytest.fixture(scope="module")
-def theirs(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
-    """Hand-written published files. Read only."""
-    folder = tmp_path_factory.mktemp("theirs") / "files"
-    return folder, publish(folder)
-
-
-@pytest.fixture(scope="module")
-def ours(theirs, tmp_path_factory) -> Path:
-    """The release made of them. Read only."""
-    root = tmp_path_factory.mktemp("ours") / "release"
-    assert from_published(theirs[0], root, kept_steps=KEPT) == "observations"
-    return root
-
-
-@pytest.fixture(scope="module")
-def twin(lite, tmp_path_factory) -> Path:
-    """`lite` by way of published files without states. Read only."""
-    folder = tmp_path_factory.mktemp("twin")
-    to_published(load_icrl4aht(lite[0]), folder / "files", states=False)
-    with h5py.File(folder / "files" / "histories.h5") as file:
-        assert not any("state" in name for group in file.values() for name in group)
-    assert from_published(folder / "files", folder / "release", kept_steps=KEPT) == "observations"
-    return folder / "release"
-
-
-@pytest.fixture
-def copy(ours, tmp_path) -> Path:
-    """A copy to damage."""
-    return shutil.copytree(ours, tmp_path / "copy")
 
 
 class TestConversion:
@@ -148,7 +61,7 @@ class TestConversion:
         to_published(load_icrl4aht(ours), tmp_path / "files")
         assert not (tmp_path / "files" / "tasks.jsonl").exists()
         from_published(tmp_path / "files", tmp_path / "back", kept_steps=KEPT)
-        for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/info.json", _SHARD):
+        for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/info.json", SHARD):
             assert (tmp_path / "back" / name).read_bytes() == (ours / name).read_bytes(), name
 
     def test_a_part(self, ours, tmp_path):
@@ -173,7 +86,7 @@ class TestConversion:
         to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
         assert from_published(tmp_path / "files", tmp_path / "two", "observations", kept_steps=KEPT) == "observations"
         for root in (tmp_path / "one", tmp_path / "two"):
-            assert (root / _SHARD).read_bytes() == (twin / _SHARD).read_bytes()
+            assert (root / SHARD).read_bytes() == (twin / SHARD).read_bytes()
         assert from_published(tmp_path / "files", tmp_path / "three", kept_steps=KEPT) == "lite"
 
     def test_some_groups_with_states(self, lite, tmp_path):
@@ -480,144 +393,5 @@ class TestCombine:
 
     def test_one_with_tasks_to_the_same_bytes(self, twin, tmp_path):
         combine_releases(tmp_path / "out", [twin])
-        for name in (_SHARD, "meta/tasks.jsonl", "meta/histories.jsonl", "meta/info.json"):
+        for name in (SHARD, "meta/tasks.jsonl", "meta/histories.jsonl", "meta/info.json"):
             assert (tmp_path / "out" / name).read_bytes() == (twin / name).read_bytes()
-
-
-def problems(root: Path, deep: bool = False) -> list[str]:
-    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, deep=deep).findings]
-
-
-def spoilt(theirs, tmp_path: Path, name: str, place: Any, value: Any) -> Path:
-    """The first history as a release whose hashes hold but whose content is spoiled."""
-    arrays = {key: array.copy() for key, array in theirs[1][0].items()}
-    arrays[name][place] = value
-    (task,) = make_tasks(["demo_wide"])
-    new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)])
-    return write_release(tmp_path / "r", "observations", [new], data_version="0.0.1", card="", kept_steps=KEPT)
-
-
-class TestVerify:
-    @pytest.mark.parametrize("deep", [False, True])
-    def test_whole(self, ours, twin, deep):
-        for root, transitions in ((ours, 360), (twin, 1440)):
-            report = verify_release(root, deep=deep)
-            assert report.ok, report.findings
-            assert report.transitions == transitions
-            assert [note[:20] for note in report.notes] == ["nothing was replayed"] * deep
-
-    def test_every_flipped_byte_is_found(self, copy):
-        rng = np.random.default_rng(1)
-        whole, table = (copy / _SHARD).read_bytes(), np.load(chunk_table_path(copy, _SHARD))
-        for row in rng.choice(np.count_nonzero(table["rows"]), 20):
-            data = bytearray(whole)
-            data[int(table["offset"][row] + rng.integers(table["size"][row]))] ^= 1 << rng.integers(8)
-            (copy / _SHARD).write_bytes(data)
-            write_manifest(copy)  # the hashes of a liar hold, the chunk's checksum does not
-            found = problems(copy)
-            assert any("in history" in line and "crc32" in line for line in found), found
-        (copy / _SHARD).write_bytes(whole)
-        write_manifest(copy)
-        assert problems(copy) == []
-
-    @pytest.mark.parametrize("cache", CACHES)
-    def test_damage_is_named_not_sampled(self, copy, cache):
-        table = np.load(chunk_table_path(copy, _SHARD))
-        data = bytearray((copy / _SHARD).read_bytes())
-        data[int(table["offset"][5]) + 4] ^= 1  # of the first history: five scalars, then its observations
-        (copy / _SHARD).write_bytes(data)
-        sampler = load_icrl4aht(copy, cache=cache).select([0]).ad(batch_size=4, length=120)
-        with pytest.raises(Exception, match="chunk 0 of obs in history 0"):
-            sampler[0]
-
-    def test_every_file_is_covered(self, copy):
-        rng = np.random.default_rng(2)
-        for path in sorted(p for p in copy.rglob("*") if p.is_file() and p.stat().st_size):
-            whole = path.read_bytes()
-            data = bytearray(whole)
-            data[rng.integers(len(data))] ^= 1 << rng.integers(8)
-            path.write_bytes(data)
-            assert problems(copy), path
-            path.write_bytes(whole)
-        assert problems(copy) == []
-
-    @pytest.mark.parametrize(
-        ("name", "place", "value", "message"),
-        [
-            ("actions", 7, 6, "actions: expected 0..5, found 0..6"),
-            ("teammate_actions", 7, -1, "teammate_actions: expected 0..5, found -1..5"),
-            ("rewards", 7, 0.5, "rewards: expected whole numbers that a byte holds, found"),
-            ("rewards", 7, 200, "rewards: expected whole numbers that a byte holds, found"),
-        ],
-    )
-    def test_values_out_of_range(self, theirs, tmp_path, name, place, value, message):
-        assert any(message in line for line in problems(spoilt(theirs, tmp_path, name, place, value)))
-
-    def test_an_observation_of_no_place_is_found_by_deep(self, theirs, tmp_path):
-        first = 2 * (7 + get_layout("demo_wide").ingredient_types)
-        root = spoilt(theirs, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
-        assert problems(root) == []
-        (found,) = problems(root, deep=True)
-        assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
-
-    def test_an_index_that_lies(self, copy):
-        path = copy / "meta" / "histories.jsonl"
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
-        lines[0]["score"] += 1
-        lines[1]["episodes"] -= 1
-        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        write_manifest(copy)
-        found = problems(copy)
-        assert any("history 0: score: the index says" in line for line in found), found
-        assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found
-
-    def test_other_kinds_need_their_tasks(self, damaged):
-        (damaged / "meta" / "tasks.jsonl").write_text("")
-        write_manifest(damaged)
-        assert any("its task" in line and "is missing" in line for line in problems(damaged))
-
-
-class TestCommand:
-    def run(self, *arguments: Any, code: int = 0) -> str:
-        result = CliRunner().invoke(cli, [str(a) for a in arguments])
-        assert result.exit_code == code, (result.output, result.exception)
-        return result.output if result.exception is None or code == 2 else f"{result.output}{result.exception}"
-
-    def test_convert_says_what_is_lacking(self, theirs, tmp_path):
-        said = self.run("convert", theirs[0], tmp_path / "out", "--kept-steps", KEPT)
-        assert said == f"{tmp_path / 'out'}: observations, no state records: nothing can be replayed or drawn\n"
-        self.run("convert", tmp_path / "out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide")
-        self.run("convert", tmp_path / "out", tmp_path / "files", "--to", "published")
-        assert verify_release(tmp_path / "part").ok
-        assert "is made of state records" in self.run(
-            "convert", tmp_path / "out", tmp_path / "full", "--to", "full", code=1
-        )
-        assert "say what to make" in self.run("convert", tmp_path / "out", tmp_path / "x", code=2)
-
-    @pytest.mark.parametrize("kind", KINDS)
-    def test_convert_to_what_needs_states(self, lite, tmp_path, kind):
-        to_published(load_icrl4aht(lite[0]), tmp_path / "files", states=False)
-        said = self.run("convert", tmp_path / "files", tmp_path / "out", "--to", kind, "--kept-steps", KEPT, code=1)
-        assert "group /0: lacks state, episode_end_state" in said
-        assert f"a {kind} release is made of state records" in said
-
-    def test_show(self, ours, twin, lite):
-        lacks = json.loads(self.run("show", "--json", ours))["lacks"]
-        assert [what.split(":")[0] for what in lacks] == ["state records", "tasks", "teammate actions of 1 histories"]
-        assert [what.split(":")[0] for what in json.loads(self.run("show", "--json", twin))["lacks"]] == [
-            "state records"
-        ]
-        assert "lacks" not in json.loads(self.run("show", "--json", lite[0]))
-        assert "observations release" in self.run("show", ours)
-        assert "teammate" not in json.loads(self.run("show", "--json", "--history", 0, ours))
-        assert "teammate" in json.loads(self.run("show", "--json", "--history", 0, twin))
-        assert "task_a" in self.run("list", ours)
-
-    def test_verify(self, ours):
-        said = self.run("verify", "--deep", ours)
-        assert "whole; checked" in said
-        assert "physics" not in said
-        assert "nothing was replayed: without state records" in said
-        content = json.loads(self.run("verify", "--deep", "--json", ours))
-        assert (content["ok"], len(content["notes"])) == (True, 1)
-        assert "replayed" not in self.run("verify", ours)

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled, same_bytes
 
 from generation.env import Environment
 from generation.learners.ego import Learner, LearnerState
@@ -25,8 +26,6 @@ from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
-
-FAST = {"xla_backend_optimization_level": 0}  # small programs: compiling is their cost
 
 CLOSET = Layout("closet", "test_closet", ("WLWW01BW", "LA0WA  W", "WPWWPXWW"))
 EPISODE = 12
@@ -72,12 +71,12 @@ def learner() -> Learner:
 
 @pytest.fixture(scope="module")
 def update(learner) -> UpdateFunction:
-    return jax.jit(learner.update, compiler_options=FAST)
+    return compiled(learner.update)
 
 
 @pytest.fixture(scope="module")
 def untrained(learner) -> LearnerState:
-    return jax.jit(learner.init, compiler_options=FAST)(jax.random.key(3))
+    return compiled(learner.init)(jax.random.key(3))
 
 
 @pytest.fixture(scope="module")
@@ -146,16 +145,6 @@ def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
     return sequences(rollout, EGO, places, hidden, jnp.zeros(places.size), jnp.float32(0))
 
 
-def same_bytes(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(raw(one)), jax.tree.leaves(raw(other)), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
-
-
-def raw(tree: Any) -> Any:
-    """Typed keys as their words."""
-    return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
-
-
 # Advantages.
 
 
@@ -205,8 +194,8 @@ def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.nd
         batch = Batch(own._replace(log_prob=log_prob), jnp.asarray(advantage), target)
         return learner.ppo.loss(state.params, jax.tree.map(jnp.asarray, batch))[1]
 
-    by_log_prob = jax.jit(jax.grad(lambda p, t: losses(p, t)["policy_loss"]), compiler_options=FAST)
-    by_target = jax.jit(jax.grad(lambda t, p: losses(p, t)["value_loss"]), compiler_options=FAST)
+    by_log_prob = compiled(jax.grad(lambda p, t: losses(p, t)["policy_loss"]))
+    by_target = compiled(jax.grad(lambda t, p: losses(p, t)["value_loss"]))
     log_prob = egos(rollout).log_prob
     ratio = np.asarray(by_log_prob(log_prob, target)) * target.size / normalised
     value = target - np.asarray(by_target(target, log_prob)) * target.size
@@ -236,10 +225,10 @@ def test_loss_against_plain_numpy(learner, played):
     hidden = played.before[1].seats.memories[EGO]
     advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
     batch = jax.tree.map(jnp.asarray, Batch(egos_sequences(played.before[1], rollout), advantage, target))
-    total, parts = jax.jit(learner.ppo.loss, compiler_options=FAST)(params, batch)
+    total, parts = compiled(learner.ppo.loss)(params, batch)
 
     obs = observe(CLOSET, rollout.record, EGO)
-    output: Any = jax.jit(learner.network.apply, compiler_options=FAST)(params, hidden, obs, rollout.reset)
+    output: Any = compiled(learner.network.apply)(params, hidden, obs, rollout.reset)
     logits, value = np.asarray(output[1], np.float64), np.asarray(output[2], np.float64)
     log_probs = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
     chosen = np.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
@@ -311,7 +300,7 @@ def test_minibatches_are_shuffled_by_the_key(update, learning):
 def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
     """Of four sequences for three minibatches; which one, the key says."""
     ppo = PPO(CLOSET, learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
-    learn = jax.jit(ppo.learn, compiler_options=FAST)
+    learn = compiled(ppo.learn)
     given = egos_sequences(played.before[1], played.rollouts[1])
 
     def learned_from(sequence: int, seed: int) -> bool:
@@ -386,7 +375,7 @@ def test_a_teammate_that_sees_the_state_is_given_the_record(learner, played):
     state, rollout = played.before[2], played.rollouts[2]
     mate = policy_player(learner.env, Policy({}, begin, reads, "state"), {}, TEAMMATE, CONFIG.environments)
     players = learner.players(state.params, {})[EGO], mate
-    turn = jax.jit(lambda seats, key: roll_out(learner.env, players, seats, 1, key), compiler_options=FAST)
+    turn = compiled(lambda seats, key: roll_out(learner.env, players, seats, 1, key))
     _, turned = turn(state.seats, jax.random.key(0))
     np.testing.assert_array_equal(turned.record[0], rollout.record[0])
     np.testing.assert_array_equal(turned.actions[0, :, TEAMMATE], rollout.record[0].sum(axis=-1, dtype=np.int32) % 4)

@@ -111,12 +111,33 @@ def test_snippets_were_found():
     assert commands("python -m generation")
 
 
-def test_files_that_the_map_names_exist():
+def mapped() -> set[Path]:
+    """The files and folders of the map."""
     (table,) = re.findall(r"## Map\n(.*?)\n## ", README, flags=re.DOTALL)
+    paths = set()
     for cell in re.findall(r"^\| `(.*?)` \|", table, flags=re.MULTILINE):
         stem, names, end = re.fullmatch(r"([^{]*)(?:\{(.*)\}(.*))?", cell).groups()  # type: ignore[union-attr]
-        for name in names.split(",") if names else [""]:
-            assert (ROOT / f"{stem}{name}{end or ''}").exists(), cell
+        paths |= {ROOT / f"{stem}{name}{end or ''}" for name in (names.split(",") if names else [""])}
+    return paths
+
+
+def test_files_that_the_map_names_exist():
+    assert mapped()
+    assert [path for path in sorted(mapped()) if not path.exists()] == []
+
+
+def test_the_map_has_every_file():
+    """By itself or by a folder that it is in."""
+    files = sorted(
+        path for name in ("icrl4aht_data", "generation", "baselines") for path in (ROOT / name).rglob("*.py")
+    )
+    named = mapped()
+    missing = [
+        str(path.relative_to(ROOT))
+        for path in files
+        if not path.stem.startswith("__") and not named & {path, *path.parents}
+    ]
+    assert not missing, ", ".join(missing)
 
 
 def test_the_table_of_published_numbers_is_what_the_command_writes():

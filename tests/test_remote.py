@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import assert_equal
 from click.testing import CliRunner
-from plays import equal_batches
 from servers import Cut, http_server, hub_server
 
 from benchmarks import bench_remote
@@ -85,10 +85,10 @@ def test_batches_are_the_same_however_held(lite, cache):
                 assert remote.cache.cache == "stream" and "are not downloaded" in remote.cache.reason
             asked = {"batch_size": 16, "seed": 3, "teammate_actions": True}
             for i in range(2):
-                assert equal_batches(remote.ad(length=30, **asked)[i], local.ad(length=30, **asked)[i])
+                assert_equal(remote.ad(length=30, **asked)[i], local.ad(length=30, **asked)[i])
                 for order in ("contiguous", "random"):
                     options = {"context": 25, "order": order, **asked}
-                    assert equal_batches(remote.dpt(**options)[i], local.dpt(**options)[i])
+                    assert_equal(remote.dpt(**options)[i], local.dpt(**options)[i])
 
 
 @pytest.mark.parametrize("kind", ["http", "s3", "hub"])
@@ -124,7 +124,7 @@ def test_datasets_travel_between_processes(lite):
     with http_server(lite[0]) as server:
         remote = pickle.loads(pickle.dumps(load_icrl4aht(server.url, layout="demo_wide")))
         local = load_icrl4aht(lite[0], layout="demo_wide")
-        assert equal_batches(remote.ad(batch_size=4, length=30)[0], local.ad(batch_size=4, length=30)[0])
+        assert_equal(remote.ad(batch_size=4, length=30)[0], local.ad(batch_size=4, length=30)[0])
 
 
 def test_a_part_is_downloaded(served, lite, folders):
@@ -137,7 +137,7 @@ def test_a_part_is_downloaded(served, lite, folders):
     assert again.absent == [] and again.files == plan.files
     dataset = load_icrl4aht(served, layout="demo_wide")
     assert dataset.cache.cache == "ram"
-    assert equal_batches(
+    assert_equal(
         dataset.ad(batch_size=4, length=30)[0],
         load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)[0],
     )
@@ -208,7 +208,7 @@ def test_the_stream_cache_is_bounded(many, monkeypatch, folders):
             dataset = load_icrl4aht(server.url, layout=layout, obs="state")
             for i in range(6):
                 expected = load_icrl4aht(many, layout=layout, obs="state").ad(batch_size=16, length=500)[i]
-                assert equal_batches(dataset.ad(batch_size=16, length=500)[i], expected)
+                assert_equal(dataset.ad(batch_size=16, length=500)[i], expected)
                 kept = sum(path.stat().st_blocks * 512 for path in folders.glob("*/*.partial/**/*") if path.is_file())
                 assert kept <= 300_000 + 100_000
 
@@ -222,7 +222,7 @@ def test_offline(served, lite, monkeypatch, variable):
     fetch_planned(plan_download(served, layout="demo_wide"))
     monkeypatch.setenv(variable, "1")
     remote = load_icrl4aht(served, layout="demo_wide")
-    assert equal_batches(
+    assert_equal(
         remote.ad(batch_size=4, length=30)[0], load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)[0]
     )
     missing = load_icrl4aht(served, layout="coord_simple", cache="ram")

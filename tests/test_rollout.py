@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled
 from scenes import random_records
 
 from generation.env import Environment, EnvState
@@ -32,8 +33,6 @@ from generation.teammates.base import Policy
 from icrl4aht_data.benchmark import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
-
-FAST = {"xla_backend_optimization_level": 0}  # small programs: compiling is their cost
 
 LAYOUT = get_layout("cramped_up")
 TABLES, EPISODE, STEPS = 4, 5, 8
@@ -129,10 +128,6 @@ def apply():
         return outputs[0], outputs[1][0], outputs[2][0]
 
     return compiled(apply)
-
-
-def compiled(function):
-    return jax.jit(function, compiler_options=FAST)
 
 
 def in_state(record: np.ndarray) -> EnvState:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import digest
 from plays import random_release
 
 from icrl4aht_data import load_icrl4aht
@@ -153,25 +153,9 @@ def test_what_follows_an_episodes_last_step_is_its_own_end(lite, order):
         assert {(before.tobytes(), after.tobytes()) for before, after in rows} <= pairs
 
 
-def digest(root: Path) -> str:
-    """Of a few batches of both samplers."""
-    dataset = load_icrl4aht(root, layout="demo_wide")
-    samplers = [
-        dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),
-        dataset.dpt(batch_size=5, context=12, seed=7),
-        dataset.dpt(batch_size=5, context=12, seed=7, order="random"),
-    ]
-    state = hashlib.sha256()
-    for sampler in samplers:
-        for i in (0, 1, 1000):
-            for name, array in sampler[i]._asdict().items():
-                state.update(name.encode() + (b"" if array is None else array.tobytes()))
-    return state.hexdigest()
-
-
 def test_same_batches_in_two_processes_and_from_both_kinds(lite, full):
     here = Path(__file__).parent
-    code = "import sys; from pathlib import Path; from test_sampling import digest; print(digest(Path(sys.argv[1])))"
+    code = "import sys; from pathlib import Path; from batches import digest; print(digest(Path(sys.argv[1])))"
     environment = os.environ | {"PYTHONPATH": str(here)}
     run = subprocess.run(
         [sys.executable, "-c", code, str(lite[0])], capture_output=True, text=True, check=True, env=environment
@@ -194,18 +178,6 @@ def test_the_draws_are_fixed_for_good(lite):
     ids, starts = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=6, length=20, seed=0).windows(0)
     assert ids.tolist() == [6, 7, 6, 9, 9, 7]
     assert starts.tolist() == [95, 99, 25, 19, 71, 13]
-
-
-def test_windows_are_uniform_over_histories_and_starts(lite):
-    sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=500, length=LENGTH, seed=11)
-    drawn = [sampler.windows(i) for i in range(120)]
-    ids, starts = (np.concatenate(part) for part in zip(*drawn, strict=True))
-    for values, cells in ((ids - 6, 6), (starts, 120 - LENGTH + 1)):
-        counts = np.bincount(values, minlength=cells)
-        assert len(counts) == cells
-        expected = len(values) / cells
-        chi_square = ((counts - expected) ** 2 / expected).sum()
-        assert chi_square < cells - 1 + 5 * np.sqrt(2 * (cells - 1)), (cells, chi_square)
 
 
 def test_length_and_iteration(lite):

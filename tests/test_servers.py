@@ -189,7 +189,7 @@ def test_closing_does_not_wait_for_a_slow_body(folder):
         while not server.log:
             time.sleep(0.01)
     connection.close()
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 30
 
 
 def test_another_etag_from_now_on(web):

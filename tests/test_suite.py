@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,8 @@ from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.manifest import file_hash
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.tasks import read_tasks, write_tasks
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 LAYOUT = get_layout("cramped_up")
 SMOKE = load_profile("smoke").teammates
@@ -77,16 +78,8 @@ def run_of(algorithm: str) -> Run:
     return Run(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_fast() -> Iterator[None]:
-    """Small programs: compiling is their cost."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, compiled_fast) -> Path:
+def trained(tmp_path_factory, compiled_quickly) -> Path:
     """A suite of all four algorithms on cramped_up. Read only."""
     root = tmp_path_factory.mktemp("trained")
     for algorithm in ALGORITHMS:

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flat_world import FLAT, TINY, ad_batch
 from plays import random_release
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
-from test_models import FLAT, TINY, ad_batch
 from tiny import start
 
 from baselines.histories import HistoryOptions, hold_out, prepare
@@ -273,8 +273,9 @@ def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
 
 
 def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    two = across(lite[0], tmp_path, [{"PROCESS": "0"}, {"PROCESS": "1"}], f"127.0.0.1:{port}")
+    with socket.socket() as held:  # which JAX's coordinator may share, and nothing else takes
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        held.bind(("127.0.0.1", 0))
+        port = held.getsockname()[1]
+        two = across(lite[0], tmp_path, [{"PROCESS": "0"}, {"PROCESS": "1"}], f"127.0.0.1:{port}")
     assert_close(two, on_one_device)

@@ -10,9 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
+from batches import assert_equal
 from click.testing import CliRunner
 from huggingface_hub import DatasetCard, ModelCard, snapshot_download
-from plays import equal_batches, random_release
+from plays import random_release
 from servers import Hub, Request, Slow, Status, hub_server, uploads
 
 from icrl4aht_data import load_icrl4aht, verify_release
@@ -261,5 +262,5 @@ def test_what_was_uploaded_loads(hub, published, tmp_path, monkeypatch):
     done = upload_release(published, ADDRESS)
     there, here = (load_icrl4aht(root, layout="demo_wide") for root in (f"{ADDRESS}@v0.0.1", published))
     assert str(there.origin) == f"{ADDRESS}@{done.commit}" and there.info == here.info
-    assert equal_batches(there.ad(batch_size=4, length=30)[0], here.ad(batch_size=4, length=30)[0])
+    assert_equal(there.ad(batch_size=4, length=30)[0], here.ad(batch_size=4, length=30)[0])
     assert verify_release(f"{ADDRESS}@v0.0.1", deep=True).ok

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxes import compiled
 from scenes import random_records, scene
 
 from generation.teammates import utility_greedy
@@ -24,7 +25,7 @@ from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL
 from icrl4aht_data.overcooked.state import ingredient_count, start, unpack
 
 PUBLISHED_PLAY = "030512503051250305125325124444444444444450530512503051250305"
-"""H4-t0..t4 on test_simple in the published ids (spec/teammates.md, section 7)."""
+"""H4-t0..t4 on test_simple in the published ids, by an independent simulator of the published teammates."""
 
 NAMES = (
     *("w_deliver", "w_pickup_cooked", "w_get_plate", "w_add_ingredient", "w_fetch_ingredient", "w_stage_on_counter"),
@@ -41,10 +42,9 @@ TEST_THETAS = [
         (9.0, 7.0, 6.0, 8.0, 7.0, 8.0, 6.0, 0.0, 0.4, 0.3, 0.9),
     )
 ]
-"""H4-t0..t4 (spec/teammates.md, section 4)."""
+"""H4-t0..t4 of the published manifests."""
 
 SEARCH = (RIGHT, DOWN, LEFT, UP)
-FAST = {"xla_backend_optimization_level": 0}  # these programs are compiled to run once
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 FACED_BY = {0: UP, 1: DOWN, 2: RIGHT, 3: LEFT}  # facing -> the action that turns there
 
@@ -85,7 +85,7 @@ def _scan(layout: Layout, slot: int, noise: Noise, steps: int):
         return jax.lax.scan(step, (record, policy.init(params, key)), recipes)[1]
 
     batch = jax.vmap(jax.vmap(one, (None, 0, 1, 0), 1), (0, None, None, None), 1)
-    return jax.jit(batch, compiler_options=FAST)
+    return compiled(batch)
 
 
 def play(
@@ -138,7 +138,7 @@ def test_two_deliveries_in_100_steps_beside_a_motionless_ego(name):
     np.testing.assert_array_equal((rewards > 0).sum(axis=0), 2)
     np.testing.assert_array_equal(rewards.sum(axis=0), 40)
     first, second = np.sort(rewards.argsort(axis=0, kind="stable")[-2:], axis=0) + 1
-    assert 36 <= first.min() <= first.max() <= 50  # spec/teammates.md, section 6
+    assert 36 <= first.min() <= first.max() <= 50  # as in 150 games of that simulator
     assert 74 <= second.min() <= second.max() <= 92
 
 
@@ -319,7 +319,7 @@ def test_equals_plain_rules_on_random_states(layout, slot):
     keys = jax.random.wrap_key_data(jnp.stack([jnp.asarray(rolls, jnp.uint32), jnp.zeros(n, jnp.uint32)], axis=1))
     policy = build(layout, {"family": "utility_greedy", "theta": DEFAULTS}, slot)
     memory = Memory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
-    act = jax.jit(jax.vmap(policy.act), compiler_options=FAST)
+    act = compiled(jax.vmap(policy.act))
     actions, after = act(params, memory, records, keys)
     found = [Plain(*row) for row in np.stack([after.intent, actions, after.wait], axis=1).tolist()]
     expected = [plain_rules(layout, thetas[of[i]], records[i], slot, int(last[i]), int(rolls[i])) for i in range(n)]
@@ -339,7 +339,7 @@ def _act(slot: int):
     """H4 in cramped_up, eight at once: memory, records (8, S) -> actions (8,), memory."""
     policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot)
     keys = jax.random.split(jax.random.key(0), 8)
-    act = jax.jit(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)), compiler_options=FAST)
+    act = compiled(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)))
     return lambda memory, records: act(policy.params, memory, records, keys)
 
 
