@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -51,13 +52,14 @@ def _plot_histories(
     panels: dict[tuple[str, str], dict[str, list[np.ndarray]]] = {}
     for history in dataset:
         panels.setdefault(panel(history.entry), {}).setdefault(curve(history.entry), []).append(history.returns())
-    plot_curves(
-        path,
-        [
-            (title, {f"{label} of {len(streams)} streams": _cut(streams) for label, streams in curves.items()})
-            for (_, title), curves in panels.items()
-        ],
-    )
+    alike, seen = Counter(title for _, title in panels), Counter()
+    drawn = []
+    for (_, title), curves in panels.items():
+        seen[title] += 1
+        number = f", {seen[title]}" if alike[title] > 1 else ""
+        streams = {f"{label} of {len(of_label)} streams": _cut(of_label) for label, of_label in curves.items()}
+        drawn.append((title + number, streams))
+    plot_curves(path, drawn)
 
 
 def _cut(streams: list[np.ndarray]) -> np.ndarray:
