@@ -13,13 +13,13 @@ from icrl4aht_data.cards import fill
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
 
-def model_card(run: Run) -> str:
+def model_card(run: Run, trained: Mapping[str, Any]) -> str:
     """README.md of a model, for who publishes its run folder.
 
     Args:
-        run: one with a trained source, see `report.Source`; of several, the first's settings are shown.
+        run: its results.
+        trained: what was trained, see `report.Source`.
     """
-    trained = next(source.trained for source in run.sources if source.trained)
     config, histories = trained["config"], trained["config"]["histories"]
     at_hub = _HUB.match(histories["root"])
     limits = [
@@ -42,12 +42,13 @@ def model_card(run: Run) -> str:
 
 
 def write_model_cards(runs: Iterable[Run], folder: Path) -> list[Path]:
-    """The cards of those that were trained, by their names, into a folder."""
+    """The cards of those that were trained, by their names, into a folder; of several sources the first's settings."""
     paths = []
     for run in runs:
-        if any(source.trained for source in run.sources):
+        trained = next((source.trained for source in run.sources if source.trained), None)
+        if trained:
             paths.append(folder / f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md")
-            paths[-1].write_text(model_card(run), encoding="utf-8")
+            paths[-1].write_text(model_card(run, trained), encoding="utf-8")
     return paths
 
 

@@ -64,7 +64,7 @@ def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) 
         CollectionError: if there is no task, because no teammate is good enough.
     """
     tasks = profile.heuristic_tasks()
-    if not (profile.algorithms and profile.learned_on):
+    if not profile.algorithms:
         return tasks
     selections = build_suite(profile, suite, profile.learned_on, profile.algorithms, seed, console)
     tasks += make_tasks(suite, selections, "train")

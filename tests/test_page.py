@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from baselines import watching
 from baselines.cli import cli
 from baselines.evaluate import PROTOCOLS, get_protocol
+from baselines.model_card import write_model_cards
 from baselines.page import write_page, write_page_with_films
-from baselines.report import LAYOUTS, Run, Source, merge, read_published
+from baselines.report import TEST_LAYOUTS, Run, Source, merge, read_published
 from baselines.tables import AVERAGE, PAPER_TABLES, fill, score, sweep
 from baselines.watching import Film, ego_of
 from icrl4aht_data.errors import OptionError
@@ -70,7 +71,7 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
     sweeps.append(run("DPT", variant=("size", "small")))
     (tmp_path / "a.gif").write_bytes(GIF)
     path = tmp_path / "r" / "report.html"
-    runs = [run("AD", LAYOUTS), run("random", LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
+    runs = [run("AD", TEST_LAYOUTS), run("random", TEST_LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
     films = [Film("H1", "H1 & an ego", tmp_path / "a.gif"), Film("rl", "no picture: <its run> is gone", None)]
     write_page(runs, path, films, ["left out: <nothing>"])
     text = path.read_text()
@@ -98,7 +99,7 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
 
 
 def test_tables_hold_ours_beside_the_papers():
-    runs = [run("AD", LAYOUTS), run("oracle", ("demo_wide",), 50.0)]
+    runs = [run("AD", TEST_LAYOUTS), run("oracle", ("demo_wide",), 50.0)]
     one, two, three, four, five = (fill(table, runs, "seeded") for table in PAPER_TABLES)
     assert [row.agent for row in one[:4]] == ["AD", "DPT", "random", "oracle"]
     assert [row.agent for row in two[:4]] == ["AD", "DPT", "random", "AD"], "oracle did not play there"
@@ -176,6 +177,22 @@ def test_models_of_different_layouts_are_one_agent():
     assert [source.layouts for source in both.sources] == [("demo_wide",), ("coord_simple",)]
     assert [found.label for found in merge([one, run("AD", value=3.0)])] == ["AD", "AD [runs/AD]"]
     assert len(merge([one, run("AD", ("coord_simple",), variant=("K", 250))])) == 2
+
+
+def test_trained_models_have_cards(tmp_path):
+    histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": ["demo_wide"], "data_version": "1.0.0"}
+    config = {"model": {"layers": 4}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+    histories["sizes"] = {"train": 14}
+    trained = run("AD")
+    source = trained.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12"})
+    (path,) = write_model_cards([run("stay"), dataclasses.replace(trained, sources=(source,))], tmp_path)
+    card = path.read_text()
+    assert path.name == "AD-seeded.md"
+    assert "| data | you/icrl4aht, data version 1.0.0 |" in card
+    assert "| 14 of demo_wide; the release's manifest has SHA-256 `ab12` |" in card
+    assert "* layers: 4\n* seed: 3" in card
+    assert "| H4 | 11.0 ± 0.0" in card
+    assert "It is one run, of seed 3" in card
 
 
 def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):

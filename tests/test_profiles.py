@@ -164,6 +164,7 @@ def test_learned_teammates_on_some_layouts(changed):
             'learned_on = ["cramped_up", "demo_wide"]\npresets =',
             r"tasks\.learned_on = \['cramped_up', 'demo_wide'\]: expected some of tasks\.layouts",
         ),
+        ("presets =", "learned_on = []\npresets =", r"tasks\.learned_on = \[\]: expected some of tasks\.layouts"),
         ("keep = 8", "keep = 0", r"release\.keep = 0: expected 1\.\.8"),
         ("keep = 8", "keep = 9", r"release\.keep = 9: expected 1\.\.8"),
         ("minibatches = 4", "minibatches = 3", r"environments = 8: not a multiple of minibatches = 3"),

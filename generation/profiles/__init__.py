@@ -123,7 +123,7 @@ def load_profile(name: str) -> Profile:
         raise OptionError(
             f"{path}: expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms"
         )
-    if not set(profile.learned_on) <= set(layouts):
+    if not profile.learned_on or not set(profile.learned_on) <= set(layouts):
         raise OptionError(f"{path}: tasks.learned_on = {list(profile.learned_on)}: expected some of tasks.layouts")
     if not 0 < profile.keep <= profile.ego.environments:
         raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
