@@ -27,9 +27,9 @@ import numpy as np
 from generation import record
 from generation.learners.ppo import PPOConfig
 from generation.profiles import Profile
-from generation.snapshot import keep_lines, sync_file
+from generation.snapshot import keep_lines
 from icrl4aht_data.errors import IndexFormatError
-from icrl4aht_data.files import parse_json, read_text, write_json
+from icrl4aht_data.files import file_in_place_of, parse_json, read_text, write_json
 from icrl4aht_data.manifest import file_hash, hashes_hold
 from icrl4aht_data.tasks import Task
 
@@ -80,10 +80,8 @@ def finish(partial: Path, task: Task, profile: Profile) -> None:
         "platform": jax.default_backend(),
         "files": {name: file_hash(partial / name) for name in sorted(_HASHED)},
     }
-    unnamed = partial / f"{METADATA}.partial"
-    write_json(unnamed, metadata)
-    sync_file(unnamed)
-    unnamed.replace(partial / METADATA)
+    with file_in_place_of(partial / METADATA) as unnamed:
+        write_json(unnamed, metadata)
 
 
 def publish(partial: Path, folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.files import file_in_place_of
 
 
 def save_state(path: Path, state: Any, card: dict[str, str]) -> None:
     """Write a pytree of arrays and typed keys (of JAX's default kind); a reader sees the old file or the new one."""
     arrays = {name: np.require(_plain(leaf), requirements="C") for name, leaf in _leaves(state).items()}
-    partial = path.with_name(f"{path.name}.partial")
-    save_file(arrays, partial, metadata=card)
-    sync_file(partial)
-    partial.replace(path)
-    sync_file(path.parent)
+    with file_in_place_of(path) as partial:
+        save_file(arrays, partial, metadata=card)
 
 
 def read_card(path: Path) -> dict[str, str] | None:
@@ -68,15 +65,6 @@ def keep_lines(path: Path, lines: int) -> None:
     """Leave a text file's first lines alone; make an empty one where there is none."""
     kept = path.read_bytes().splitlines(keepends=True)[:lines] if path.exists() else []
     path.write_bytes(b"".join(kept))
-
-
-def sync_file(path: Path) -> None:
-    """Have the system write a file, or a folder's list of names, to the disk now."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _leaves(tree: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -129,12 +130,15 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def file_in_place_of(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to. At the end the file takes its place at once; after an error nothing changes."""
+    """A name beside `path` to write to. At the end the file, by then on the disk, takes its place at once; after an
+    error nothing changes."""
     partial = path.with_name(f".{path.name}.partial")
     partial.unlink(missing_ok=True)  # not to write through a link that somebody laid there
     try:
         with naming(path):
             yield partial
+            with partial.open("rb+") as stream:
+                os.fsync(stream.fileno())
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

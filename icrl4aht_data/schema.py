@@ -99,7 +99,7 @@ FIELDS: dict[str, Field] = {
         Field("teammate_actions", "int32", "int8", "T", "scalar", 2000, optional=(OBSERVATIONS,)),
         Field("expert_actions", "int32", "int8", "T", "scalar", 2000, optional=ALL_KINDS),
         Field("episode_end_state", "uint8", "uint8", "E", "state", 1000, absent=(OBSERVATIONS,)),
-        Field("obs", "uint8", "uint8", "T", "obs", 500, absent=("lite",)),
+        Field("obs", "uint8", "uint8", "T", "obs", 200, absent=("lite",)),
     )
 }
 """Every field, in file order. `episode_end_state` is the state after each episode's last kept step."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _Arrays = Mapping[str, np.ndarray]
 
-_DEFLATE_LEVEL = 6
+_DEFLATE_LEVEL = 8
 _BLOCK = 2000  # steps: a chunk of scalars, two of records
 
 
