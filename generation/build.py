@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 from filelock import FileLock
@@ -66,11 +67,12 @@ def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) 
     tasks = profile.heuristic_tasks()
     if not profile.algorithms:
         return tasks
-    selections = build_suite(profile, suite, profile.learned_on, profile.algorithms, seed, console)
+    selections = build_suite(profile, suite, profile.algorithms, seed, console)
     tasks += make_tasks(suite, selections, "train")
     if not tasks:
+        names = dict.fromkeys(chain(*profile.algorithms.values()))
         raise CollectionError(
-            f"{suite}: no checkpoint of {', '.join(profile.algorithms)} exceeds the return of {THRESHOLD:g} that a "
+            f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
     return tasks

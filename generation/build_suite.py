@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from generation.suite import PopulationBusyError, Run, checkpoints, is_trained, 
 from generation.teammates import learned
 from generation.teammates.instances import published_thetas
 from generation.teammates.registry import build
-from icrl4aht_data.benchmark import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of, unknown
+from icrl4aht_data.benchmark import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
@@ -27,24 +27,20 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 def build_suite(
     profile: Profile,
     suite: Path,
-    layouts: Sequence[str],
-    algorithms: Sequence[str],
+    algorithms: Mapping[str, Sequence[str]],
     seed: int,
     console: Console,
 ) -> list[Selection]:
     """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
 
-    Populations that another process trains are left to it until nothing else is to do, then waited for.
+    `algorithms` has those of each layout. Populations that another process trains are left to it until nothing else is
+    to do, then waited for.
 
     Returns:
         What the filter left of each population that was asked for.
     """
-    names = _names(layouts)
-    for name in algorithms:
-        if name not in ALGORITHMS:
-            raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
-    todo = runs(profile, names, algorithms, seed)
+    todo = runs(profile, algorithms, seed)
     wanted = [(run.layout.name, run.algorithm) for run in todo]
     for wait in (False, True):
         todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
@@ -61,8 +57,8 @@ def build_suite(
     return [selection for selection in selections if (selection.layout, selection.algorithm) in wanted]
 
 
-def runs(profile: Profile, layouts: Sequence[str], algorithms: Sequence[str], seed: int) -> list[Run]:
-    """The populations of these layouts, each with a seed of its own."""
+def runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], seed: int) -> list[Run]:
+    """The populations by these algorithms of each layout, each with a seed of its own."""
     config = profile.teammates
     return [
         Run(
@@ -72,8 +68,8 @@ def runs(profile: Profile, layouts: Sequence[str], algorithms: Sequence[str], se
             config.ppo,
             seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm),
         )
-        for name in layouts
-        for algorithm in algorithms
+        for name, wanted in algorithms.items()
+        for algorithm in wanted
     ]
 
 

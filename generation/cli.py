@@ -251,7 +251,12 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
 
     ask_for_determinism()
     profile = load_profile(profile_name)
-    build_suite(profile, suite, layouts or profile.learned_on, algorithms, seed, console)
+    if layouts:
+        wanted = dict.fromkeys(layouts, algorithms)
+    else:
+        of_profile = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
+        wanted = {layout: [name for name in names if name in algorithms] for layout, names in of_profile.items()}
+    build_suite(profile, suite, wanted, seed, console)
 
 
 @cli.command()

@@ -104,7 +104,7 @@ def cost(profile: Profile, devices: int) -> Cost:
     ego, tasks = profile.ego, len(profile.task_layouts)
     learning = calibrate(ego, partial(task_learner, profile))
     task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
-    populations = [run.steps for run in runs(profile, profile.learned_on, profile.algorithms, 0)]
+    populations = [run.steps for run in runs(profile, profile.algorithms, 0)]
     playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
     population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
     in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds

@@ -227,23 +227,26 @@ def _limits(release: _Release) -> list[str]:
 def _missing(release: _Release) -> Iterable[str]:
     """Which learned teammates are fewer than was wanted."""
     found = Counter((task.layout.name, task.teammate_kind) for task in release.tasks if task.split == "train")
-    for suite in release.distinct("suite"):
-        learned_on = suite.get("layouts", release.info["layouts"])
-        without = [layout for layout in release.info["layouts"] if layout not in learned_on]
-        if without:
-            yield f"Learned on {', '.join(without)}: its profile has no learned teammates there, only presets of H4."
-        few = [
-            f"{algorithm} on {layout} ({found[layout, algorithm]} of {suite['train']})"
-            for layout in release.info["layouts"]
-            if layout in learned_on
-            for algorithm in suite["algorithms"]
-            if found[layout, algorithm] < suite["train"]
-        ]
-        if few:
-            yield (
-                f"Complete: it has fewer training teammates than its profile wanted of {', '.join(few)}. Too few "
-                "checkpoints passed the quality filter, or this is a part of a release."
-            )
+    suites = release.distinct("suite")
+    wanted = {
+        (layout, algorithm): suite["train"]
+        for suite in suites
+        for layout in suite.get("layouts", release.info["layouts"])
+        for algorithm in suite["algorithms"]
+    }
+    without = [name for name in release.info["layouts"] if name not in {layout for layout, _ in wanted}]
+    if suites and without:
+        yield f"Learned on {', '.join(without)}: its profile has no learned teammates there, only presets of H4."
+    few = [
+        f"{algorithm} on {layout} ({found[layout, algorithm]} of {count})"
+        for (layout, algorithm), count in wanted.items()
+        if layout in release.info["layouts"] and found[layout, algorithm] < count
+    ]
+    if few:
+        yield (
+            f"Complete: it has fewer training teammates than its profile wanted of {', '.join(few)}. Too few "
+            "checkpoints passed the quality filter, or this is a part of a release."
+        )
 
 
 def _smaller(release: _Release) -> Iterable[str]:

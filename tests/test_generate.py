@@ -286,9 +286,7 @@ def test_a_population_that_another_process_trains_is_waited_for(learned, monkeyp
         assert other.stdout is not None
         assert other.stdout.readline() == b"\n"
         output = Heard("another process is training it", other.stdin.close)
-        selections = build_suite(
-            profile, learned / "suite", profile.learned_on, ["brdiv", "fcp"], 0, Console(file=output)
-        )
+        selections = build_suite(profile, learned / "suite", {"demo_wide": ["brdiv", "fcp"]}, 0, Console(file=output))
     lines = [line for line in output.getvalue().splitlines() if " on demo_wide: " in line][:3]
     assert [line.partition(": ")[2] for line in lines] == [
         "another process is training it",

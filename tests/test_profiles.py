@@ -63,7 +63,7 @@ def test_shipped_profiles_load(name):
     assert profile.ego.updates > 0
     assert 0 < profile.keep <= profile.ego.environments
     for layout in profile.layouts:
-        learned = len(profile.algorithms) * profile.teammates.train * (layout in profile.learned_on)
+        learned = len(profile.algorithms.get(layout, ())) * profile.teammates.train
         assert profile.task_layouts.count(layout) == len(profile.presets) + learned > 0
     tasks = profile.heuristic_tasks()
     assert len(tasks) == len(profile.layouts) * len(profile.presets)
@@ -89,8 +89,8 @@ def test_paper_profile_has_the_papers_numbers():
     assert (ego.entropy, ego.value, ego.shaping_horizon) == (0.01, 0.5, 60_000_000)
     assert ego.widths == Widths((128, 128, 8), (16, 32, 32), 128, 128, 128)
     assert profile.keep == 128
-    assert (profile.algorithms, profile.presets, len(profile.task_layouts)) == (ALGORITHMS, (), 8 * 80)
-    assert profile.layouts == profile.learned_on
+    assert (profile.presets, len(profile.task_layouts)) == ((), 8 * 80)
+    assert profile.algorithms == dict.fromkeys(profile.layouts, ALGORITHMS)
     assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
 
 
@@ -133,9 +133,9 @@ def test_a_profile_by_its_path(changed):
 
 
 def test_learned_teammates_on_some_layouts(changed):
-    learned = 'algorithms = ["fcp", "comedi"]\nlearned_on = ["cramped_room_up"]\npresets ='
+    learned = 'algorithms = { cramped_room_up = ["fcp", "comedi"], coord_simple = [] }\npresets ='
     profile = load_profile(changed("presets =", learned))
-    assert profile.learned_on == ("cramped_up",)
+    assert profile.algorithms == {"cramped_up": ("fcp", "comedi")}
     assert profile.task_layouts.count("coord_simple") == 2
     assert profile.task_layouts.count("cramped_up") == 2 + 2 * profile.teammates.train
 
@@ -161,10 +161,15 @@ def test_learned_teammates_on_some_layouts(changed):
         ('"default"', '"defualt"', r"unknown preset of utility_greedy 'defualt'; .*Did you mean 'default'\?"),
         (
             "presets =",
-            'learned_on = ["cramped_up", "demo_wide"]\npresets =',
-            r"tasks\.learned_on = \['cramped_up', 'demo_wide'\]: expected some of tasks\.layouts",
+            'algorithms = { demo_wide = ["fcp"] }\npresets =',
+            r"tasks\.algorithms\.demo_wide: expected a table with some of tasks\.layouts",
         ),
-        ("presets =", "learned_on = []\npresets =", r"tasks\.learned_on = \[\]: expected some of tasks\.layouts"),
+        ("presets =", 'algorithms = "fcp"\npresets =', r"tasks\.algorithms = 'fcp': expected list"),
+        (
+            "presets =",
+            'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =',
+            r"tasks\.algorithms\.cramped_up = .*: expected names, none twice",
+        ),
         ("keep = 8", "keep = 0", r"release\.keep = 0: expected 1\.\.8"),
         ("keep = 8", "keep = 9", r"release\.keep = 9: expected 1\.\.8"),
         ("minibatches = 4", "minibatches = 3", r"environments = 8: not a multiple of minibatches = 3"),

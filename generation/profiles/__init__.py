@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import chain
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,7 @@ class Profile:
     keep: int  # streams of each task that the release keeps, best first
     layouts: tuple[str, ...]
     presets: tuple[str, ...] = ()  # teammates that are the heuristic H4 utility_greedy
-    algorithms: tuple[str, ...] = ()  # teammates that learned, `teammates.train` of each
-    learned_on: tuple[str, ...] = ()  # the layouts that have those
+    algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of a layout's teammates that learned
 
     def heuristic_tasks(self) -> list[Task]:
         """One training task per layout and preset, each with a seed of its own."""
@@ -63,8 +63,10 @@ class Profile:
     @property
     def task_layouts(self) -> tuple[str, ...]:
         """The layout of each training task, if the populations have teammates enough."""
-        learned = self.learned_on * len(self.algorithms) * self.teammates.train
-        return self.layouts * len(self.presets) + learned
+        learned = [
+            layout for layout, names in self.algorithms.items() for _ in range(len(names) * self.teammates.train)
+        ]
+        return self.layouts * len(self.presets) + tuple(learned)
 
     @property
     def ego_hash(self) -> str:
@@ -95,7 +97,7 @@ def load_profile(name: str) -> Profile:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         _only(content, "", {"ego", "teammates", "release", "tasks"})
         _only(content["release"], "release.", {"keep", "data_version"})
-        _only(content["tasks"], "tasks.", {"layouts", "presets", "algorithms", "learned_on"})
+        _only(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
         tasks = content["tasks"]
         layouts = _layouts("tasks.layouts", tasks["layouts"])
         profile = Profile(
@@ -106,8 +108,7 @@ def load_profile(name: str) -> Profile:
             keep=_typed("release.keep", content["release"]["keep"], int),
             layouts=layouts,
             presets=_names("tasks.presets", tasks.get("presets", [])),
-            algorithms=_names("tasks.algorithms", tasks.get("algorithms", [])),
-            learned_on=_layouts("tasks.learned_on", tasks.get("learned_on", list(layouts))),
+            algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
         )
         profile.heuristic_tasks()
     except tomllib.TOMLDecodeError as error:
@@ -116,15 +117,10 @@ def load_profile(name: str) -> Profile:
         raise OptionError(f"{path}: missing key {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise OptionError(f"{path}: {error}") from error
-    for name in profile.algorithms:
-        if name not in ALGORITHMS:
-            raise OptionError(f"{path}: {unknown('algorithm', name, ALGORITHMS)}")
     if not profile.task_layouts:
         raise OptionError(
             f"{path}: expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms"
         )
-    if not profile.learned_on or not set(profile.learned_on) <= set(layouts):
-        raise OptionError(f"{path}: tasks.learned_on = {list(profile.learned_on)}: expected some of tasks.layouts")
     if not 0 < profile.keep <= profile.ego.environments:
         raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
     if profile.ego.episodes < 5:
@@ -174,6 +170,21 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
     if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
         raise OptionError(f"{key} = {names!r}: expected names, none twice")
     return tuple(names)
+
+
+def _algorithms(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """By layout, in the order of the layouts; a list is for all of them."""
+    if isinstance(value, dict):
+        found = {get_layout(name).name: _names(f"{key}.{name}", names) for name, names in value.items()}
+    else:
+        found = dict.fromkeys(layouts, _names(key, value))
+    for name in found:
+        if name not in layouts:
+            raise OptionError(f"{key}.{name}: expected a table with some of tasks.layouts")
+    for name in chain(*found.values()):
+        if name not in ALGORITHMS:
+            raise unknown("algorithm", name, ALGORITHMS)
+    return {name: found[name] for name in layouts if found.get(name)}
 
 
 def _layouts(key: str, value: Any) -> tuple[str, ...]:
