@@ -66,7 +66,7 @@ def combine_releases(
         first["kind"],
         new,
         data_version=data_version or _one_version(datasets),
-        card=_card(datasets),
+        source_card=_cards(datasets),
         kept_steps=first["environment"]["kept_steps"],
         done=done,
     )
@@ -141,7 +141,7 @@ class Deferred(Mapping[str, np.ndarray]):
         return len(self._names)
 
 
-def _card(datasets: Sequence[Dataset]) -> str:
+def _cards(datasets: Sequence[Dataset]) -> str:
     for dataset in datasets:
         plain_size(inside(dataset.root, MANIFEST), TEXT_BYTES)
     parts = "\n".join(

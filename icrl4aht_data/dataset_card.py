@@ -343,8 +343,9 @@ def _provenance(release: _Release) -> list[str]:
     for recorded, kept in sorted(counts):
         lines.append(f"Of a task's {recorded:,} streams the best {kept:,} by end + improvement are kept.")
     for suite in release.distinct("suite"):
+        where = ", ".join(suite.get("layouts", release.info["layouts"]))
         lines.append(
-            f"Learned teammates: populations of {suite['members']} by {', '.join(suite['algorithms'])}, "
+            f"Learned teammates on {where}: populations of {suite['members']} by {', '.join(suite['algorithms'])}, "
             f"{suite['total_steps']:,} steps a member; training teammates are drawn from the checkpoints whose return "
             f"beside their own partner, greedy, in 400 steps exceeds {suite['threshold']:g}."
         )

@@ -16,7 +16,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from icrl4aht_data.benchmark import ACTIONS, EGO, EPISODE_STEPS, KEPT_STEPS
-from icrl4aht_data.dataset_card import dataset_card
+from icrl4aht_data.dataset_card import SOURCE_CARD, dataset_card
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import plain_size, write_json
 from icrl4aht_data.manifest import inside, write_manifest
@@ -133,6 +133,7 @@ def write_release(
     *,
     data_version: str,
     card: str | None = None,
+    source_card: str | None = None,
     kept_steps: int = KEPT_STEPS,
     shard_histories: int = 1024,
     shard_bytes: int = SHARD_BYTES,
@@ -147,6 +148,7 @@ def write_release(
         tasks: what to write; histories are numbered in this order.
         data_version: SemVer of the data.
         card: README.md of the release; by default it is made of what the release says, see `dataset_card`.
+        source_card: the card of what the release is made of, to keep beside its own.
         kept_steps: steps of every episode.
         shard_histories: at most this many histories a shard.
         shard_bytes: about how large a shard should be, judged by the first history of each layout.
@@ -167,7 +169,7 @@ def write_release(
             f"release of {OBSERVATIONS}, none"
         )
     with folder_in_place_of(target) as partial:
-        _fill(partial, kind, new, data_version, card, kept_steps, (shard_histories, shard_bytes), done)
+        _fill(partial, kind, new, data_version, (card, source_card), kept_steps, (shard_histories, shard_bytes), done)
     return target
 
 
@@ -216,7 +218,7 @@ def _fill(
     kind: Kind,
     tasks: list[NewTask],
     data_version: str,
-    card: str | None,
+    cards: tuple[str | None, str | None],
     kept_steps: int,
     shard_limits: tuple[int, int],
     done: Callable[[Task], None],
@@ -252,6 +254,9 @@ def _fill(
     statistics = layout_statistics(root, entries, given, provenance, kept_steps)
     info = describe(kind, data_version, kept_steps, entries)
     write_json(root / INFO, info | {"shards": shard_sizes(root, entries), "statistics": statistics})
+    card, source_card = cards
+    if source_card is not None:
+        (root / SOURCE_CARD).write_text(source_card, encoding="utf-8")
     (root / CARD).write_text(dataset_card(root) if card is None else card, encoding="utf-8")
     write_manifest(root)
 

@@ -45,7 +45,8 @@ def test_histories_are_those_of_the_parts(parts, tmp_path):
         assert (history.entry.score, history.entry.seed) == (old.entry.score, old.entry.seed)
         for name in _FIELDS:
             assert np.array_equal(history.read(name), old.read(name)), name
-    assert "SHA-256 of its manifest" in (tmp_path / "out" / "README.md").read_text()
+    assert "* 8 histories of " in (tmp_path / "out" / "README.md").read_text()
+    assert (tmp_path / "out" / "meta" / "source_card.md").read_text().count("SHA-256 of its manifest") == len(parts)
 
 
 def test_one_release_combines_to_the_same_bytes(parts, tmp_path):

@@ -152,7 +152,7 @@ class TestFormat:
                 np.testing.assert_array_equal(theirs, ours)
 
     def test_the_bundled_release(self, reader):
-        self.assert_read(reader, MINI, (0, 31, 47, 48))
+        self.assert_read(reader, MINI, (0, 31, 79, 80))
 
     def test_every_kind(self, reader, lite, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "observations", "observations")

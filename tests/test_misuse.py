@@ -52,11 +52,11 @@ MISUSED = [
     (
         "reader",
         "verify --teammate-kind greedy",
-        "unknown teammate_kind 'greedy'; valid: utility_greedy, lbrdiv, comedi, fcp, brdiv.",
+        "unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, comedi, fcp.",
     ),
     ("reader", "verify --from x", "--from says where to repair from: give --repair with it"),
     ("reader", "show --history -1", "-1: expected a whole number from 0 on"),
-    ("reader", "show --history 152", "this selection has no history [152], ids are within 0..151"),
+    ("reader", "show --history 184", "this selection has no history [184], ids are within 0..183"),
     ("reader", "show --plot curves.jpg", "curves.jpg: expected a name that ends in .png or .svg or .pdf"),
     ("reader", "show --plot none/curves.png", "no folder none: make it first, or give another path"),
     ("reader", "show --plot empty", "'empty' is a directory"),

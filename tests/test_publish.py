@@ -119,12 +119,17 @@ def test_a_combination_of_built_ones_says_of_what(published, tmp_path):
     random_release(tmp_path / "other", "full", ("demo_wide",))
     both = combine_releases(tmp_path / "both", [published, tmp_path / "other"])
     card = (both / "README.md").read_text()
-    assert card.count("SHA-256 of its manifest") == 2
-    assert "# test\n" in card and "12 histories of 6 tasks" in card
-    assert "pretty_name" not in card and "![" not in card
+    tasks = len((both / "meta/tasks.jsonl").read_text().splitlines())
+    assert f"* {len(load_icrl4aht(both)):,} histories of {tasks} tasks" in card
+    assert "![" not in card
+    sources = (both / "meta/source_card.md").read_text()
+    assert sources.count("SHA-256 of its manifest") == 2
+    assert "# test\n" in sources and "12 histories of 6 tasks" in sources
+    assert "pretty_name" not in sources and "![" not in sources
+    assert verify_release(both).ok
     out = build_release(both, tmp_path / "out")
     assert verify_release(out).ok
-    assert (out / "meta/source_card.md").read_text() == card
+    assert (out / "meta/source_card.md").read_text() == sources
 
 
 def test_links_are_not_written_through(published, tmp_path):
