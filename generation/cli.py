@@ -244,18 +244,23 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
     """Train populations of teammates.
 
     Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by what they earn, and writes
-    the lists of tasks with those that are left, SUITE/manifests. Finished populations are kept.
+    the lists of tasks with those that are left, SUITE/manifests. Finished populations are kept. Without --layout these
+    are the populations that the profile names, or all on its layouts if it names none.
     """
     from generation.build_suite import build_suite
     from generation.profiles import load_profile
+    from icrl4aht_data.errors import OptionError
+    from icrl4aht_data.overcooked.layouts import get_layout
 
     ask_for_determinism()
     profile = load_profile(profile_name)
     if layouts:
-        wanted = dict.fromkeys(layouts, algorithms)
+        wanted = dict.fromkeys((get_layout(name).name for name in layouts), algorithms)
     else:
         of_profile = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
         wanted = {layout: [name for name in names if name in algorithms] for layout, names in of_profile.items()}
+        if not any(wanted.values()):
+            raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: name a --layout")
     build_suite(profile, suite, wanted, seed, console)
 
 

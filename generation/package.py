@@ -66,10 +66,8 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
     }
     if task.teammate_family == "rl":
-        algorithms = profile.algorithms[task.layout.name]
         provenance["suite"] = {
-            "algorithms": list(algorithms),
-            "layouts": [layout for layout, names in profile.algorithms.items() if names == algorithms],
+            "algorithms": {layout: list(names) for layout, names in profile.algorithms.items()},
             "members": profile.teammates.members,
             "train": profile.teammates.train,
             "total_steps": profile.teammates.ppo.total_steps,

@@ -378,7 +378,8 @@ def convert(
 def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | None, quiet: bool) -> None:
     """Combine releases into one, in the folder OUT.
 
-    They are of one kind, and no two have a task in common. A release that is at OUT is replaced.
+    They are of one kind, and no two have a task in common. A release that is at OUT is replaced. The card is made anew;
+    those of the releases are kept in meta/source_card.md.
     """
     from icrl4aht_data.combine import combine_releases
     from icrl4aht_data.info import read_info

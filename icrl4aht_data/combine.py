@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.dataset_card import SOURCE_CARD
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.files import TEXT_BYTES, plain_size, read_text
 from icrl4aht_data.info import check_version
-from icrl4aht_data.manifest import file_hash, inside
+from icrl4aht_data.manifest import file_hash, inside, read_manifest
 from icrl4aht_data.release import CARD, NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
@@ -149,7 +150,12 @@ def _cards(datasets: Sequence[Dataset]) -> str:
         f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
         for dataset in datasets
     )
-    cards = "\n".join(_text_of_card(read_text(dataset.origin.file(CARD))) for dataset in datasets)
+    cards = "\n".join(
+        _text_of_card(read_text(dataset.origin.file(name)))
+        for dataset in datasets
+        for name in (CARD, SOURCE_CARD)
+        if name in read_manifest(dataset.root)
+    )
     return (
         f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"
     )

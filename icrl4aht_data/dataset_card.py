@@ -41,7 +41,7 @@ TWIN = "index"
 """The folder of the index as Parquet files, `index/<layout>/<split>.parquet`, which a published release has."""
 
 SOURCE_CARD = "meta/source_card.md"
-"""The card of the release that a published one was made of, where it was not made of this template."""
+"""The cards of what a release was made of by `combine`, or that one's own where it was not made of this template."""
 
 _SIZES = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12)
 _SIZE_NAMES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
@@ -88,7 +88,7 @@ def dataset_card(root: Path) -> str:
     provenance = read_provenance(root / PROVENANCE)
     try:
         return _card(_Release(root, index.info, list(index.entries), read_tasks(root / TASKS), provenance))
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise IndexFormatError(f"{root / PROVENANCE}: not as `generation` writes it: {error!r}") from error
 
 
@@ -227,15 +227,12 @@ def _limits(release: _Release) -> list[str]:
 def _missing(release: _Release) -> Iterable[str]:
     """Which learned teammates are fewer than was wanted."""
     found = Counter((task.layout.name, task.teammate_kind) for task in release.tasks if task.split == "train")
-    suites = release.distinct("suite")
-    wanted = {
-        (layout, algorithm): suite["train"]
-        for suite in suites
-        for layout in suite.get("layouts", release.info["layouts"])
-        for algorithm in suite["algorithms"]
-    }
+    wanted: Counter[tuple[str, str]] = Counter()
+    for suite in release.distinct("suite"):
+        for layout, names in _populations(release, suite).items():
+            wanted |= Counter({(layout, name): suite["train"] for name in names})
     without = [name for name in release.info["layouts"] if name not in {layout for layout, _ in wanted}]
-    if suites and without:
+    if wanted and without:
         yield f"Learned on {', '.join(without)}: its profile has no learned teammates there, only presets of H4."
     few = [
         f"{algorithm} on {layout} ({found[layout, algorithm]} of {count})"
@@ -247,6 +244,14 @@ def _missing(release: _Release) -> Iterable[str]:
             f"Complete: it has fewer training teammates than its profile wanted of {', '.join(few)}. Too few "
             "checkpoints passed the quality filter, or this is a part of a release."
         )
+
+
+def _populations(release: _Release, suite: dict[str, Any]) -> dict[str, list[str]]:
+    """A suite's algorithms by layout. Older provenance has one list, and perhaps its layouts."""
+    algorithms: dict[str, list[str]] | list[str] = suite["algorithms"]
+    if isinstance(algorithms, dict):
+        return algorithms
+    return dict.fromkeys(suite.get("layouts", release.info["layouts"]), algorithms)
 
 
 def _smaller(release: _Release) -> Iterable[str]:
@@ -343,12 +348,15 @@ def _provenance(release: _Release) -> list[str]:
     for recorded, kept in sorted(counts):
         lines.append(f"Of a task's {recorded:,} streams the best {kept:,} by end + improvement are kept.")
     for suite in release.distinct("suite"):
-        where = ", ".join(suite.get("layouts", release.info["layouts"]))
-        lines.append(
-            f"Learned teammates on {where}: populations of {suite['members']} by {', '.join(suite['algorithms'])}, "
+        alike: dict[str, list[str]] = {}
+        for layout, names in _populations(release, suite).items():
+            alike.setdefault(", ".join(names), []).append(layout)
+        lines += [
+            f"Learned teammates on {', '.join(layouts)}: populations of {suite['members']} by {names}, "
             f"{suite['total_steps']:,} steps a member; training teammates are drawn from the checkpoints whose return "
             f"beside their own partner, greedy, in 400 steps exceeds {suite['threshold']:g}."
-        )
+            for names, layouts in alike.items()
+        ]
     if release.distinct("expert"):
         lines.append("Expert actions: the final ego's, greedy, its recurrent state carried through the episode.")
     names = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "on"}
@@ -357,7 +365,7 @@ def _provenance(release: _Release) -> list[str]:
     if made:
         lines.append(f"Made with {'; '.join(made)}.")
     if release.has(SOURCE_CARD):
-        lines.append(f"The card of the release that this one was made of is kept in `{SOURCE_CARD}`.")
+        lines.append(f"What this release was made of, and the cards of that, stand in `{SOURCE_CARD}`.")
     return lines or ["Not recorded: the files that this release was made of do not say."]
 
 

@@ -148,7 +148,7 @@ def write_release(
         tasks: what to write; histories are numbered in this order.
         data_version: SemVer of the data.
         card: README.md of the release; by default it is made of what the release says, see `dataset_card`.
-        source_card: the card of what the release is made of, to keep beside its own.
+        source_card: the cards of what the release is made of, to keep beside its own.
         kept_steps: steps of every episode.
         shard_histories: at most this many histories a shard.
         shard_bytes: about how large a shard should be, judged by the first history of each layout.

@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 from rich.console import Console
 from tiny import LEARNED, TINY, artefact
 
@@ -24,11 +24,11 @@ from generation.artefact import METADATA
 from generation.build_suite import build_suite
 from generation.cli import cli
 from generation.learners.checkpoint import load_policy
-from generation.profiles import load_profile
+from generation.profiles import FOLDER, load_profile
 from generation.run import CollectionError
 from generation.teammates.registry import recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.benchmark import TEAMMATE
+from icrl4aht_data.benchmark import ALGORITHMS, TEAMMATE
 from icrl4aht_data.combine import combine_releases
 from icrl4aht_data.convert import to_release
 from icrl4aht_data.errors import OptionError
@@ -340,6 +340,33 @@ def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
     path.write_text(json.dumps(card))
     with pytest.raises(OptionError, match=r"demo_wide/fcp/m0/c3: its card lacks 'teammate_return'.*anew"):
         select.select(tmp_path / "suite", "demo_wide", "fcp", 1, 1)
+
+
+def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("generation.build_suite.build_suite", lambda *arguments: asked.append(dict(arguments[2])))
+    path = tmp_path / "own.toml"
+    path.write_text((FOLDER / "mini.toml").read_text().replace(', "comedi"]', "]"))
+
+    def teammates(*options: str) -> Result:
+        return CliRunner().invoke(cli, ["teammates", "--suite", str(tmp_path / "suite"), *options])
+
+    for options in (
+        ("--profile", str(path)),
+        ("--profile", str(path), "--algorithm", "fcp"),
+        ("--profile", "smoke"),
+        ("--layout", "cramped_room_up", "--layout", "cramped_up", "--algorithm", "comedi"),
+    ):
+        assert teammates(*options).exit_code == 0, options
+    everywhere = load_profile(str(path)).algorithms
+    assert asked == [
+        {layout: list(names) for layout, names in everywhere.items()},
+        {layout: ["fcp"] if "fcp" in names else [] for layout, names in everywhere.items()},
+        {layout: list(ALGORITHMS) for layout in load_profile("smoke").layouts},
+        {"cramped_up": ("comedi",)},
+    ]
+    assert isinstance(teammates("--profile", str(path), "--algorithm", "comedi").exception, OptionError)
+    assert len(asked) == 4
 
 
 def test_unknown_profile_is_one_line(tmp_path):

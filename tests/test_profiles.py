@@ -156,13 +156,23 @@ def test_learned_teammates_on_some_layouts(changed):
             "",
             r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
         ),
-        ('presets = ["default", "high_inertia"]', 'algorithms = ["fpc"]', r"unknown algorithm 'fpc'; .*mean 'fcp'\?"),
+        (
+            'presets = ["default", "high_inertia"]',
+            'algorithms = ["fpc"]',
+            r"tasks\.algorithms: unknown algorithm 'fpc'; .*mean 'fcp'\?",
+        ),
         ('"coord_simple"', '"coord_simpel"', r"unknown layout 'coord_simpel'; .*Did you mean 'coord_simple'\?"),
         ('"default"', '"defualt"', r"unknown preset of utility_greedy 'defualt'; .*Did you mean 'default'\?"),
         (
             "presets =",
             'algorithms = { demo_wide = ["fcp"] }\npresets =',
-            r"tasks\.algorithms\.demo_wide: expected a table with some of tasks\.layouts",
+            r"tasks\.algorithms\.demo_wide: expected one of tasks\.layouts",
+        ),
+        ("presets =", 'algorithms = { demo_wied = ["fcp"] }\npresets =', r"unknown layout 'demo_wied'"),
+        (
+            "presets =",
+            'algorithms = { cramped_up = ["fcp"], cramped_room_up = ["fcp"] }\npresets =',
+            r"tasks\.algorithms = \['cramped_up', 'cramped_up'\]: expected names, none twice",
         ),
         ("presets =", 'algorithms = "fcp"\npresets =', r"tasks\.algorithms = 'fcp': expected list"),
         (

@@ -9,6 +9,7 @@ import re
 import shutil
 import tomllib
 import warnings
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,8 @@ def test_a_combination_of_built_ones_says_of_what(published, tmp_path):
     assert "![" not in card
     sources = (both / "meta/source_card.md").read_text()
     assert sources.count("SHA-256 of its manifest") == 2
+    kept = (published / "meta/source_card.md").read_text()
+    assert kept in sources
     assert "# test\n" in sources and "12 histories of 6 tasks" in sources
     assert "pretty_name" not in sources and "![" not in sources
     assert verify_release(both).ok
@@ -254,18 +257,27 @@ def test_a_release_that_nobody_published_has_a_card_without_pictures(release):
     assert "Not recorded" in card
 
 
-@pytest.mark.parametrize("provenance", ['{"a": 1}', '{"a": {"ego": 3}}', "[]"])
+@pytest.mark.parametrize(
+    "provenance",
+    ['{"a": 1}', '{"a": {"ego": 3}}', "[]", '{"a": {"ego": {"total_steps": "many", "environments": 2}}}'],
+)
 def test_a_provenance_of_another_form_is_named(damaged, provenance):
     (damaged / "meta/provenance.json").write_text(provenance)
     with pytest.raises(IndexFormatError, match=r"provenance\.json: not as `generation` writes it"):
         dataset_card(damaged)
 
 
-def test_the_card_says_where_learned_teammates_are_missing(damaged):
-    suite = {"algorithms": ["fcp"], "layouts": ["demo_wide"], "members": 2, "train": 3, "total_steps": 10**6}
+@pytest.mark.parametrize(
+    "algorithms", [{"algorithms": {"demo_wide": ["fcp"]}}, {"algorithms": ["fcp"], "layouts": ["demo_wide"]}]
+)
+def test_the_card_says_where_learned_teammates_are_missing(damaged, algorithms):
+    """Also of a combination, whose tasks come from several suites."""
+    suite = algorithms | {"members": 2, "train": 3, "total_steps": 10**6, "threshold": 20.0}
     path = damaged / "meta/provenance.json"
-    path.write_text(json.dumps({task: {"suite": suite | {"threshold": 20.0}} for task in json.loads(path.read_text())}))
+    suites = chain([suite | {"train": 1}], repeat(suite))
+    path.write_text(json.dumps({task: {"suite": next(suites)} for task in json.loads(path.read_text())}))
     card = dataset_card(damaged)
+    assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps a member" in card
     others = ", ".join(name for name in read_info(damaged)["layouts"] if name != "demo_wide")
     assert f"* Learned on {others}: its profile has no learned teammates there, only presets of H4." in card
     assert "fewer training teammates than its profile wanted of fcp on demo_wide (0 of 3)." in card

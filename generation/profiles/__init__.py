@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
-from itertools import chain
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -175,20 +174,22 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
 def _algorithms(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """By layout, in the order of the layouts; a list is for all of them."""
     if isinstance(value, dict):
-        found = {get_layout(name).name: _names(f"{key}.{name}", names) for name, names in value.items()}
+        names_of = dict(zip(_layouts(key, list(value)), value, strict=True))
+        found = {name: _names(f"{key}.{typed}", value[typed]) for name, typed in names_of.items()}
     else:
         found = dict.fromkeys(layouts, _names(key, value))
-    for name in found:
+    for name, algorithms in found.items():
         if name not in layouts:
-            raise OptionError(f"{key}.{name}: expected a table with some of tasks.layouts")
-    for name in chain(*found.values()):
-        if name not in ALGORITHMS:
-            raise unknown("algorithm", name, ALGORITHMS)
+            raise OptionError(f"{key}.{name}: expected one of tasks.layouts, {', '.join(layouts)}")
+        for algorithm in algorithms:
+            if algorithm not in ALGORITHMS:
+                raise OptionError(f"{key}: {unknown('algorithm', algorithm, ALGORITHMS)}")
     return {name: found[name] for name in layouts if found.get(name)}
 
 
 def _layouts(key: str, value: Any) -> tuple[str, ...]:
-    return tuple(get_layout(name).name for name in _names(key, value))
+    layouts = [get_layout(name).name for name in _names(key, value)]
+    return _names(key, layouts)
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
