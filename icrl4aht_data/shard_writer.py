@@ -146,4 +146,7 @@ def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
     raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
     if itemsize > 1:
         raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
-    return zlib.compress(raw, _DEFLATE_LEVEL)
+    # Short matches among actions, which are drawn at random, cost more than they save.
+    strategy = zlib.Z_FILTERED if rows.ndim == 1 else zlib.Z_DEFAULT_STRATEGY
+    deflater = zlib.compressobj(_DEFLATE_LEVEL, strategy=strategy)
+    return deflater.compress(raw) + deflater.flush()
