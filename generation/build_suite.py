@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from generation.suite import PopulationBusyError, Run, checkpoints, is_trained, 
 from generation.teammates import learned
 from generation.teammates.instances import published_thetas
 from generation.teammates.registry import build
-from icrl4aht_data.benchmark import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.benchmark import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of, unknown
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
@@ -39,6 +40,9 @@ def build_suite(
     Returns:
         What the filter left of each population that was asked for.
     """
+    for name in chain(*algorithms.values()):
+        if name not in ALGORITHMS:
+            raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
     todo = runs(profile, algorithms, seed)
     wanted = [(run.layout.name, run.algorithm) for run in todo]

@@ -12,9 +12,9 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.dataset_card import SOURCE_CARD
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import TEXT_BYTES, plain_size, read_text
+from icrl4aht_data.files import read_text
 from icrl4aht_data.info import check_version
-from icrl4aht_data.manifest import file_hash, inside, read_manifest
+from icrl4aht_data.manifest import file_hash, read_manifest
 from icrl4aht_data.release import CARD, NewHistory, NewTask, checkpoint_files, write_release
 from icrl4aht_data.remote import is_address
 from icrl4aht_data.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
@@ -143,8 +143,7 @@ class Deferred(Mapping[str, np.ndarray]):
 
 
 def _cards(datasets: Sequence[Dataset]) -> str:
-    for dataset in datasets:
-        plain_size(inside(dataset.root, MANIFEST), TEXT_BYTES)
+    listed = [read_manifest(dataset.root) for dataset in datasets]
     parts = "\n".join(
         f"* {dataset.root.name}: data version {dataset.info['data_version']}, {len(dataset):,} histories, "
         f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
@@ -152,9 +151,9 @@ def _cards(datasets: Sequence[Dataset]) -> str:
     )
     cards = "\n".join(
         _text_of_card(read_text(dataset.origin.file(name)))
-        for dataset in datasets
+        for dataset, names in zip(datasets, listed, strict=True)
         for name in (CARD, SOURCE_CARD)
-        if name in read_manifest(dataset.root)
+        if name == CARD or name in names
     )
     return (
         f"# ICRL4AHT learning histories, combined\n\nOf these releases, whose own cards follow:\n\n{parts}\n\n{cards}"

@@ -231,7 +231,8 @@ def _missing(release: _Release) -> Iterable[str]:
     for suite in release.distinct("suite"):
         for layout, names in _populations(release, suite).items():
             wanted |= Counter({(layout, name): suite["train"] for name in names})
-    without = [name for name in release.info["layouts"] if name not in {layout for layout, _ in wanted}]
+    learned_on = {layout for layout, _ in wanted}
+    without = [layout for layout in release.info["layouts"] if layout not in learned_on]
     if wanted and without:
         yield f"Learned on {', '.join(without)}: its profile has no learned teammates there, only presets of H4."
     few = [
