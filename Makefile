@@ -66,10 +66,10 @@ bench-learner: install ## self-play learning steps/s beside JaxMARL's IPPO: PEER
 	$(BIN)/python -m benchmarks.bench_learner --peer $(PEER)
 
 bench-remote: install ## requests, bytes and seconds of remote releases over HTTP, S3 and the Hub's protocol, JSON lines
-	PYTHONPATH=tests $(BIN)/python -m benchmarks.bench_remote
+	$(BIN)/python -m tests.robustness.bench_remote
 
 bench-faults: install ## faults of remotes, disks, processes and files: tried, survived, lost, JSON lines
-	PYTHONPATH=tests $(BIN)/python -m benchmarks.bench_faults
+	$(BIN)/python -m tests.robustness.faults.series
 
 bench-train: install ## training steps/s beside a reader of the published format, cached beside exact acting, JSON lines
 	$(BIN)/python -m benchmarks.bench_train $(OPTIONS)

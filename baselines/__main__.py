@@ -1,3 +1,3 @@
-from baselines.cli import main
+from baselines.commands.cli import main
 
 main()

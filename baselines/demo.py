@@ -9,25 +9,26 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from baselines.agents import AGENTS, find_agent
-from baselines.evaluate import PROTOCOLS, Protocol, evaluate
-from baselines.histories import HistoryOptions, prepare
-from baselines.method import ModelOptions
-from baselines.page import write_page_with_films
-from baselines.provenance import note_results
-from baselines.report import Run, read_run
-from baselines.trainer import TrainOptions, train
+from baselines.agents.egos import AGENTS, find_agent
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import PROTOCOLS, Protocol
+from baselines.methods.method import ModelOptions
+from baselines.report.page import write_page_with_films
+from baselines.report.provenance import note_results
+from baselines.report.results import Run, read_run
+from baselines.training.histories import HistoryOptions, prepare
+from baselines.training.trainer import TrainOptions, train
 from generation.teammates.instances import named_task
-from icrl4aht_data.benchmark import KEPT_STEPS
-from icrl4aht_data.commands import bars, counted
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.commands.options import bars, counted
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
-from icrl4aht_data.figures import plot_learning_curves
-from icrl4aht_data.headroom import HEURISTICS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.tasks import Task
-from icrl4aht_data.verify import verify_release
+from icrl4aht_data.plotting import plot_learning_curves
 
 LAYOUT = "demo_wide"
 MODEL = ModelOptions(layers=2, width=64)

@@ -18,22 +18,24 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from baselines.agents import Acting, find_agent
-from baselines.evaluate import evaluate, get_protocol
-from baselines.histories import HistoryOptions, Job, prepare
-from baselines.method import SIZES, ModelOptions
-from baselines.methods import get_method
-from baselines.page import write_page_with_films
-from baselines.provenance import note_results
-from baselines.report import merge, read_run, write_report
-from baselines.trainer import TrainOptions, train
-from icrl4aht_data.benchmark import TRACKS, track_of, unknown
-from icrl4aht_data.commands import counted
+from baselines.agents.egos import Acting, find_agent
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import get_protocol
+from baselines.methods.method import SIZES, ModelOptions
+from baselines.methods.registry import get_method
+from baselines.report.page import write_page_with_films
+from baselines.report.provenance import note_results
+from baselines.report.results import merge, read_run
+from baselines.report.write import write_report
+from baselines.training.histories import HistoryOptions, Job, prepare
+from baselines.training.trainer import TrainOptions, train
+from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
+from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
+from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.schema import TASKS
-from icrl4aht_data.tasks import Task, manifest_path, read_tasks
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""

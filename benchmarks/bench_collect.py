@@ -27,18 +27,18 @@ import h5py
 import jax
 
 from benchmarks.histories import folder_size
-from generation.artefact import last_timing
-from generation.collect import make_learner, run_task
+from generation.collection.task import make_learner, run_task
+from generation.collection.task_folder import last_timing
 from generation.learners.network import Widths
 from generation.profiles import Profile, load_profile
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark import EPISODE_STEPS, KEPT_STEPS
-from icrl4aht_data.convert import PUBLISHED_CHUNK
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.history import History
-from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import HISTORIES, KINDS, TASKS
-from icrl4aht_data.tasks import Task, read_tasks
+from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
+from icrl4aht_data.reading.history import History
+from icrl4aht_data.writing.published import PUBLISHED_CHUNK
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 _PAPER_DTYPES = {
     "obs": "float32",

@@ -17,12 +17,14 @@ import click
 import jax
 import jax.numpy as jnp
 
-from baselines.agents import random
-from baselines.evaluate import PROTOCOLS, Rollout, evaluate, task_key
+from baselines.agents.egos import random
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import PROTOCOLS
+from baselines.evaluate.rollout import Rollout, task_key
 from generation.env import Environment
 from generation.teammates.instances import published_tasks
 from generation.teammates.registry import build
-from icrl4aht_data.benchmark import HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _EPISODES = 20

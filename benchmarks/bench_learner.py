@@ -23,8 +23,8 @@ import jax
 
 from benchmarks.peers import jaxmarl_environment
 from generation.env import Environment
-from generation.learners.fcp import FCP
-from generation.learners.population import Population
+from generation.learners.population.fcp import FCP
+from generation.learners.population.population import Population
 from generation.learners.ppo import PPOConfig
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 

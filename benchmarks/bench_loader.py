@@ -29,9 +29,10 @@ import numpy as np
 
 from benchmarks.histories import folder_size, write_many
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.convert import to_published, to_release
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.sampling import ADSampler
+from icrl4aht_data.sampling.ad import ADSampler
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.published import to_published
 
 TARGETS = {  # (how held, observations) -> least ratio to the published and to the fair reader
     ("ram", "state"): (1000, 200),
@@ -117,7 +118,7 @@ def seconds(work: Callable[[], Any]) -> float:
 
 def memcpy_rate(size: int, threads: int) -> float:
     """Bytes/s of copying a buffer of that size onto another that is in use."""
-    from icrl4aht_data.threads import in_slices
+    from icrl4aht_data.utils.threads import in_slices
 
     size = min(size, 2**29)
     source, target = np.ones(size, np.uint8), np.ones(size, np.uint8)
@@ -275,7 +276,7 @@ def flat_memory(folder: Path, batches: int) -> None:
 _OPEN_INDEX = """
 import json, resource, sys, time
 from pathlib import Path
-from icrl4aht_data.index import read_index
+from icrl4aht_data.format.index import read_index
 clock = [time.perf_counter()]
 def lap():
     clock.append(time.perf_counter())

@@ -24,20 +24,21 @@ import h5py
 import jax
 import numpy as np
 
-from baselines.agents import Acting, learned
-from baselines.context import plain_view
-from baselines.evaluate import PROTOCOLS, Game, Protocol, evaluate, play, set_up
-from baselines.method import Method, ModelOptions
-from baselines.methods import get_method, kitchen
-from baselines.trainer import Trainer, TrainOptions
-from generation.teammates.base import Policy
+from baselines.agents.egos import Acting, learned
+from baselines.evaluate.evaluator import Game, evaluate, play, set_up
+from baselines.evaluate.protocols import PROTOCOLS, Protocol
+from baselines.methods.method import Method, ModelOptions
+from baselines.methods.registry import get_method, kitchen
+from baselines.methods.tokens import plain_view
+from baselines.training.trainer import Trainer, TrainOptions
+from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark import TRACKS, track_of
-from icrl4aht_data.convert import FROM_PUBLISHED, HISTORIES_H5, to_published
+from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.sampling import ADBatch, ADSampler
+from icrl4aht_data.sampling.ad import ADBatch, ADSampler
+from icrl4aht_data.writing.published import FROM_PUBLISHED, HISTORIES_H5, to_published
 
 _TARGET_RATIO, _TARGET_MINUTES = 20, 30
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.release import NewHistory, NewTask, write_release
-from icrl4aht_data.schema import TASKS, held_fields
-from icrl4aht_data.tasks import read_tasks
+from icrl4aht_data.format.schema import TASKS, held_fields
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 
 def write_many(folder: Path, layouts: Sequence[str], histories: int) -> Path:

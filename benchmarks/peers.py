@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import redirect_stdout
 
-from icrl4aht_data.benchmark import EPISODE_STEPS
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 
 with redirect_stdout(sys.stderr):  # it prints on import

@@ -12,9 +12,9 @@ from typing import Any
 import click
 from rich.console import Console
 
-from generation.options import EXECUTORS, Executor, Options, ask_for_determinism, leave_memory_to_workers
-from icrl4aht_data.benchmark import ALGORITHMS
-from icrl4aht_data.commands import (
+from generation.collection.options import EXECUTORS, Executor, Options, ask_for_determinism, leave_memory_to_workers
+from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
     LAYOUT,
@@ -28,7 +28,7 @@ from icrl4aht_data.commands import (
     run,
     version_option,
 )
-from icrl4aht_data.schema import KINDS, Kind
+from icrl4aht_data.format.schema import KINDS, Kind
 
 console = Console(soft_wrap=True)
 
@@ -111,8 +111,8 @@ def generate(
     trained by this process, tasks by the executor. Tasks that fail are listed in OUT/failed.jsonl; the others are
     finished, nothing is packed, and the exit code is 1.
     """
-    from generation.build import build_releases
-    from generation.package import bundle_release
+    from generation.releases.build import build_releases
+    from generation.releases.package import bundle_release
 
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
@@ -138,7 +138,7 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 
     Prints tasks, environment steps, disk, and hours at the speed that is measured here. Writes nothing.
     """
-    from generation.plan import cost
+    from generation.planning.plan import cost
     from generation.profiles import load_profile
 
     costs = cost(load_profile(profile_name), devices)
@@ -159,7 +159,7 @@ def check(a: Path, b: Path, as_json: bool) -> None:
     A and B are releases, artefacts, or folders that `generate` has made. Prints what differs, and exits with 1 if
     anything does. Writes nothing.
     """
-    from generation.check import compare
+    from generation.releases.check import compare
 
     compared = compare(a, b)
     if as_json:
@@ -180,9 +180,9 @@ def speed(profile_name: str, layout: str) -> None:
 
     Prints one JSON line: steps/s, and the shares of environment, forward pass and update. Writes nothing.
     """
-    from generation.plan import task_learner
+    from generation.planning.plan import task_learner
+    from generation.planning.speed import learner_speed
     from generation.profiles import load_profile
-    from generation.speed import learner_speed
     from icrl4aht_data.overcooked.layouts import get_layout
 
     name = get_layout(layout).name
@@ -199,9 +199,9 @@ def manifests(check: bool) -> None:
     Makes icrl4aht_data/manifests/*.jsonl from the parameter tables.
     """
     from generation.teammates.instances import published_tasks
-    from icrl4aht_data.benchmark import TRACKS
+    from icrl4aht_data.benchmark.facts import TRACKS
+    from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
     from icrl4aht_data.errors import TaskFormatError
-    from icrl4aht_data.tasks import manifest_path, read_tasks, write_tasks
 
     for track in TRACKS:
         path, tasks = manifest_path(track, "test"), published_tasks(track)
@@ -247,7 +247,7 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
     the lists of tasks with those that are left, SUITE/manifests. Finished populations are kept. Without --layout these
     are the populations that the profile names, or all on its layouts if it names none.
     """
-    from generation.build_suite import build_suite
+    from generation.populations.build import build_suite
     from generation.profiles import load_profile
     from icrl4aht_data.errors import OptionError
     from icrl4aht_data.overcooked.layouts import get_layout
@@ -281,7 +281,7 @@ def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path
     Prints self-play and cross-play of each population, and the Hamming distances of all teammates, and draws them into
     SUITE/LAYOUT.
     """
-    from generation.build_suite import report_diversity
+    from generation.populations.build import report_diversity
 
     report_diversity(suite, layouts, algorithms, greedy, console)
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from icrl4aht_data.benchmark import EPISODE_STEPS
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe, observe_both

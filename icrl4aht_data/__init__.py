@@ -4,15 +4,18 @@ ds = load_icrl4aht(split="train", layout="coord_simple")
 batch = ds.ad(batch_size=64, length=500, seed=0)[0]
 """
 
-from icrl4aht_data.benchmark import ACTIONS, FAMILIES, SPLITS, TRACKS
+from icrl4aht_data.benchmark.facts import FAMILIES, SPLITS, TRACKS
+from icrl4aht_data.checking.report import Report
+from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
-from icrl4aht_data.draws import Curriculum
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.history import History
+from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
-from icrl4aht_data.prefetch import Batches
-from icrl4aht_data.sampling import ADBatch, ADSampler, DPTBatch, DPTSampler
-from icrl4aht_data.verify import Report, verify_release
+from icrl4aht_data.reading.history import History
+from icrl4aht_data.sampling.ad import ADBatch, ADSampler
+from icrl4aht_data.sampling.batches import Batches
+from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
+from icrl4aht_data.sampling.draws import Curriculum
 
 __all__ = [
     "ACTIONS",

@@ -1,3 +1,3 @@
-from icrl4aht_data.cli import main
+from icrl4aht_data.commands.cli import main
 
 main()

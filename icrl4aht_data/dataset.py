@@ -7,33 +7,34 @@ import threading
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from icrl4aht_data.benchmark import unknown
-from icrl4aht_data.draws import Curriculum, Episodes, Weights, whole
-from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError
-from icrl4aht_data.history import OBS, History, Obs
-from icrl4aht_data.index import Index, read_index
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.format.index import Index, read_index
+from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.schema import KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.remote import Root, open_root
-from icrl4aht_data.schema import KINDS, PROVENANCE, TASKS, Entry
-from icrl4aht_data.shard import Shards
-from icrl4aht_data.store import CACHES, Cache, Choice, Source, choose, decoded_size, open_source
-from icrl4aht_data.tasks import Task, read_provenance, read_tasks
-from icrl4aht_data.threads import usable_cores
-from icrl4aht_data.transport import Traffic
+from icrl4aht_data.reading.history import OBS, History, Obs
+from icrl4aht_data.reading.selection import Holding, Names, Options
+from icrl4aht_data.reading.shard import Shards
+from icrl4aht_data.reading.sources import CACHES, Cache, Choice, choose, decoded_size, open_source
+from icrl4aht_data.remote.remote_release import Root, open_root
+from icrl4aht_data.remote.store import Traffic
+from icrl4aht_data.sampling.base import SamplerOptions
+from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.validation import whole
 
 if TYPE_CHECKING:
     from typing import Unpack
 
-    from icrl4aht_data.sampling import ADSampler, ContextOrder, DPTSampler
+    from icrl4aht_data.sampling.ad import ADSampler
+    from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 
 MINI = Path(__file__).parent / "mini"
 """The bundled mini release."""
-
-Names = str | Sequence[str] | None
 
 
 def load_icrl4aht(
@@ -92,34 +93,6 @@ def load_icrl4aht(
         teammate_kind=teammate_kind,
         task_id=task_id,
     )
-
-
-class SamplerOptions(TypedDict, total=False):
-    """What both samplers take; see `sampling.ADSampler`."""
-
-    seed: int
-    teammate_actions: bool
-    weights: Weights
-    episodes: Episodes | None
-    curriculum: Curriculum | None
-    process_index: int
-    process_count: int
-
-
-class Options(NamedTuple):
-    """How a dataset gives its data; see `load_icrl4aht`."""
-
-    obs: Obs
-    cache: Cache
-    threads: int
-
-
-class Holding(NamedTuple):
-    """Where a selection's rows come from: one source a layout, and each history's place."""
-
-    sources: list[Source]
-    layout: np.ndarray  # intp (H,), which source
-    place: np.ndarray  # intp (H,), position in it
 
 
 class Dataset:
@@ -343,7 +316,7 @@ class Dataset:
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
         """Algorithm Distillation windows; see `sampling.ADSampler` for the options."""
-        from icrl4aht_data.sampling import ADSampler
+        from icrl4aht_data.sampling.ad import ADSampler
 
         return ADSampler(self, batch_size=batch_size, length=length, **options)
 
@@ -351,6 +324,6 @@ class Dataset:
         self, *, batch_size: int, context: int, order: ContextOrder = "contiguous", **options: Unpack[SamplerOptions]
     ) -> DPTSampler:
         """Decision-Pretrained Transformer queries with contexts; see `sampling.DPTSampler` for the options."""
-        from icrl4aht_data.sampling import DPTSampler
+        from icrl4aht_data.sampling.dpt import DPTSampler
 
         return DPTSampler(self, batch_size=batch_size, context=context, order=order, **options)

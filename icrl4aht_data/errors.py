@@ -5,6 +5,9 @@ Messages name the file or value, what was expected, what was found, and what to 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 
 class Icrl4ahtError(Exception):
     """Base class: catch this to catch every error of the package that is about input, not about a bug."""
@@ -101,3 +104,15 @@ class UploadError(Icrl4ahtError):
 
 class TaskFormatError(Icrl4ahtError, ValueError):
     """A task line is malformed."""
+
+
+_LISTED, _COMPARED = 50, 1000  # names that an error lists, and looks at for the nearest
+
+
+def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
+    """The error for a name that does not exist: lists the valid names and the nearest one."""
+    names = list(dict.fromkeys(valid))
+    nearest = get_close_matches(str(found), names[:_COMPARED], n=1, cutoff=0.4)
+    hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
+    more = f", and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return UnknownNameError(f"unknown {what} {found!r}; valid: {', '.join(names[:_LISTED])}{more}.{hint}")

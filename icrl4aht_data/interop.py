@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrl4aht_data.draws import whole
 from icrl4aht_data.errors import NotStoredError, OptionError
+from icrl4aht_data.utils.validation import whole
 
 if TYPE_CHECKING:
     import datasets
     from torch.utils.data import DataLoader
 
     from icrl4aht_data.dataset import Dataset
-    from icrl4aht_data.sampler import Sampler
+    from icrl4aht_data.sampling.base import Sampler
 
 
 def torch_loader(

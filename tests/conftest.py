@@ -11,13 +11,13 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from plays import random_release
-from published import KEPT, publish
-from tiny import PAIR, TINY
 
 from generation.cli import cli
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.convert import from_published, to_published
+from icrl4aht_data.writing.published import from_published, to_published
+from tests.helpers.published_files import KEPT, publish
+from tests.helpers.random_play import random_release
+from tests.helpers.tiny import PAIR, TINY
 
 
 @pytest.fixture(scope="session", autouse=True)

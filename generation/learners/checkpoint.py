@@ -14,8 +14,8 @@ from safetensors.numpy import load_file, save_file
 
 from generation.learners.network import ActorCritic, Widths
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.files import parse_json, plain_size, read_text
-from icrl4aht_data.release import CHECKPOINT_BYTES
+from icrl4aht_data.format.checkpoints import CHECKPOINT_BYTES
+from icrl4aht_data.utils.files import parse_json, plain_size, read_text
 
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 

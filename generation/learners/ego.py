@@ -17,8 +17,8 @@ from generation.env import Environment
 from generation.learners.network import ActorCritic
 from generation.learners.ppo import PPO, PPOConfig, episode_metrics, sequences
 from generation.learners.rollout import Player, Rollout, Seats, network_player, policy_player, roll_out, take_seats
-from generation.teammates.base import Policy
-from icrl4aht_data.benchmark import EGO, TEAMMATE
+from generation.policy import Policy
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
 
 class LearnerState(NamedTuple):

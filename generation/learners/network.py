@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
-from icrl4aht_data.benchmark import ACTIONS
+from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import WINDOW
 
 _CELLS = WINDOW * WINDOW

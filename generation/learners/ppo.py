@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.learners.network import ActorCritic, Widths
 from generation.learners.rollout import Rollout, seen_from
-from icrl4aht_data.benchmark import EGO, EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
+from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.env import Environment, EnvState
 from generation.learners.network import ActorCritic
-from generation.teammates.base import Policy
-from icrl4aht_data.benchmark import ACTIONS, EGO
+from generation.policy import Policy
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import swapped
 

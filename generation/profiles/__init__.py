@@ -11,12 +11,12 @@ from typing import Any
 from generation.learners.network import Widths
 from generation.learners.ppo import PPOConfig
 from generation.teammates.registry import heuristic_teammate
-from icrl4aht_data.benchmark import ALGORITHMS, PAPER_TEAMMATE_STEPS, PAPER_TEAMMATES, track_of, unknown
-from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import json_hash
-from icrl4aht_data.info import check_version
+from icrl4aht_data.benchmark.facts import ALGORITHMS, PAPER_TEAMMATE_STEPS, PAPER_TEAMMATES, track_of
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.tasks import Task, make_task
+from icrl4aht_data.utils.files import json_hash
 
 FOLDER = Path(__file__).parent
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark import HEURISTIC_KINDS, TRACKS, track_of, unknown
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.tasks import Task, make_task
 
 Table = dict[str, tuple[float, ...]]
 """parameter -> its value in t0..t4, parameters in declaration order."""

@@ -13,11 +13,11 @@ from jaxtyping import Array, Key, UInt8
 
 from generation.learners.checkpoint import WEIGHTS, load_policy
 from generation.learners.network import ActorCritic, Widths
-from generation.teammates.base import Policy
+from generation.policy import Policy
 from icrl4aht_data.errors import OptionError, TaskFormatError
-from icrl4aht_data.manifest import file_hash
+from icrl4aht_data.format.checkpoints import checkpoint_folder
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.release import checkpoint_folder
+from icrl4aht_data.utils.hashes import file_hash
 
 Action = Literal["greedy", "sampled"]
 """How a checkpoint acts: its likeliest action, as teammates of the dataset do, or a draw from its distribution."""

@@ -12,13 +12,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from generation.teammates import assembly_line, learned, recipe_aware_button, territory, utility_greedy
-from generation.teammates.base import Noise, Policy, as_params
-from icrl4aht_data.benchmark import EGO, TEAMMATE, unknown
+from generation.policy import Noise, Policy, as_params
+from generation.teammates import learned
+from generation.teammates.heuristics import assembly_line, recipe_aware_button, territory, utility_greedy
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import OptionError, TaskFormatError
+from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.format.schema import TEAMMATES
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.schema import TEAMMATES
 
 _FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
 
@@ -94,7 +95,7 @@ def build(
 
     Args:
         layout: the kitchen.
-        teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.tasks.Task`.
+        teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.benchmark.tasks.Task`.
         slot: 0 or 1, the agent it plays.
         noise: of heuristics, see `base.Noise`.
         suite: the folder that checkpoints are in: a suite, or TEAMMATES of a release.

@@ -14,7 +14,8 @@ from string import digits
 
 import numpy as np
 
-from icrl4aht_data.benchmark import ACTIONS, unknown
+from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked.actions import ACTIONS
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
 """What stands on a cell. A wall is a counter that holds one item; PLATES and PILE are endless."""

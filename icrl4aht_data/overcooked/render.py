@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark import EGO, TEAMMATE
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.files import file_in_place_of
 from icrl4aht_data.overcooked import layouts
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, PLATE, WINDOW, Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, record_size, unpack
+from icrl4aht_data.utils.files import file_in_place_of
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.benchmark import INTERACT
+from icrl4aht_data.overcooked.actions import INTERACT
 from icrl4aht_data.overcooked.layouts import BUTTON, COOKED, FACINGS, GOAL, PLATE, POT, WALL, Layout
 from icrl4aht_data.overcooked.state import (
     BUTTON_STEPS,

@@ -1,0 +1,1 @@
+"""The positive control: worlds in which the models must adapt in context."""

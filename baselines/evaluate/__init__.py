@@ -1,0 +1,7 @@
+"""The evaluation protocols and the evaluator."""
+
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import PROTOCOLS, Protocol, get_protocol
+from baselines.evaluate.results import Result
+
+__all__ = ["PROTOCOLS", "Protocol", "Result", "evaluate", "get_protocol"]

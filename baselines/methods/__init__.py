@@ -1,0 +1,1 @@
+"""The in-context learners: one transformer, one file a method."""

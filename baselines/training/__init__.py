@@ -1,0 +1,1 @@
+"""Training of the in-context learners on releases."""

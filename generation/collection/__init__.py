@@ -1,0 +1,1 @@
+"""Collecting learning histories: one task, and all tasks of a profile."""

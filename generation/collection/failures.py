@@ -1,0 +1,47 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from filelock import FileLock
+
+from generation.collection.job import Outcome
+from icrl4aht_data.utils.files import file_in_place_of, read_text
+
+FAILED = "failed.jsonl"
+
+
+class FailureLog:
+    """failed.jsonl: one line per failed task that is still without an artefact. Collectors may share it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = FileLock(path.with_name(f".{path.name}.lock"))
+
+    def add(self, outcome: Outcome) -> None:
+        line = {
+            "task_id": outcome.task.task_id,
+            "attempts": outcome.attempts,
+            "error": outcome.error,
+            "traceback": outcome.trace,
+        }
+        self._change(lambda lines: [*(old for old in lines if old["task_id"] != line["task_id"]), line])
+
+    def forget(self, task_ids: Iterable[str]) -> None:
+        """Drop the lines of tasks that are finished."""
+        finished = set(task_ids)
+        self._change(lambda lines: [line for line in lines if line["task_id"] not in finished])
+
+    def _change(self, change: Callable[[list[dict]], list[dict]]) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self._lock:
+            before = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
+            after = change(before)
+            if not after:
+                self.path.unlink(missing_ok=True)
+            elif after != before:
+                with file_in_place_of(self.path) as partial:
+                    partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")

@@ -1,0 +1,1 @@
+"""Population training: FCP, BRDiv, LBRDiv and CoMeDi."""

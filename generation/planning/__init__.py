@@ -1,0 +1,1 @@
+"""The cost of a rebuild: steps, disk space, hours."""

@@ -1,0 +1,192 @@
+"""What a rebuild costs, before it starts."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich import filesize
+
+from generation.collection import record
+from generation.env import Environment
+from generation.learners.ego import Learner
+from generation.learners.population.fcp import FCP
+from generation.learners.population.population import Population
+from generation.learners.ppo import PPOConfig
+from generation.populations.build import runs
+from generation.profiles import Profile
+from generation.teammates import learned
+from generation.teammates.registry import build
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.format.schema import KINDS, TASKS, Kind
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+
+_WORTH_MEASURING = 20.0
+"""Seconds: a whole update that should take less is measured itself, not only a share of it."""
+
+
+class Speed(NamedTuple):
+    """Of a learner on this machine."""
+
+    steps_per_second: float  # of all its environments
+    compile_seconds: float
+
+    def seconds(self, steps: int) -> float:
+        return steps / self.steps_per_second + self.compile_seconds
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of a whole profile. Hours are of learning and recording; N devices take the tasks in turn, after one process has
+    trained the populations, one after the other."""
+
+    profile: str
+    populations: int
+    teammate_steps: int
+    tasks: int
+    environment_steps: int
+    recorded_transitions: int
+    kept_transitions: int
+    artefact_bytes: int
+    lite_bytes: int
+    full_bytes: int
+    device: str
+    teammate_steps_per_second: float | None
+    steps_per_second: float
+    compile_seconds: float  # of each task
+    teammate_hours_on_one: float
+    hours_on_one: float  # of everything
+    devices: int
+    hours_on_devices: float
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def in_words(self) -> Iterator[tuple[str, str]]:
+        """(what, how much) in the order to be printed."""
+        yield "profile", self.profile
+        if self.teammate_steps_per_second:
+            yield "populations of teammates", f"{self.populations:,}"
+            yield "environment steps of them", f"{self.teammate_steps:,}"
+        yield "tasks", f"{self.tasks:,}"
+        yield "environment steps", f"{self.environment_steps:,}"
+        yield "recorded transitions", f"{self.recorded_transitions:,}"
+        yield "kept transitions", f"{self.kept_transitions:,}"
+        yield "disk, artefacts", filesize.decimal(self.artefact_bytes)
+        yield "disk, release lite", filesize.decimal(self.lite_bytes)
+        yield "disk, release full", filesize.decimal(self.full_bytes)
+        yield "measured here", f"{self.steps_per_second:,.0f} steps/s on {self.device}"
+        yield "compiling a task", f"{self.compile_seconds:.0f} s"
+        if self.teammate_steps_per_second:
+            yield "measured, teammates", f"{self.teammate_steps_per_second:,.0f} steps/s"
+            yield "hours, teammates", f"{self.teammate_hours_on_one:,.1f}"
+        yield "hours on one such device", f"{self.hours_on_one:,.1f}"
+        yield f"hours on {self.devices} of them", f"{self.hours_on_devices:,.1f}"
+
+
+def cost(profile: Profile, devices: int) -> Cost:
+    """Reckoned from the profile, short calibration runs, and a history of the bundled release.
+
+    Args:
+        devices: the N of `hours_on_devices`; each does one task at a time.
+    """
+    ego, tasks = profile.ego, len(profile.task_layouts)
+    learning = calibrate(ego, partial(task_learner, profile))
+    task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
+    populations = [run.steps for run in runs(profile, profile.algorithms, 0)]
+    playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
+    population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
+    in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
+    kept = tasks * profile.keep * ego.episodes * KEPT_STEPS
+    device = jax.devices()[0]
+    return Cost(
+        profile=profile.name,
+        populations=len(populations),
+        teammate_steps=sum(populations),
+        tasks=tasks,
+        environment_steps=tasks * ego.updates * ego.steps_per_update,
+        recorded_transitions=tasks * ego.environments * ego.episodes * KEPT_STEPS,
+        kept_transitions=kept,
+        artefact_bytes=artefact_bytes(profile.task_layouts, ego),
+        **{f"{kind}_bytes": round(kept * bytes_per_transition(kind)) for kind in KINDS},
+        device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
+        teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
+        steps_per_second=round(learning.steps_per_second, 1),
+        compile_seconds=round(learning.compile_seconds, 1),
+        teammate_hours_on_one=round(sum(population_seconds) / 3600, 2),
+        hours_on_one=round((sum(population_seconds) + tasks * task_seconds) / 3600, 2),
+        devices=devices,
+        hours_on_devices=round(in_turn / 3600, 2),
+    )
+
+
+def task_learner(profile: Profile, ego: PPOConfig) -> Learner:
+    """The ego of a task of the profile's first layout, beside a teammate of the kind that most tasks have."""
+    layout = get_layout(profile.layouts[0])
+    if profile.algorithms:
+        mate = learned.untrained(layout, profile.teammates.ppo.widths)
+    else:
+        mate = build(layout, profile.heuristic_tasks()[0].teammate)
+    return Learner(Environment(layout), mate, ego)
+
+
+def population(profile: Profile, config: PPOConfig) -> Population:
+    """A population of the profile's first layout."""
+    return Population(Environment(get_layout(profile.layouts[0])), FCP(profile.teammates.members), config)
+
+
+def calibrate(config: PPOConfig, make: Callable[[PPOConfig], Learner | Population]) -> Speed:
+    """The speed of what `make` gives for a configuration.
+
+    First an update with the environments of one minibatch, which costs as much a step where the device is kept busy
+    by that many; where a whole update should then be short, that is measured instead.
+    """
+    share = replace(config, environments=config.environments // config.minibatches, minibatches=1)
+    speed, steps = _measure(make(share))
+    if share != config and steps * config.minibatches / speed.steps_per_second < _WORTH_MEASURING:
+        speed, _ = _measure(make(config))
+    return speed
+
+
+def _measure(learner: Learner | Population) -> tuple[Speed, int]:
+    """Speed, and the steps of an update."""
+    began = time.perf_counter()
+    state: Any = jax.jit(learner.init)(jax.random.key(0))
+    update = jax.jit(learner.update, donate_argnums=0).lower(state).compile()
+    compiling = time.perf_counter() - began
+    state, *_ = jax.block_until_ready(update(state))
+    began = time.perf_counter()
+    jax.block_until_ready(update(state))
+    steps = learner.steps_per_update
+    return Speed(steps / (time.perf_counter() - began), compiling), steps
+
+
+def artefact_bytes(layouts: Sequence[str], ego: PPOConfig) -> int:
+    """What the histories of one task on each of these layouts take, uncompressed."""
+    arrays = (record.shapes(get_layout(layout), ego).values() for layout in layouts)
+    return sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for task in arrays for shape, dtype in task)
+
+
+def bytes_per_transition(kind: Kind) -> float:
+    """Of the bundled release's data, one history of each of its tasks, if packed so."""
+    dataset = load_icrl4aht()
+    with tempfile.TemporaryDirectory() as folder:
+        new = [NewTask(task, {}, 1, partial(_first_history, task)) for task in read_tasks(dataset.root / TASKS)]
+        root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
+        shards = sum(path.stat().st_size for path in (root / "data").rglob("*.h5"))
+        return shards / sum(entry.T for entry in load_icrl4aht(root).entries)
+
+
+def _first_history(task: Task) -> list[NewHistory]:
+    return [NewHistory.copied(load_icrl4aht(task_id=task.task_id)[0])]

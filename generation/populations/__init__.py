@@ -1,0 +1,1 @@
+"""Populations of learned teammates: training, selection, cross-play."""

@@ -1,0 +1,52 @@
+"""Pictures of training and of populations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from icrl4aht_data.plotting import save_figure
+
+
+def plot_training(metrics: Path, path: Path, title: str) -> None:
+    """Returns over environment steps from a JSON-lines log: self-play, and cross-play where there is any."""
+    lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes: Any = figure.subplots()
+    for stage in sorted({line["stage"] for line in lines}):
+        own = [line for line in lines if line["stage"] == stage]
+        for name, style in (("self_play", "-"), ("cross_play", "--")):
+            points = [(line["step"], line[name]) for line in own if name in line]
+            if points:
+                label = name.replace("_", "-") + (f", stage {stage}" if stage else "")
+                axes.plot(*np.transpose(points), style, label=label, linewidth=1.2)
+    axes.set(title=title, xlabel="environment steps of each member", ylabel="return of an episode (400 steps)")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, frameon=False)
+    save_figure(figure, path)
+
+
+def plot_matrix(
+    values: np.ndarray, rows: Sequence[str], columns: Sequence[str], path: Path, title: str, labels: tuple[str, str]
+) -> None:
+    """A matrix as coloured cells with their numbers."""
+    size = (1.6 + 0.75 * len(columns), 1.4 + 0.6 * len(rows))
+    figure = Figure(figsize=(max(size[0], 4.2), max(size[1], 3.4)), layout="constrained")
+    axes: Any = figure.subplots()
+    image = axes.imshow(values, cmap="viridis", aspect="auto")
+    middle = (values.max() + values.min()) / 2
+    for (i, j), value in np.ndenumerate(values):
+        text = f"{value:.2f}" if np.abs(values).max() < 2 else f"{value:.0f}"
+        axes.text(j, i, text, ha="center", va="center", color="white" if value < middle else "black", fontsize=8)
+    axes.set_xticks(range(len(columns)), columns, fontsize=8)
+    axes.set_yticks(range(len(rows)), rows, fontsize=8)
+    axes.set_ylabel(labels[0])
+    axes.set_xlabel(labels[1])
+    axes.set_title(title, fontsize=10)
+    figure.colorbar(image)
+    save_figure(figure, path)

@@ -1,0 +1,364 @@
+"""The suite of learned teammates: populations trained into folders of checkpoints (paper, App. B.1).
+
+    SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
+    SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, where the algorithm trains them
+    SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, curves.png, population.json
+
+`population.json` comes last and names every file by its hash. Before it there is `resume.safetensors`, from which a
+stopped run goes on to the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from filelock import FileLock, Timeout
+
+from generation.collection.task_folder import TIMING
+from generation.env import Environment
+from generation.learners.checkpoint import CARD, WEIGHTS, load_card, load_policy, save_policy
+from generation.learners.population.brdiv import BRDiv
+from generation.learners.population.comedi import CoMeDi
+from generation.learners.population.fcp import FCP
+from generation.learners.population.lbrdiv import LBRDiv
+from generation.learners.population.population import Population, PopulationState
+from generation.learners.ppo import PPOConfig
+from generation.learners.state_file import keep_lines, load_state, read_card, save_state
+from generation.policy import stacked
+from generation.populations import cross_play
+from generation.populations.figures import plot_training
+from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.files import file_in_place_of, json_hash, write_json
+from icrl4aht_data.utils.hashes import file_hash, hashes_hold
+
+CHECKPOINTS = 5
+"""Evenly spaced over a policy's training (paper, App. B.1)."""
+
+_SELECTIONS = 10  # how often in a member's training CoMeDi looks anew for the member it resembles most
+_SAVE_SECONDS = 60.0
+_POPULATION, _METRICS, _RESUME = "population.json", "metrics.jsonl", "resume.safetensors"
+
+Report = Callable[[int, int, dict[str, float]], None]
+"""Called after each update with its number, the number of all updates, and the metrics."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One population of one layout.
+
+    Args:
+        algorithm: one of `ALGORITHMS`.
+        members: policies for the suite.
+        config: of each policy.
+        seed: of everything.
+    """
+
+    layout: Layout
+    algorithm: str
+    members: int
+    config: PPOConfig
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.algorithm not in ALGORITHMS:
+            raise unknown("algorithm", self.algorithm, ALGORITHMS)
+        if self.config.updates < CHECKPOINTS:
+            raise OptionError(
+                f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "
+                f"{CHECKPOINTS}, one for each checkpoint"
+            )
+        try:
+            for stage in self.stages:
+                _ = stage.seating
+        except ValueError as error:
+            raise OptionError(f"teammates, {self.algorithm} with {self.members} members: {error}") from error
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {
+            "layout": self.layout.name,
+            "algorithm": self.algorithm,
+            "members": self.members,
+            "config": asdict(self.config),
+            "seed": self.seed,
+            "code_version": version("icrl4aht-data"),
+        }
+
+    @property
+    def settings_hash(self) -> str:
+        return json_hash(self.settings)
+
+    @cached_property
+    def stages(self) -> list[Population]:
+        """What is trained one after the other; CoMeDi adds a member in each."""
+        env = Environment(self.layout)
+        if self.algorithm == "comedi":
+            first = Population(env, FCP(1), self.config, partners=2)
+            return [first, *[Population(env, CoMeDi(), self.config)] * (self.members - 1)]
+        kinds = {"fcp": FCP, "brdiv": BRDiv, "lbrdiv": LBRDiv}
+        return [Population(env, kinds[self.algorithm](self.members), self.config)]
+
+    @property
+    def responds(self) -> bool:
+        """Whether best responses of their own sit opposite the members."""
+        return self.algorithm in ("brdiv", "lbrdiv")
+
+    @property
+    def updates(self) -> int:
+        return len(self.stages) * self.config.updates
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all tables, over the whole run."""
+        return self.config.updates * sum(stage.steps_per_update for stage in self.stages)
+
+
+def is_finished(folder: Path, run: Run) -> bool:
+    """Whether the folder holds this population under these settings, every file as it was written."""
+    try:
+        content = json.loads((folder / _POPULATION).read_text(encoding="utf-8"))
+        same = content["settings_hash"] == run.settings_hash
+        return same and hashes_hold(folder, content["files"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+class PopulationBusyError(OptionError):
+    """Another process is training this population."""
+
+
+def train(
+    run: Run, folder: Path, report: Report = lambda update, updates, metrics: None, *, wait: bool = False
+) -> bool:
+    """Train a population into `folder`, from where a stopped run of the same settings ended.
+
+    Args:
+        wait: for another process that is at it, rather than leaving it to that.
+
+    Returns:
+        Whether there was anything to do; False if the population was finished before.
+
+    Raises:
+        PopulationBusyError: if another process trains into this folder.
+        OptionError: if it holds a run of other settings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=-1 if wait else 0):
+            if is_finished(folder, run):
+                return False
+            _Training(run, folder, report).run_on()
+            return True
+    except Timeout as error:
+        raise PopulationBusyError(f"{folder}: another process is training this population; wait for it") from error
+
+
+class _Training:
+    """A run in its folder."""
+
+    def __init__(self, run: Run, folder: Path, report: Report) -> None:
+        self.run, self.folder, self.report = run, folder, report
+
+    def run_on(self) -> None:
+        stage, state = self._resume()
+        while stage < len(self.run.stages):
+            self._train_stage(stage, state)
+            stage, state = stage + 1, None
+        self._finish()
+
+    def _resume(self) -> tuple[int, PopulationState | None]:
+        path = self.folder / _RESUME
+        if (self.folder / _POPULATION).exists():
+            raise OptionError(
+                f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
+            )
+        notes = read_card(path)
+        if notes is None:
+            self._begin_anew()
+            return 0, None
+        if {name: notes.get(name) for name in self._notes(0)} != self._notes(int(notes["stage"])):
+            raise OptionError(
+                f"{self.folder}: holds an unfinished run of other settings, another JAX or another kind of device; "
+                f"remove it, or give another --suite"
+            )
+        stage = int(notes["stage"])
+        state = load_state(path, jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
+        keep_lines(self.folder / _METRICS, stage * self.run.config.updates + int(state.update))
+        return stage, state
+
+    def _begin_anew(self) -> None:
+        """Remove what a run left that was killed before its first save."""
+        for folder in (*self.folder.glob("m[0-9]*"), self.folder / "responses"):
+            shutil.rmtree(folder, ignore_errors=True)
+        for name in (_METRICS, TIMING):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _notes(self, stage: int) -> dict[str, str]:
+        """What must be the same for a run to go on to the same bits."""
+        software = {"jax": jax.__version__, "platform": jax.default_backend()}
+        return {"settings_hash": self.run.settings_hash, "stage": str(stage), **software}
+
+    def _difference(self) -> str:
+        """In what a finished population is not this run's."""
+        try:
+            found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
+            wanted = json.loads(json.dumps(self.run.settings))
+            other = {name: found.get(name) for name, value in wanted.items() if found.get(name) != value}
+        except (OSError, ValueError, KeyError, AttributeError):
+            other = {}
+        return f"of other settings: {other}" if other else "with changed files"
+
+    def _key(self, stage: int):
+        return jax.random.fold_in(jax.random.key(self.run.seed), stage)
+
+    def _train_stage(self, stage: int, resumed: PopulationState | None) -> None:
+        population, updates = self.run.stages[stage], self.run.config.updates
+        state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
+        update = jax.jit(population.update, donate_argnums=0)
+        marks = {-(-updates * (c + 1) // CHECKPOINTS): c for c in range(CHECKPOINTS)}
+        started, before = time.perf_counter(), int(state.update)
+        saved = started
+        metrics_file, timing_file = (self.folder / name for name in (_METRICS, TIMING))
+        with metrics_file.open("a", encoding="utf-8") as log, timing_file.open("a", encoding="utf-8") as clock:
+            for number in range(before, updates):
+                if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
+                    state = state._replace(params=self._meet_the_nearest(state.params, stage, number))
+                state, metrics = update(state)
+                seconds = time.perf_counter() - started
+                line = self._line(stage, number, metrics)
+                speed = {"steps_per_second": round((number + 1 - before) * population.steps_per_update / seconds, 1)}
+                log.write(json.dumps(line) + "\n")
+                clock.write(json.dumps({"stage": stage, "update": number} | speed) + "\n")
+                self.report(stage * updates + number + 1, self.run.updates, line | speed)
+                if number + 1 in marks:
+                    self._save_checkpoints(stage, marks[number + 1], number + 1, state.params)
+                if time.perf_counter() - saved > _SAVE_SECONDS:
+                    log.flush()
+                    clock.flush()
+                    save_state(self.folder / _RESUME, state, self._notes(stage))
+                    saved = time.perf_counter()
+
+    def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
+        values = {name: float(value) for name, value in metrics.items()}
+        if not values["episodes"]:
+            del values["self_play"], values["cross_play"]
+        elif self.run.stages[stage].seating.self_play.all():
+            del values["cross_play"]
+        return {
+            "stage": stage,
+            "update": number,
+            "step": (number + 1) * self.run.config.steps_per_update,
+            **values,
+        }
+
+    def _meet_the_nearest(self, params: Any, stage: int, number: int) -> Any:
+        """Put the former member with which the new one plays best in the frozen one's place (paper, App. B.1,
+        "Partner Selection")."""
+        network = self.run.stages[stage].network
+        former = stacked([load_policy(self.folder / f"m{m}" / f"c{CHECKPOINTS - 1}")[1] for m in range(stage)])
+        new = jax.tree.map(lambda leaf: leaf[:1], params)
+        returns = cross_play.matrix(self.run.layout, network, new, former, seed=number)[0]
+        returns = returns + cross_play.matrix(self.run.layout, network, former, new, seed=number)[:, 0]
+        nearest = int(np.argmax(returns))
+        return jax.tree.map(lambda leaf, old: leaf.at[1].set(old[nearest]), params, former)
+
+    def _save_checkpoints(self, stage: int, checkpoint: int, update: int, params: Any) -> None:
+        run, population = self.run, self.run.stages[stage]
+        count = 1 if run.algorithm == "comedi" else run.members
+        members = jax.tree.map(lambda leaf: leaf[:count], params)
+        opposite = jax.tree.map(lambda leaf: leaf[count : 2 * count], params) if run.responds else members
+        returns, as_teammate = (
+            cross_play.together(run.layout, population.network, opposite, members, greedy=greedy)
+            for greedy in (False, True)
+        )
+        for k in range(count):
+            card = {
+                "algorithm": run.algorithm,
+                "layout": run.layout.name,
+                "member": stage + k,
+                "checkpoint": checkpoint,
+                "step": update * run.config.steps_per_update,
+                "seed": run.seed,
+                "code_version": version("icrl4aht-data"),
+                "seats": [1] if run.responds else [0, 1],
+                "return": float(returns[k]),
+                "teammate_return": float(as_teammate[k]),
+                "return_of": f"{cross_play.EPISODES} episodes of 400 steps with its best response or itself, both "
+                "drawing their actions; as a teammate it acts greedily, in seat 1",
+            }
+            own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
+            save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
+            if run.responds and checkpoint == CHECKPOINTS - 1:
+                response = jax.tree.map(lambda leaf, k=k: leaf[k], opposite)
+                where = self.folder / "responses" / f"m{k}"
+                save_policy(where, population.network, response, card | {"role": "best response", "seats": [0]})
+
+    def _finish(self) -> None:
+        plot_training(
+            self.folder / _METRICS, self.folder / "curves.png", f"{self.run.algorithm}, {self.run.layout.name}"
+        )
+        files = {
+            str(path.relative_to(self.folder)): file_hash(path)
+            for name in (WEIGHTS, CARD)
+            for path in sorted(self.folder.rglob(name))
+        }
+        content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
+        with file_in_place_of(self.folder / _POPULATION) as partial:
+            write_json(partial, content)
+        (self.folder / _RESUME).unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint of a suite. `path` is relative to the suite's folder."""
+
+    path: str
+    card: dict[str, Any]
+
+
+def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
+    """Whether a suite has this population, finished."""
+    return (suite / layout / algorithm / _POPULATION).is_file()
+
+
+def checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Checkpoint]:
+    """A population's checkpoints, by member and checkpoint.
+
+    Raises:
+        OptionError: if the population was not finished.
+    """
+    folder = suite / layout / algorithm
+    if not is_trained(suite, layout, algorithm):
+        raise OptionError(f"{folder}: no finished population; run `python -m generation teammates --layout {layout}`")
+    found = [path.parent for path in folder.glob(f"m*/c*/{WEIGHTS}")]
+    for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
+        yield Checkpoint(str(path.relative_to(suite)), load_card(path))
+
+
+def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
+    """Mean returns float64 (K, K) of the final policies: row the one in seat 0 (the best response, where the algorithm
+    trains them), column the member in seat 1; the diagonal is self-play. `greedy` members act as teammates do.
+
+    Raises:
+        OptionError: if the population was not finished.
+    """
+    last = [point for point in checkpoints(suite, layout.name, algorithm) if point.path.endswith(f"c{CHECKPOINTS - 1}")]
+    loaded = [load_policy(suite / point.path) for point in last]
+    members = stacked([params for _, params, _ in loaded])
+    folder = suite / layout.name / algorithm / "responses"
+    left = members
+    if folder.is_dir():
+        left = stacked([load_policy(folder / f"m{point.card['member']}")[1] for point in last])
+    return cross_play.matrix(layout, loaded[0][0], left, members, greedy=greedy)

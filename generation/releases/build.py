@@ -1,0 +1,93 @@
+"""A whole rebuild: every task of a profile collected, then packed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+
+from filelock import FileLock
+from rich.console import Console
+
+from generation.collection.job import CollectionError
+from generation.collection.options import Options
+from generation.collection.run import collect_tasks
+from generation.populations.build import build_suite
+from generation.populations.select import THRESHOLD, make_tasks
+from generation.profiles import Profile, load_profile
+from generation.progress import progress
+from generation.releases.package import package
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.info import read_info
+from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.writing.release_folder import check_replaceable
+from icrl4aht_data.writing.statistics import print_statistics
+
+SUITE = "suite"
+"""Where a rebuild keeps its learned teammates, unless told another place."""
+
+
+def build_releases(
+    profile_name: str,
+    out: Path,
+    kinds: Sequence[Kind],
+    console: Console,
+    options: Options | None = None,
+    suite: Path | None = None,
+    seed: int = 0,
+) -> list[Path]:
+    """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
+
+    Args:
+        out: tasks are collected under out/artefacts.
+        suite: the folder of the learned teammates; by default out/suite.
+        seed: of the suite.
+
+    Raises:
+        CollectionError: if a task could not be collected; nothing is packed then.
+    """
+    profile = load_profile(profile_name)
+    for kind in kinds:
+        check_replaceable(out / kind)  # before the long work, not after it
+    out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
+    tasks = train_teammates(profile, suite, seed, console)
+    collect_tasks(tasks, profile, out, console, options or Options(), suite)
+    with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same, before or after
+        releases = [_pack(out / "artefacts", out / kind, tasks, profile, suite, kind, console) for kind in kinds]
+        for release in releases:
+            print_statistics(read_info(release), console)
+    return releases
+
+
+def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) -> list[Task]:
+    """The training tasks of a profile: those with presets, then those with learned teammates, which are trained first.
+
+    Raises:
+        CollectionError: if there is no task, because no teammate is good enough.
+    """
+    tasks = profile.heuristic_tasks()
+    if not profile.algorithms:
+        return tasks
+    selections = build_suite(profile, suite, profile.algorithms, seed, console)
+    tasks += make_tasks(suite, selections, "train")
+    if not tasks:
+        names = dict.fromkeys(chain(*profile.algorithms.values()))
+        raise CollectionError(
+            f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
+            f"teammate needs: raise teammates.total_steps in profile {profile.name}"
+        )
+    return tasks
+
+
+def _pack(
+    artefacts: Path,
+    target: Path,
+    tasks: list[Task],
+    profile: Profile,
+    suite: Path,
+    kind: Kind,
+    console: Console,
+) -> Path:
+    with progress(console) as bars:
+        bar = bars.add_task(f"packing {kind}", total=len(tasks), note="")
+        return package(artefacts, target, tasks, profile, suite, kind, lambda task: bars.advance(bar))

@@ -1,0 +1,86 @@
+"""Two rebuilds, bit for bit: the same files with the same bytes, or what differs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from generation.collection.failures import FAILED
+from generation.collection.task_folder import FILTER_CURVES, TIMING
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.hashes import file_hash
+
+_APART = {TIMING, FAILED, FILTER_CURVES}
+"""Files that say how a rebuild went, and pictures of what it made."""
+
+_TEXT = {".json", ".jsonl", ".md", ".sha256"}
+
+
+@dataclass
+class Comparison:
+    """How many files there are in one or the other, and what is the matter with those that differ."""
+
+    files: int = 0
+    differences: dict[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        return {"equal": not self.differences, **asdict(self)}
+
+
+def compare(a: Path, b: Path) -> Comparison:
+    """Compare two folders. Wall-clock figures, failures, pictures and hidden files are left out.
+
+    Raises:
+        OptionError: if one is no folder, or there is nothing to compare.
+    """
+    for folder in (a, b):
+        if not folder.is_dir():
+            raise OptionError(f"{folder}: no such folder")
+    ours, theirs = _files(a), _files(b)
+    result = Comparison(len(ours | theirs))
+    if not result.files:
+        raise OptionError(f"{a} and {b}: no files to compare")
+    for name in sorted(ours | theirs):
+        if name not in theirs:
+            result.differences[name] = f"only in {a}"
+        elif name not in ours:
+            result.differences[name] = f"only in {b}"
+        elif file_hash(a / name) != file_hash(b / name):
+            result.differences[name] = _how(a / name, b / name)
+    return result
+
+
+def _files(root: Path) -> set[str]:
+    paths = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
+    return {
+        path.as_posix() for path in paths if path.name not in _APART and not any(p.startswith(".") for p in path.parts)
+    }
+
+
+def _how(a: Path, b: Path) -> str:
+    if a.suffix == ".npy":
+        try:
+            return _how_arrays(np.load(a, mmap_mode="r"), np.load(b, mmap_mode="r"))
+        except ValueError:  # one of them is no array
+            pass
+    sizes = a.stat().st_size, b.stat().st_size
+    ours, theirs = np.memmap(a, np.uint8, "r") if sizes[0] else (), np.memmap(b, np.uint8, "r") if sizes[1] else ()
+    common = min(sizes)
+    wrong = np.flatnonzero(np.asarray(ours[:common]) != np.asarray(theirs[:common]))
+    first = int(wrong[0]) if len(wrong) else common
+    size = f"{sizes[0]} bytes" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} bytes"
+    line = f", line {1 + bytes(ours[:first]).count(10)}" if a.suffix in _TEXT else ""
+    return f"{size}, the first difference at byte {first}{line}"
+
+
+def _how_arrays(a: np.ndarray, b: np.ndarray) -> str:
+    if (a.shape, a.dtype) != (b.shape, b.dtype):
+        return f"{a.dtype} {a.shape} and {b.dtype} {b.shape}"
+    wrong = np.argwhere(np.asarray(a != b))
+    if not len(wrong):
+        return "the same array, stored in another way"
+    at = tuple(wrong[0].tolist())
+    return f"{len(wrong)} of {a.size} values, the first at {at}: {a[at]} and {b[at]}"

@@ -1,0 +1,92 @@
+"""Artefacts -> a release folder: the best streams of each task, labelled."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from generation.collection import record
+from generation.collection.curate import best_streams, filter_report, plot_filter, relabel
+from generation.collection.task import TEAMMATE_NOISE
+from generation.collection.task_folder import FILTER_CURVES, METADATA
+from generation.learners.checkpoint import load_policy
+from generation.populations.select import THRESHOLD
+from generation.profiles import Profile
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.schema import Kind, episode_ends
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.release_folder import folder_in_place_of
+from icrl4aht_data.writing.statistics import STREAMS_RECORDED
+
+
+def package(
+    artefacts: Path,
+    target: Path,
+    tasks: Sequence[Task],
+    profile: Profile,
+    suite: Path,
+    kind: Kind,
+    done: Callable[[Task], None] = lambda task: None,
+) -> Path:
+    """Write a release of these tasks' artefacts, with the checkpoints of learned teammates; see `write_release`."""
+    new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
+    return write_release(target, kind, new, data_version=profile.data_version, done=done)
+
+
+def bundle_release(release: Path) -> Path:
+    """Put a copy of a release in the place of the one that the package bundles."""
+    with folder_in_place_of(MINI) as copy:
+        shutil.copytree(release, copy, dirs_exist_ok=True)
+    return MINI
+
+
+def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTask:
+    metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+    rewards = np.load(folder / "rewards.npy", mmap_mode="r")
+    streams = best_streams(rewards, profile.keep)
+    plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
+    provenance = {
+        "profile": metadata["profile"],
+        "profile_hash": profile.hash,
+        "ego": metadata["ego"],
+        "ego_hash": metadata["ego_hash"],
+        "code_version": metadata["code_version"],
+        "jax_version": metadata["jax_version"],
+        "platform": metadata["platform"],
+        "seed": task.seed,
+        "teammate": {"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
+        STREAMS_RECORDED: metadata["ego"]["environments"],
+        "streams_kept": profile.keep,
+        "filter": filter_report(rewards, streams),
+        "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
+    }
+    if task.teammate_family == "rl":
+        provenance["suite"] = {
+            "algorithms": {layout: list(names) for layout, names in profile.algorithms.items()},
+            "members": profile.teammates.members,
+            "train": profile.teammates.train,
+            "total_steps": profile.teammates.ppo.total_steps,
+            "threshold": THRESHOLD,
+        }
+    files = checkpoint_files(suite, task)
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams), files)
+
+
+def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHistory]:
+    arrays = record.Histories(
+        **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in record.Histories._fields}
+    )
+    network, params, _ = load_policy(folder)
+    labels = relabel(task.layout, network, params, (arrays.state[stream] for stream in streams))
+    dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)
+    for stream, expert in zip(streams, labels, strict=True):
+        recorded = {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}
+        yield NewHistory(int(stream), recorded | {"dones": dones, "expert_actions": expert})

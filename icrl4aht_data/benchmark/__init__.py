@@ -1,0 +1,1 @@
+"""The benchmark: tracks, splits, teammate families, tasks, reference returns."""

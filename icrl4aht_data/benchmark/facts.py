@@ -1,0 +1,71 @@
+"""Facts of the benchmark: actions, tracks, splits, teammate families, and which layout belongs where."""
+
+from __future__ import annotations
+
+from icrl4aht_data.errors import unknown
+
+_TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
+_LAYOUT_LAYOUTS = ("asymm_both", "cramped_up")
+
+TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
+    "teammate": {"train": _TEAMMATE_LAYOUTS, "test": _TEAMMATE_LAYOUTS, "heldout": _TEAMMATE_LAYOUTS},
+    "layout": {"train": _LAYOUT_LAYOUTS, "test": ("asymm_right", "cramped_down"), "heldout": _LAYOUT_LAYOUTS},
+}
+"""track -> split -> layouts (paper, App. A)."""
+
+LAYOUTS = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
+"""Every layout of the benchmark, in the paper's order; its place here goes into seeds."""
+
+SPLITS = ("train", "test", "heldout")
+"""`heldout` has the training layouts and learned teammates that `train` does not have (paper, App. F)."""
+
+FAMILIES = ("rl", "H1", "H2", "H3", "H4")
+"""Teammate families: learned policies, and the four heuristics (paper, App. B)."""
+
+HEURISTIC_KINDS = {
+    "recipe_aware_button": "H1",
+    "territory": "H2",
+    "assembly_line": "H3",
+    "utility_greedy": "H4",
+}
+"""teammate kind -> family, for the heuristics."""
+
+ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
+"""What makes the learned teammates; the teammate kinds of family `rl` (paper, App. B.1)."""
+
+EPISODE_STEPS = 400
+"""Steps of an episode in training (paper, App. C)."""
+
+KEPT_STEPS = 100
+"""Steps kept of each training episode, and steps of an evaluation episode (paper, App. C and Sec. 4.3)."""
+
+PAPER_EGO_STEPS = 60_000_000
+"""Environment steps for which an ego learns (paper, App. C.2.2)."""
+
+PAPER_TEAMMATE_STEPS = 30_000_000
+"""Environment steps for which a member of a population of teammates learns (paper, App. B.1)."""
+
+PAPER_TEAMMATES = 20
+"""Training teammates of each algorithm and layout (paper, App. B.1)."""
+
+
+def track_of(layout: str) -> str:
+    """The track whose train or test layouts include `layout` (short name)."""
+    for track, splits in TRACKS.items():
+        if any(layout in layouts for layouts in splits.values()):
+            return track
+    raise unknown("layout", layout, LAYOUTS)
+
+
+def check_place(track: object, split: object, layout: object) -> None:
+    """Whether a layout (short name) belongs to that split of that track.
+
+    Raises:
+        UnknownNameError: lists the valid names and the nearest.
+    """
+    if not isinstance(track, str) or track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    if not isinstance(split, str) or split not in SPLITS:
+        raise unknown("split", split, SPLITS)
+    if layout not in TRACKS[track][split]:
+        raise unknown(f"layout of the {split} split of track {track}", layout, TRACKS[track][split])

@@ -1,0 +1,47 @@
+"""What the benchmark leaves an ego to do: the mean returns of the reference egos in every test cell."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+from icrl4aht_data.benchmark.facts import FAMILIES
+from icrl4aht_data.utils.templates import card_file, markdown_table
+
+REFERENCES = ("stay", "random", "oracle")
+"""The reference egos."""
+
+HEURISTICS = FAMILIES[1:]
+"""The teammate families of the test tasks."""
+
+_NO_HEADROOM = 1.0  # a cell where `oracle` is within this of `stay` leaves an ego nothing to do
+
+Cell = tuple[str, str]
+"""(layout, family)."""
+
+
+def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
+    """cell -> mean returns of the reference egos; empty if none was measured under this protocol."""
+    content = json.loads(card_file("headroom.json").read_text(encoding="utf-8")).get(protocol, {})
+    return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
+
+
+def has_headroom(references: Mapping[str, float]) -> bool:
+    """Whether the oracle gets more in this cell than an ego that only stays, by over a point."""
+    return references["oracle"] - references["stay"] > _NO_HEADROOM
+
+
+def headroom_table(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> str:
+    """Markdown: a row a family, a column a layout, `stay / random / oracle` in each cell, bold where there is headroom,
+    and a line that names the cells where there is none."""
+    rows = [[family, *(_in_words(cells.get((layout, family))) for layout in layouts)] for family in HEURISTICS]
+    known = [(layout, family) for layout in layouts for family in HEURISTICS if (layout, family) in cells]
+    flat = ["/".join(cell) for cell in known if not has_headroom(cells[cell])]
+    return f"{markdown_table(['family', *layouts], rows)}\n\nNo headroom: {', '.join(flat) or 'none'}."
+
+
+def _in_words(references: Mapping[str, float] | None) -> str:
+    if references is None:
+        return ""
+    text = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
+    return f"**{text}**" if has_headroom(references) else text

@@ -1,0 +1,192 @@
+"""A task: a layout, a teammate, a seed. One JSON line each in manifests and in a release's meta/tasks.jsonl.
+
+    {"task_id": ..., "track": "teammate", "split": "train", "layout_name": "demo_cook_wide", "seed": 0,
+     "teammate": {"kind": "heuristic", "family": "utility_greedy", "theta_id": 0, "base_seed": 0, "theta": {...}}}
+
+The id ends in a hash of the rest, so a task cannot change and keep its name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS, SPLITS, TRACKS, check_place
+from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import parse_json, read_lines
+from icrl4aht_data.utils.paths import is_inside
+
+_FIELDS = ("task_id", "track", "split", "layout_name", "seed", "teammate")
+_HASHED = ("kind", "family", "theta_id", "base_seed", "theta")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task. `layout_name` is the environment name, as in the published manifests.
+
+    Args:
+        teammate: kind, family, theta_id, base_seed and theta. Kind "heuristic": theta has the parameters. Kind "rl":
+            the checkpoint's folder within its suite, and the sha256 of its weights.
+    """
+
+    task_id: str
+    track: str
+    split: str
+    layout_name: str
+    seed: int
+    teammate: dict[str, Any]
+
+    @property
+    def layout(self) -> Layout:
+        return get_layout(self.layout_name)
+
+    @property
+    def teammate_kind(self) -> str:
+        """The index's `teammate_kind`: the heuristic's or algorithm's name."""
+        return self.teammate["family"]
+
+    @property
+    def teammate_family(self) -> str:
+        """The index's `teammate_family`: H1..H4, or rl."""
+        return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS[self.teammate_kind]
+
+
+@dataclass(frozen=True)
+class NamedTask(Task):
+    """A task of which only what an index line says is known: no parameters of its teammate, and -1 for its seed.
+
+    Args:
+        teammate: the line's teammate_kind and teammate_family.
+    """
+
+    @property
+    def teammate_kind(self) -> str:
+        return self.teammate["teammate_kind"]
+
+    @property
+    def teammate_family(self) -> str:
+        return self.teammate["teammate_family"]
+
+
+def named_task(line: Mapping[str, Any]) -> NamedTask:
+    """The task of an index line with the paper's fields.
+
+    Raises:
+        UnknownNameError: for names that the benchmark does not know.
+    """
+    layout = get_layout(line["layout"])
+    check_place(line["track"], line["split"], layout.name)
+    if line["teammate_family"] not in FAMILIES:
+        raise unknown("teammate_family", line["teammate_family"], FAMILIES)
+    teammate = {name: line[name] for name in ("teammate_kind", "teammate_family")}
+    return NamedTask(line["task_id"], line["track"], line["split"], layout.alias, -1, teammate)
+
+
+def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:
+    """A task with its id.
+
+    Raises:
+        UnknownNameError: if the layout does not belong to that split of that track.
+    """
+    known = get_layout(layout)
+    check_place(track, split, known.name)
+    return Task(task_id(track, split, known.alias, teammate, seed), track, split, known.alias, seed, teammate)
+
+
+def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], seed: int) -> str:
+    """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
+
+    hash8: the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`.
+    """
+    spec = {name: teammate[name] for name in _HASHED if name in teammate}
+    text = f"{track}:{split}:{layout_name}:{spec!r}:{seed}"
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return f"{track}_{split}_{layout_name}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{seed}_{digest}"
+
+
+def manifest_path(track: str, split: str) -> Path:
+    """The bundled manifest of a track's tasks.
+
+    Raises:
+        UnknownNameError: for an unknown track or split.
+    """
+    if track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    if split not in SPLITS:
+        raise unknown("split", split, SPLITS)
+    return Path(__file__).parent.parent / "manifests" / f"{track}_{split}.jsonl"
+
+
+def read_tasks(path: Path) -> list[Task]:
+    """The tasks of a JSONL file.
+
+    Raises:
+        TaskFormatError: names the file and the line.
+    """
+    tasks: dict[str, Task] = {}
+    for number, line in enumerate(read_lines(path), start=1):
+        try:
+            task = _parse(line)
+            if task.task_id in tasks:
+                raise TaskFormatError(f"duplicate task_id {task.task_id!r}")
+        except Icrl4ahtError as error:
+            raise TaskFormatError(f"{path}, line {number}: {error}") from error
+        tasks[task.task_id] = task
+    return list(tasks.values())
+
+
+def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
+    """One line per task."""
+    path.write_text("".join(json.dumps(asdict(task)) + "\n" for task in tasks), encoding="utf-8")
+
+
+def _parse(line: str) -> Task:
+    fields = parse_json(line)
+    if not isinstance(fields, dict) or set(fields) != set(_FIELDS):
+        found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
+        raise TaskFormatError(f"expected the fields {sorted(_FIELDS)}, found {found}")
+    for name, kind in (("task_id", str), ("layout_name", str), ("seed", int), ("teammate", dict)):
+        if not isinstance(fields[name], kind):
+            raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
+    if abs(fields["seed"]) >= 2**63:
+        raise TaskFormatError(f"seed: expected at most 64 bits, found {fields['seed']}")
+    check_place(fields["track"], fields["split"], get_layout(fields["layout_name"]).name)
+    teammate = fields["teammate"]
+    if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
+        raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
+    _check_teammate(teammate)
+    task = Task(**fields)
+    expected = task_id(task.track, task.split, task.layout_name, teammate, task.seed)
+    if task.task_id != expected:
+        raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
+    return task
+
+
+def _check_teammate(teammate: dict[str, Any]) -> None:
+    kinds = tuple(HEURISTIC_KINDS) if teammate["kind"] == "heuristic" else ALGORITHMS
+    if teammate["family"] not in kinds:
+        raise unknown(f"{teammate['kind']} family", teammate["family"], kinds)
+    if teammate.get("slot", TEAMMATE) != TEAMMATE:
+        raise TaskFormatError(f"teammate.slot: a task's teammate plays slot {TEAMMATE}, found {teammate['slot']!r}")
+    fields = set(teammate) - {"slot"}
+    if fields != set(_HASHED):
+        raise TaskFormatError(f"teammate: expected the fields {sorted(_HASHED)}, found {sorted(fields)}")
+    theta = teammate["theta"]
+    if not isinstance(theta, dict):
+        raise TaskFormatError(f"teammate.theta: expected parameters by name, found {theta!r}")
+    if teammate["kind"] == "rl":
+        if set(theta) != {"checkpoint", "sha256"} or not all(isinstance(value, str) for value in theta.values()):
+            raise TaskFormatError(f"teammate.theta: expected the strings checkpoint and sha256, found {theta!r}")
+        if not is_inside(theta["checkpoint"]):
+            raise TaskFormatError(
+                f"teammate.theta.checkpoint: expected a path within the suite, found {theta['checkpoint'][:200]!r}"
+            )
+        if not re.fullmatch("[0-9a-f]{64}", theta["sha256"]):
+            raise TaskFormatError(f"teammate.theta.sha256: expected 64 digits, found {theta['sha256'][:200]!r}")

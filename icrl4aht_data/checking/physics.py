@@ -1,0 +1,58 @@
+"""TODO."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import fixed_channels, observe
+from icrl4aht_data.overcooked.rules import step
+from icrl4aht_data.overcooked.state import columns, record_size, start
+from icrl4aht_data.reading.history import History
+
+
+def _place_problems(layout: Layout, history: History) -> Iterator[str]:
+    fixed = fixed_channels(layout)
+    records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
+    records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
+    views = {view.tobytes() for view in observe(layout, records, EGO)[..., fixed]}
+    wrong = [t for t, seen in enumerate(history.read("obs")[..., fixed]) if seen.tobytes() not in views]
+    if wrong:
+        yield f"obs: {len(wrong)} steps do not show {layout.name} from any cell of the ego's, first step {wrong[0]}"
+
+
+def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
+    states, ends = history.read("state"), history.read("episode_end_state")
+    if history.kind == "full":
+        wrong = np.flatnonzero((history.read("obs") != observe(layout, states, EGO)).any(axis=(1, 2, 3)))
+        if len(wrong):
+            yield f"obs: {len(wrong)} steps differ from what their state shows, first step {wrong[0]}"
+    following = np.concatenate([states[1:], states[:1]])
+    following[dones] = ends
+    recipe = columns(layout).recipe
+    actions = np.stack([history.read("actions"), history.read("teammate_actions")], axis=-1)
+    played = step(layout, states, np.clip(actions, 0, len(ACTIONS) - 1), following[:, recipe])
+    wrong = np.flatnonzero((played.state != following).any(axis=-1))
+    if len(wrong):
+        yield f"replay: {len(wrong)} steps do not lead to the recorded next state, first step {wrong[0]}"
+    wrong = np.flatnonzero(played.reward != rewards)
+    if len(wrong):
+        t = int(wrong[0])
+        yield f"replay: {len(wrong)} rewards differ, first at step {t}: rules {played.reward[t]}, found {rewards[t]}"
+    if not np.isin([*states[:, recipe], *ends[:, recipe]], layout.recipe_items).all():
+        yield "a recipe is not one of the layout's"
+    yield from _start_problems(layout, states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])])
+
+
+def _start_problems(layout: Layout, starts: np.ndarray) -> Iterator[str]:
+    where = columns(layout)
+    positions = starts[:, where.positions]
+    fresh = start(layout, positions, starts[:, where.facings], starts[:, where.recipe])
+    wrong = (fresh != starts).any(axis=-1)
+    for agent in (0, 1):
+        wrong |= ~np.isin(positions[:, agent], layout.rooms[agent])
+    if wrong.any():
+        yield f"{wrong.sum()} episodes do not start as the environment starts, first episode {wrong.argmax()}"

@@ -1,0 +1,1 @@
+"""The `icrl4aht-data` command line."""

@@ -1,0 +1,48 @@
+"""TODO."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.schema import (
+    TEAMMATES,
+)
+from icrl4aht_data.utils.files import plain_size
+from icrl4aht_data.utils.paths import inside
+
+CHECKPOINT_BYTES = 64 * 2**20
+"""Of each file of a learned teammate: sixty times what the paper's network takes."""
+
+
+def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
+    """Where the checkpoint of a learned teammate is: named by its hash in a release, by its path in a suite.
+
+    Args:
+        folder: TEAMMATES of a release, or a suite.
+        teammate: the task's entry, of kind "rl".
+    """
+    theta = teammate["theta"]
+    return folder / (theta["sha256"] if (folder / theta["sha256"]).is_dir() else theta["checkpoint"])
+
+
+def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict[str, Path]:
+    """The files of a task's learned teammate by their path in a release; none for a heuristic, or where there are none.
+
+    Args:
+        folder: see `checkpoint_folder`.
+        root: the release that the folder is in, out of which no link may lead.
+
+    Raises:
+        UnsafePathError, IndexFormatError: for what is none of the release's files, or too large for a checkpoint.
+    """
+    if task.teammate.get("kind") != "rl":
+        return {}
+    found = sorted(checkpoint_folder(folder, task.teammate).glob("policy.*"))
+    for path in found:
+        if root is not None:
+            inside(root, path.relative_to(root).as_posix())
+        plain_size(path, CHECKPOINT_BYTES)
+    return {f"{TEAMMATES}/{task.teammate['theta']['sha256']}/{path.name}": path for path in found}

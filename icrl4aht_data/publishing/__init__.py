@@ -1,0 +1,1 @@
+"""Preparing a release for publication and uploading it to the Hugging Face Hub."""

@@ -1,0 +1,1 @@
+"""Reading histories: shards, chunk cache, sources held in memory, memory-mapped or streamed."""

@@ -1,0 +1,48 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+
+import numpy as np
+
+_CACHE_BYTES = 256 * 2**20
+
+
+class ChunkCache:
+    """Decoded chunks of all shards of a dataset, the least recently used ones dropped beyond a size. Thread-safe."""
+
+    def __init__(self, size: int = _CACHE_BYTES) -> None:
+        self._size = size
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop everything."""
+        self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> int:
+        return self._size
+
+    def __setstate__(self, size: int) -> None:
+        self._size = size
+        self.clear()
+
+    def get(self, key: tuple[str, int]) -> np.ndarray | None:
+        """The chunk of that key, if it is here."""
+        with self._lock:
+            rows = self._chunks.get(key)
+            if rows is not None:
+                self._chunks.move_to_end(key)
+            return rows
+
+    def put(self, key: tuple[str, int], rows: np.ndarray) -> None:
+        """Keep a chunk."""
+        with self._lock:
+            if key not in self._chunks:
+                self._chunks[key] = rows
+                self._bytes += rows.nbytes
+            while self._bytes > self._size and len(self._chunks) > 1:
+                self._bytes -= self._chunks.popitem(last=False)[1].nbytes

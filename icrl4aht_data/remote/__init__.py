@@ -1,0 +1,1 @@
+"""Releases at an address: byte ranges, partially downloaded files, downloads."""

@@ -1,0 +1,1 @@
+"""AD and DPT batches: draws, samplers, prefetching."""

@@ -1,0 +1,1 @@
+"""Helpers without knowledge of the dataset: files, paths, hashes, threads, memory, the cache folder."""

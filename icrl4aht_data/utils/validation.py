@@ -1,0 +1,23 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+from icrl4aht_data.errors import OptionError
+
+
+def whole(name: str, value: Any, least: int) -> int:
+    """The value as an int, if it is one from `least` to 2**63.
+
+    Raises:
+        OptionError: otherwise.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError as error:
+        raise OptionError(f"{name} = {value!r}: expected a whole number") from error
+    if not least <= number < 2**63:
+        raise OptionError(f"{name} = {number}: expected at least {least} and below 2**63")
+    return number

@@ -1,0 +1,55 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.schema import (
+    INFO,
+)
+
+
+@contextmanager
+def folder_in_place_of(target: Path) -> Iterator[Path]:
+    """A new folder to fill, which takes the place of the release at `target` when the block ends without an error.
+
+    Raises:
+        OptionError: if `target` is not a release, or if another process is writing it.
+    """
+    target = target.resolve()
+    check_replaceable(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
+    try:
+        with FileLock(target.with_name(f".{target.name}.lock"), timeout=0):
+            if old.exists() and not target.exists():  # a writer was killed between the two renames below
+                old.rename(target)
+            for leftover in (new, old):
+                shutil.rmtree(leftover, ignore_errors=True)
+            new.mkdir()
+            try:
+                yield new
+                if target.exists():
+                    target.rename(old)
+                new.rename(target)
+            finally:
+                for leftover in (new, old):
+                    shutil.rmtree(leftover, ignore_errors=True)
+    except Timeout as error:
+        raise OptionError(f"{target}: another process is writing it; wait for it, or give another folder") from error
+
+
+def check_replaceable(target: Path) -> None:
+    """Whether a release may be written there.
+
+    Raises:
+        OptionError: if there is a file, or a folder that is neither empty nor a release.
+    """
+    if target.exists() and not (target.is_dir() and ((target / INFO).exists() or not any(target.iterdir()))):
+        raise OptionError(f"{target}: exists and is not a release; give another folder or remove it")

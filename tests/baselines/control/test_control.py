@@ -1,0 +1,58 @@
+"""The positive control, its small worlds and its table."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.commands.cli import cli
+from baselines.control import control, worlds
+from generation.policy import Policy
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+TINY = control.Size(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
+
+
+def fixed(action: int) -> Policy:
+    return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(action), carry), "percept")
+
+
+def test_what_the_worlds_reward():
+    means = jnp.array([[0.0, 1.0, 0, 0, 0], [1.0, 0.0, 0, 0, 0]])
+    actions, rewards = worlds.play(worlds.bandit(), fixed(1), means, 0, 6)
+    assert actions.tolist() == [[1] * 6] * 2
+    assert rewards.tolist() == [[1] * 6, [0] * 6]
+    above, corner = worlds.MIDDLE - worlds.SIDE, 0
+    _, rewards = worlds.play(worlds.dark_room(), fixed(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
+    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # it passes the goal and goes on to the wall
+    assert rewards.tolist() == [episode * 2, [0] * 2 * worlds.ROOM_STEPS]
+    assert worlds.best_return(np.array([above, corner])).tolist() == [10, 7]
+
+
+def test_sources_learn():
+    rng = np.random.default_rng(0)
+    means = rng.random((300, worlds.ARMS))
+    uniform = 100 * (means.max(axis=1) - means.mean(axis=1)).mean()
+    for choose in (worlds.thompson, worlds.ucb):
+        actions, _ = worlds.play_bandits(choose, means, 100, rng)
+        regret = (means.max(axis=1, keepdims=True) - np.take_along_axis(means, actions, axis=1)).sum(axis=1).mean()
+        assert regret < uniform / 2
+    goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
+    cells, actions, rewards = worlds.search(np.tile(goals, 10), 20, rng)
+    np.testing.assert_array_equal(cells.reshape(-1, worlds.ROOM_STEPS)[:, 0], worlds.MIDDLE)
+    shares = rewards.reshape(len(cells), 20, -1).sum(axis=-1) / worlds.best_return(np.tile(goals, 10))[:, None]
+    assert shares[:, 0].mean() < 0.3
+    assert shares[:, -4:].mean() > 0.8
+
+
+def test_a_tiny_control_runs_and_fails(tmp_path, monkeypatch):
+    """Two updates teach nothing: the table says so, and the exit code."""
+    monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, of, step, loss: None))
+    result = CliRunner().invoke(cli, ["control", "--out", str(tmp_path)])
+    assert result.exit_code == 1, result.output
+    assert result.output.count("FAIL") >= 2
+    assert "context cut off" in result.output
+    assert {path.name for path in tmp_path.iterdir()} == {"dpt_on_bandits", "ad_on_bandits", "ad_in_dark_room"}

@@ -1,0 +1,140 @@
+"""Trained models as egos of the evaluator, and the commands that make and play them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.agents.egos import find_agent
+from baselines.commands.cli import cli
+from baselines.evaluate.drift import measure
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import PROTOCOLS
+from baselines.methods.method import SIZES, ModelOptions
+from baselines.methods.registry import get_method, kitchen
+from baselines.training.histories import HistoryOptions, prepare, read_trained
+from baselines.training.run_folder import Checkpoints, open_run, versions
+from baselines.training.trainer import TrainOptions
+from generation.teammates.instances import published_tasks
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.flat_world import drawn
+from tests.servers.common import http_server
+
+SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2, steps=10)
+WIDE = [task for task in published_tasks("teammate") if (task.layout.name, task.teammate_family) == ("demo_wide", "H4")]
+MODEL = ModelOptions(layers=1, width=16, heads=2, teammate_actions=True)
+OPTIONS = TrainOptions(steps=2, batch_size=2, context=30)
+
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
+@pytest.fixture(scope="module")
+def runs(lite, tmp_path_factory) -> Path:
+    """Run folders ad and dpt, as training would leave them, of models that know nothing."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("ad", "dpt"):
+        job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
+        config = {**versions(), "method": name, **job.about, "train": dataclasses.asdict(OPTIONS)}
+        open_run(folder / name, config)
+        checkpoints = Checkpoints(folder / name)
+        checkpoints.save(2, drawn(job.method), {"step": np.int32(2)})
+        checkpoints.close()
+    return folder
+
+
+@pytest.mark.parametrize(("name", "label", "acting"), [("ad", "AD+TA", "exact"), ("dpt", "DPT+TA", "cached")])
+def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting):
+    agent = find_agent(str(runs / name), acting)
+    assert agent.name == label
+    (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
+    assert np.shape(result.returns) == (1, 2)
+    run = read_trained(runs / name)
+    assert result.settings["details"] == {"run": run.hash, "step": 2, "context": 30, "acting": acting}
+    with pytest.raises(OptionError, match="holds a result of other settings"):
+        evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
+
+
+def test_drift_is_nothing_before_the_window_is_full_and_something_after(runs, monkeypatch):
+    """With one layer there is none at all: what is kept of a step was computed of that step alone."""
+    kitchen_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), kitchen([WIDE[0].layout]))
+    params, found, protocol = drawn(kitchen_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
+
+    def two_layers(method, params_of_run, context, tasks, asked):
+        assert (context, len(tasks), asked.episodes) == (30, 5, 3)
+        found.extend(measure(kitchen_ad, params, context, WIDE[:1], protocol))
+        return found
+
+    monkeypatch.setattr("baselines.evaluate.drift.measure", two_layers)
+    result = CliRunner().invoke(cli, ["drift", str(runs / "ad")], catch_exceptions=False)
+    assert "AD+TA on demo_wide beside 5 teammates of H4, K = 30" in result.output
+    (episode,) = found
+    assert f"{episode.distance.max():>10.6f}" in result.output
+    assert episode.distance.shape == (1, 60)
+    np.testing.assert_allclose(episode.distance[:, :30], 0, atol=1e-6)
+    assert episode.distance[:, 30:].max() > 1e-5
+
+
+class TestBadRuns:
+    def test_a_layout_that_does_not_fit(self, runs, tmp_path):
+        arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
+        result = CliRunner().invoke(cli, arguments)
+        assert isinstance(result.exception, OptionError)
+        told = "trained on demo_wide with observations (5, 5, 45); coord_simple has (5, 5, 40)"
+        assert told in str(result.exception)
+
+    def test_folders_that_are_no_runs(self, runs, tmp_path):
+        with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle"):
+            find_agent("no/where")
+        with pytest.raises(OptionError, match=r"not a run: expected config\.json with run_format"):
+            find_agent(str(tmp_path))
+
+    def test_another_version_and_another_shape(self, runs, tmp_path):
+        def copy(name: str, **changes) -> str:
+            shutil.copytree(runs / "ad", tmp_path / name)
+            config = json.loads((tmp_path / name / "config.json").read_text())
+            (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
+            return str(tmp_path / name)
+
+        with pytest.raises(OptionError, match=r"run_format 99, expected 1: written by version .*; use that version"):
+            find_agent(copy("newer", run_format=99))
+        wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
+        with pytest.raises(OptionError, match=r"parameters of another model: .* has shape"):
+            find_agent(copy("wider", model=wide))
+        with pytest.raises(OptionError, match="not of a run on learning histories: KeyError"):
+            find_agent(copy("other", model={}, histories={}))
+        shutil.rmtree(Path(copy("early")) / "checkpoints")
+        with pytest.raises(OptionError, match="no checkpoint yet; train on"):
+            find_agent(str(tmp_path / "early"))
+
+
+def test_the_train_command(lite, tmp_path, monkeypatch):
+    """From an address, as from a folder."""
+    monkeypatch.setitem(SIZES, "small", (1, 16, 5))
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    small = ["--steps", "1", "--batch-size", "2", "--context", "4"]
+    with http_server(lite[0]) as server:
+        arguments = ["train", "ad", "--layout", "demo_wide", "--root", server.url, "--out", str(tmp_path / "run")]
+        result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        assert "1 steps in" in result.output
+        again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
+    assert config["histories"]["data_version"] == "0.0.1"
+    assert config["histories"]["root"] == server.url
+    assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")
+    assert "model.teammate_actions: the run has False, asked for True" in str(again.exception)
+    wrong = CliRunner().invoke(cli, [*arguments, "--size", "smal"])
+    assert wrong.exit_code == 2
+    assert "unknown size 'smal'" in wrong.output
+    alone = CliRunner().invoke(cli, [*arguments, *small, "--processes", "2"])
+    assert alone.exit_code == 2
+    assert "expected a --coordinator HOST:PORT as well" in alone.output.replace("\n", " ")

@@ -1,0 +1,411 @@
+"""The models: sizes, what depends on what, the ways to compute the same thing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from baselines.agents.host import Percept
+from baselines.methods import attention
+from baselines.methods.method import Method, ModelOptions
+from baselines.methods.registry import get_method, kitchen
+from baselines.methods.tokens import (
+    Transition,
+    plain_view,
+    state_view,
+    step_of,
+    steps_of,
+    transitions_of,
+    visible_slots,
+)
+from icrl4aht_data import get_layout, load_icrl4aht
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.sampling.ad import ADBatch
+from tests.helpers.flat_world import FLAT, TINY, ad_batch, dpt_batch, drawn
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+STEPS = ("ad", "hybrid_ad", "amago_offline")
+
+
+def sizes(method: Method) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(method.init, jax.random.key(0))))
+
+
+@cache
+def tiny(name: str, **changes: Any) -> tuple[Method, Any]:
+    """A method in the flat world, and parameters, none of them zero."""
+    method = get_method(name)(dataclasses.replace(TINY, **changes), FLAT)
+    return method, drawn(method)
+
+
+def run(method: Method, params: Any, *inputs: Any, **named: Any) -> Any:
+    """The model's output."""
+    return method.model.apply({"params": params}, *inputs, **named)
+
+
+def batch_for(method: Method, **options):
+    return ad_batch(**options) if method.data == "ad" else dpt_batch(**options)
+
+
+class TestSizes:
+    @pytest.mark.parametrize(("name", "parameters"), [("ad", 3_283_870), ("dpt", 3_285_022), ("hybrid_ad", 913_310)])
+    def test_published_parameter_counts(self, name, parameters):
+        world = kitchen([get_layout("coord_simple")])
+        assert sizes(get_method(name)(ModelOptions(), world)) == parameters
+
+    def test_teammate_actions_add_one_table_or_one_hot(self):
+        world = kitchen([get_layout("coord_simple")])
+        option = ModelOptions(teammate_actions=True)
+        assert sizes(get_method("ad")(option, world)) == 3_283_870 + 6 * 64 + 64 * 256
+        assert sizes(get_method("dpt")(option, world)) == 3_285_022 + 6 * 256
+
+    def test_impossible_options(self):
+        with pytest.raises(OptionError, match="width = 30: expected a multiple of twice the heads"):
+            ModelOptions(width=30)
+        with pytest.raises(OptionError, match="dropout = 1"):
+            ModelOptions(dropout=1.0)
+        with pytest.raises(UnknownNameError, match=r"unknown positions 'rop'.*Did you mean 'rope'"):
+            ModelOptions(positions="rop")  # type: ignore[arg-type]
+        with pytest.raises(UnknownNameError, match=r"unknown method 'DTP'; valid: ad, dpt"):
+            get_method("DTP")
+
+
+def reach(f, *inputs) -> list[np.ndarray]:
+    """For each input (T, ..): bool (outputs, T), which outputs (outputs, ..) of f move with which of its rows."""
+    jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
+    return [
+        np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
+        for jacobian, x in zip(jacobians, inputs, strict=True)
+    ]
+
+
+KINDS = [("ad", "none"), ("ad", "rope"), ("hybrid_ad", "none"), ("amago_offline", "none")]
+
+
+@pytest.mark.parametrize(("name", "positions"), KINDS)
+def test_steps_see_all_that_was_and_nothing_to_come(name, positions):
+    method, params = tiny(name, positions=positions)
+    steps = steps_of(ad_batch(rows=1), plain_view)
+
+    def policy(obs, rewards):
+        changed = steps._replace(obs=obs[None], prev_reward=rewards[None])
+        return method.logits(run(method, params, changed).head)[0]
+
+    for found in reach(policy, steps.obs[0], steps.prev_reward[0]):
+        np.testing.assert_array_equal(found, np.tril(np.ones((7, 7), bool)))
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_policies_depend_on_the_actions_before(name):
+    method, params = tiny(name)
+    steps = steps_of(ad_batch(rows=1), plain_view)
+
+    @jax.jit
+    def policy(mine, theirs):
+        changed = steps._replace(prev_action=mine, prev_teammate_action=theirs)
+        return method.logits(run(method, params, changed).head)[0]
+
+    mine, theirs = steps.prev_action, steps.prev_teammate_action
+    other = np.arange(7) == 2
+    for changed in (((mine + other) % 4, theirs), (mine, (theirs + other) % 4)):
+        moved = np.abs(policy(mine, theirs) - policy(*changed)).max(axis=-1)
+        assert (moved[:2] == 0).all()
+        assert (moved[2:] > 1e-6).all()
+
+
+@pytest.mark.parametrize("positions", ["none", "rope"])
+def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positions):
+    method, params = tiny("dpt", positions=positions)
+    batch = dpt_batch(rows=1)
+
+    def answers(obs, rewards, query):
+        changed = batch._replace(context_obs=obs[None], context_rewards=rewards[None], query_obs=query)
+        return run(method, params, *transitions_of(changed, plain_view)).logits[0]
+
+    of_obs, of_rewards, of_query = reach(answers, batch.context_obs[0], batch.context_rewards[0], batch.query_obs)
+    seen = np.tril(np.ones((7, 6), bool), k=-1)  # answer j has seen the first j transitions
+    assert seen[-1].all()
+    np.testing.assert_array_equal(of_obs, seen)
+    np.testing.assert_array_equal(of_rewards, seen)
+    assert of_query.all()
+
+
+def query_mask(context: int) -> np.ndarray:
+    """What each of [c_1 .. c_K, q_0 .. q_K] sees: a transition those up to itself, query j the first j and itself."""
+    to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
+    to_queries = np.concatenate([np.zeros((context, context + 1)), np.eye(context + 1)])
+    return np.concatenate([to_context, to_queries], axis=1).astype(bool)
+
+
+def test_the_query_stands_behind_its_context():
+    assert query_mask(2).astype(int).tolist() == [
+        [1, 0, 0, 0, 0],
+        [1, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0],
+        [1, 0, 0, 1, 0],
+        [1, 1, 0, 0, 1],
+    ]
+
+
+def test_attention_is_that_of_the_mask(monkeypatch):
+    """To the rounding of float32, its gradient too; whole and in parts."""
+    q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
+
+    def of_mask(q, k, v):
+        return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
+
+    def ours(q, k, v):
+        context = attention.causal(q[:, :7], k[:, :7], v[:, :7])
+        queries = attention.asked(q[:, 7:], k[:, 7:], v[:, 7:], k[:, :7], v[:, :7])
+        return jnp.concatenate([context, queries], axis=1)
+
+    def results(attend):
+        return jax.jit(jax.value_and_grad(lambda *qkv: (attend(*qkv) * to).sum(), argnums=(0, 1, 2)))(q, k, v)
+
+    expected = results(of_mask)
+    for rows in (attention.ROWS, 5):
+        monkeypatch.setattr(attention, "ROWS", rows)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(ours), expected)
+
+
+def test_padding_is_not_seen(monkeypatch):
+    q, k, v = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2, 8, 2, 8)), jnp.float32)
+    lengths = jnp.array([3, 8])
+    expected = jax.nn.dot_product_attention(q, k, v, is_causal=True, key_value_seq_lengths=lengths)
+    for rows in (attention.ROWS, 5):
+        monkeypatch.setattr(attention, "ROWS", rows)
+        found = jax.jit(lambda q, k, v: attention.causal(q, k, v, lengths))(q, k, v)
+        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-6)
+
+
+def arrays_in(jaxpr: Any) -> Iterator[Any]:
+    """Everything that a computation makes."""
+    for equation in jaxpr.eqns:
+        yield from (out.aval for out in equation.outvars)
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda leaf: hasattr(leaf, "eqns")):
+            if hasattr(inner, "eqns"):
+                yield from arrays_in(inner)
+
+
+@pytest.mark.parametrize("name", ["ad", "dpt"])
+def test_long_contexts_make_no_square(name):
+    method, params = tiny(name, layers=1)
+    batch = ad_batch(rows=1, length=3072) if name == "ad" else dpt_batch(rows=1, context=3072)
+    made = jax.make_jaxpr(jax.grad(lambda p: method.loss(p, p, batch, jax.random.key(0))[0]))(params)
+    largest = max(array.size for array in arrays_in(made.jaxpr))
+    assert largest < TINY.heads * 3072 * 1024
+
+
+def test_slots_of_a_ring():
+    assert np.flatnonzero(visible_slots(5, jnp.int32(0), 3, jnp.int32(0))).tolist() == []
+    assert np.flatnonzero(visible_slots(5, jnp.int32(4), 3, jnp.int32(3))).tolist() == [0, 1, 2]
+    assert np.flatnonzero(visible_slots(5, jnp.int32(7), 3, jnp.int32(6))).tolist() == [0, 3, 4]  # entries 3, 4, 5
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_padding_has_no_part_in_the_loss(name):
+    method, params = tiny(name, layers=1)
+    batch = ad_batch(rows=3)
+    lengths = np.array([7, 4, 1])
+    mask = np.arange(7) < lengths[:, None]
+    garbage = ad_batch(rows=3, seed=5)
+    other = jax.tree.map(lambda a, b: np.where(mask.reshape(3, 7, *[1] * (a.ndim - 2)), a, b), batch, garbage)
+    batch, other = (b._replace(attention_mask=mask) for b in (batch, other))
+
+    def of(batch):
+        return method.loss(params, params, batch, None)
+
+    loss = jax.jit(of)
+    assert loss(batch)[0] != loss(batch._replace(attention_mask=np.ones_like(mask)))[0]
+    for one, two in zip(*(jax.tree.leaves(loss(b)) for b in (batch, other)), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-6)
+    gradient = jax.jit(jax.grad(lambda obs: of(batch._replace(obs=obs))[0]))(batch.obs)
+    assert not np.abs(gradient)[~mask].any()
+
+
+@pytest.mark.parametrize("name", ["ad", "dpt"])
+def test_bfloat16_computes_nearly_the_same(name):
+    full, params = tiny(name, layers=1)
+    half, batch = tiny(name, layers=1, bfloat16=True)[0], batch_for(full)
+    one, two = (jax.jit(method.loss)(params, params, batch, None)[0] for method in (full, half))
+    assert one != two
+    np.testing.assert_allclose(one, two, rtol=0.03)
+
+
+def test_remat_changes_no_gradient():
+    gradients = []
+    for remat in (False, True):
+        method, params = tiny("ad", layers=1, remat=remat)
+        key = jax.random.key(0)
+        gradients.append(jax.jit(jax.grad(lambda p, m=method: m.loss(p, p, ad_batch(), key)[0]))(params))  # noqa: B023
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *gradients)
+
+
+@pytest.mark.parametrize("name", ["ad", "dpt", "hybrid_ad"])
+def test_dropout_is_a_function_of_its_key(name):
+    method, params = tiny(name, layers=1)
+    batch = batch_for(method)
+    loss = jax.jit(lambda key: method.loss(params, params, batch, key)[0])
+    assert loss(jax.random.key(0)) == loss(jax.random.key(0)) != loss(jax.random.key(1))
+
+
+def test_next_observations_are_of_the_same_episode():
+    method, params = tiny("ad", layers=1)
+    batch = ad_batch()
+    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1]["next_obs_loss"])
+    after_the_end, within = batch.obs.copy(), batch.obs.copy()
+    after_the_end[:, 4] += 100  # follows the done at step 3
+    within[:, 3] += 100
+    masked = batch._replace(dones=np.ones_like(batch.dones))
+    assert loss(masked) == 0
+    last = batch._replace(dones=np.arange(7) != 2)  # only the step before an end counts
+    last = last._replace(dones=np.broadcast_to(last.dones, (2, 7)))
+    assert loss(last) == loss(last._replace(obs=after_the_end)) != loss(last._replace(obs=within))
+
+
+class TestKitchen:
+    """On real batches."""
+
+    def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite):
+        world = kitchen([get_layout("demo_wide")])
+        options = dataclasses.replace(TINY, teammate_actions=False, next_obs=True, layers=1)
+        data = {obs: load_icrl4aht(lite[0], layout="demo_wide", obs=obs) for obs in ("state", "float32")}
+        for name in ("ad", "dpt"):
+            shown = get_method(name)(options, world._replace(view=plain_view))
+            rendered = get_method(name)(options, world)
+            params = drawn(shown)
+            state, obs = (
+                d.ad(batch_size=2, length=6)[3] if name == "ad" else d.dpt(batch_size=2, context=5)[3]
+                for d in data.values()
+            )
+            one = jax.jit(rendered.loss)(params, None, state, None)[0]
+            np.testing.assert_allclose(one, jax.jit(shown.loss)(params, None, obs, None)[0], rtol=1e-6)
+
+    def test_a_batch_of_several_layouts(self, tmp_path):
+        from tests.helpers.random_play import random_release
+
+        random_release(tmp_path / "two", layouts=("asymm_both", "cramped_up"))
+        states, shown = (
+            load_icrl4aht(tmp_path / "two", obs=obs).ad(batch_size=8, length=5) for obs in ("state", "uint8")
+        )
+        batch = states[0]
+        assert len(set(batch.layouts.tolist())) == 2  # type: ignore[union-attr]
+        np.testing.assert_array_equal(
+            state_view(states.layouts)(*map(jnp.asarray, (batch.obs, batch.layouts))), shown[0].obs
+        )
+
+
+def percepts(steps: int, episode: int, seed=0) -> Percept:
+    """What an ego is given over so many steps."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(steps)
+    zero_first = t > 0
+    return Percept(
+        obs=jnp.asarray(rng.normal(size=(steps, 3)), jnp.float32),
+        prev_action=jnp.asarray(rng.integers(0, 4, steps) * zero_first),
+        prev_reward=jnp.asarray(rng.normal(size=steps) * zero_first, jnp.float32),
+        prev_teammate_action=jnp.asarray(rng.integers(0, 4, steps) * zero_first),
+        prev_done=jnp.asarray(zero_first & (t % episode == 0)),
+    )
+
+
+@cache
+def player(name: str, context: int, cached: bool, **changes: Any):
+    method, params = tiny(name, **changes)
+
+    @jax.jit
+    def play(seen: Percept):
+        def step(memory, percept):
+            logits, memory = method.act(params, step_of(percept), percept.prev_done, memory)
+            return memory, logits
+
+        return jax.lax.scan(step, method.start(context, cached), seen)[1]
+
+    return play
+
+
+@pytest.mark.parametrize(("name", "positions"), [*KINDS, ("dpt", "none"), ("dpt", "rope")])
+def test_cached_equals_exact_while_the_window_is_not_full(name, positions):
+    seen = percepts(12, episode=4)
+    exact, cached = (player(name, 12, way, positions=positions)(seen) for way in (False, True))
+    np.testing.assert_allclose(exact, cached, rtol=1e-4, atol=1e-5)
+    assert np.abs(np.diff(exact, axis=0)).min() > 0
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_acting_computes_what_training_computes(name):
+    method, params = tiny(name)
+    seen = percepts(9, episode=4)
+    steps = jax.tree.map(lambda x: x[None], step_of(seen))
+    policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
+    whole = policy(steps)
+    np.testing.assert_allclose(player(name, 12, False)(seen), whole, rtol=1e-4, atol=1e-5)
+    # a full window holds the last K steps, as a window of training data does
+    last = policy(jax.tree.map(lambda x: x[:, -4:], steps))[-1]
+    np.testing.assert_allclose(player(name, 4, False)(seen)[-1], last, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("context", "first"), [(12, 0), (4, 2)])
+def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
+    method, params = tiny("dpt")
+    seen = percepts(11, episode=4)  # two finished episodes, and three steps of the third
+    known = np.array([0, 1, 2, 4, 5, 6])[first:]  # an episode's last step has no successor in it
+    after = jax.tree.map(lambda x: x[known + 1][None], seen)
+    transitions = Transition(
+        seen.obs[known][None], after.prev_action, after.prev_reward, after.obs, after.prev_teammate_action
+    )
+    answer = jax.jit(lambda query: run(method, params, transitions, query).logits[0, -1])
+    expected = [answer(seen.obs[t][None]) for t in (8, 9, 10)]
+    np.testing.assert_allclose(player("dpt", context, False)(seen)[8:], np.stack(expected), rtol=1e-4, atol=1e-5)
+
+
+def test_a_cached_window_forgets_what_is_older_than_it():
+    """What is left of it are the traces in what was computed while it was there."""
+    seen = percepts(12, episode=4)
+    play = player("ad", 4, False)
+    changed = seen._replace(obs=seen.obs.at[0].add(3.0))
+    exact = np.abs(play(seen) - play(changed)).max(axis=-1)
+    assert (exact[:4] > 0).all() and not exact[4:].any()
+    play = player("ad", 4, True)
+    cached = np.abs(play(seen) - play(changed)).max(axis=-1)
+    assert (cached[:4] > 0).all() and cached[-1] < cached[:4].max()
+
+
+def test_amago_prefers_what_is_rewarded():
+    """From random play alone, of which action 2 is rewarded: imitation would stay random."""
+    options = ModelOptions(layers=1, width=16, heads=2, dropout=0.0, discounts=(0.5, 0.8))
+    method = get_method("amago_offline")(options, FLAT)
+    params = slow = drawn(method)
+    optimizer = optax.adam(5e-3)
+
+    def batch(key):
+        actions = jax.random.randint(key, (8, 9), 0, 4)
+        rewards = 20.0 * (actions == 2)
+        none = jnp.zeros((8, 8), jnp.int32)
+        obs, mask = jnp.ones((8, 8, 3)), jnp.ones((8, 8), bool)
+        return ADBatch(obs, actions[:, :-1], rewards[:, :-1], actions[:, 1:], none > 0, mask)  # type: ignore[arg-type]
+
+    @jax.jit
+    def train(params, state):
+        def step(carry, key):
+            params, slow, state = carry
+            gradient = jax.grad(lambda p: method.loss(p, slow, batch(key), None)[0])(params)
+            change, state = optimizer.update(gradient, state)
+            params = optax.apply_updates(params, change)
+            return (params, optax.incremental_update(params, slow, 0.05), state), None
+
+        return jax.lax.scan(step, (params, slow, state), jax.random.split(jax.random.key(3), 200))[0]
+
+    params, slow, _ = train(params, optimizer.init(params))
+    steps = steps_of(batch(jax.random.key(9)), plain_view)
+    policy = jax.nn.softmax(method.logits(run(method, params, steps).head))
+    assert float(policy[..., 2].mean()) > 0.9

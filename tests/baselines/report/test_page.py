@@ -1,0 +1,247 @@
+"""The report's tables beside the paper's numbers, and the page: self-contained, every part there."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.figure import Figure
+
+from baselines.commands.cli import cli
+from baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from baselines.report import episode_gifs as watching
+from baselines.report.episode_gifs import Film, ego_of
+from baselines.report.model_card import write_model_cards
+from baselines.report.page import write_page, write_page_with_films
+from baselines.report.results import TEST_LAYOUTS, Run, Source, merge, read_published
+from baselines.report.tables import AVERAGE, PAPER_TABLES, fill, score, sweep
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
+from icrl4aht_data.benchmark.tasks import make_task, manifest_path, read_tasks, write_tasks
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.plotting import legend_below
+
+GIF = b"GIF89a"  # the page does not look inside
+SETTINGS = {
+    "agent": "AD",
+    "seeds": [0],
+    "protocol": {"name": "seeded", "episodes": 40, "steps": 100},
+    "code_version": "0",
+}
+
+
+def run(agent: str, layouts=("demo_wide",), value=10.0, variant=None, families=HEURISTICS) -> Run:
+    """Every instance earns `value`, and 2 more in the second half."""
+    returns = value + np.repeat([[0.0, 2.0]], 20, axis=1) * np.ones((5, 1))
+    cells = {(layout, family): returns for layout in layouts for family in families}
+    source = Source(f"runs/{agent}", tuple(layouts), SETTINGS, None)
+    return Run(agent, "seeded", cells, variant, sources=(source,))
+
+
+class Outside(HTMLParser):
+    """What a page would fetch or run, and its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found, self.images, self.open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = {name: value or "" for name, value in attrs}
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+        if tag in ("script", "link", "iframe", "object"):
+            self.found.append(tag)
+        if tag == "img":
+            self.images.append(values["src"].split(";")[0])
+            assert values["alt"]
+        self.found += [
+            value for name, value in values.items() if name in ("src", "href") and not value.startswith("data:")
+        ]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_fetches_nothing(tmp_path):
+    sweeps = [run("AD", value=k / 100, variant=("K", k)) for k in (250, 500)]
+    sweeps.append(run("DPT", variant=("size", "small")))
+    (tmp_path / "a.gif").write_bytes(GIF)
+    path = tmp_path / "r" / "report.html"
+    runs = [run("AD", TEST_LAYOUTS), run("random", TEST_LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
+    films = [Film("H1", "H1 & an ego", tmp_path / "a.gif"), Film("rl", "no picture: <its run> is gone", None)]
+    write_page(runs, path, films, ["left out: <nothing>"])
+    text = path.read_text()
+    page = Outside(text)
+    assert page.found == []
+    assert page.open == []
+    assert page.images.count("data:image/gif") == 1
+    assert page.images.count("data:image/png") == 5, "two sweeps, curves of agents and of sweeps, gain"
+    for told in (
+        "Table 5. Offline Meta-RL Comparison",
+        "left out: &lt;nothing&gt;",
+        "H1 &amp; an ego",
+        "<h3>Learned teammates</h3>\n<figure class=film><figcaption>no picture: &lt;its run&gt; is gone",
+        "paper 12.5 ± 11.3",
+    ):
+        assert told in text
+    for part in ("Context length", "Model scale", "Adaptation gain", "Headroom", "Settings and hashes", "runs/AD+TA"):
+        assert part in text
+    assert "url(" not in text
+    assert "@import" not in text
+    with pytest.raises(OptionError, match=r"report\.txt: expected a name that ends in \.html"):
+        write_page(runs, tmp_path / "report.txt")
+    with pytest.raises(OptionError, match="no run to report"):
+        write_page([], path)
+
+
+def test_tables_hold_ours_beside_the_papers():
+    runs = [run("AD", TEST_LAYOUTS), run("oracle", ("demo_wide",), 50.0)]
+    one, two, three, four, five = (fill(table, runs, "seeded") for table in PAPER_TABLES)
+    assert [row.agent for row in one[:4]] == ["AD", "DPT", "random", "oracle"]
+    assert [row.agent for row in two[:4]] == ["AD", "DPT", "random", "AD"], "oracle did not play there"
+    place = PAPER_TABLES[0].columns.index("demo_wide")
+    cell = one[0].scores[place]
+    assert (cell.mean, cell.std, cell.published, cell.headroom) == (11.0, 0.0, (-3.2, 2.6), (1, 1))
+    told = read_headroom("seeded")["demo_wide", "H1"]
+    assert cell.normalised == pytest.approx((11 - told["stay"]) / (told["oracle"] - told["stay"]))
+    assert one[1].scores[place].mean is None
+    assert one[0].scores[0].headroom == (0, 1), "coord_simple with H1 is flat"
+    assert one[0].scores[0].normalised is None
+    assert next(row for row in three if (row.label, row.agent) == (AVERAGE, "DPT+TA")).scores[1].published == (9.4, 5.5)
+    assert four[1].scores[0].published == (-6.5, 3.8)
+    assert [(row.agent, row.scores[1].published) for row in five if row.agent != "random"] == [
+        ("AD", (2.6, 4.1)),
+        ("DPT", (6.9, 8.6)),
+        ("AMAGO-Offline", (3.4, 4.8)),
+    ]
+    assert five[0].scores[0].played == (24, 24)
+
+
+def test_a_part_of_a_place_is_said_to_be_one():
+    partial = score([("demo_wide", family) for family in HEURISTICS], run("AD", families=("H1", "H2")), {})
+    assert partial.played == (2, 4)
+    assert (partial.mean, partial.normalised) == (11.0, None)
+
+
+def test_short_runs_gain_from_half_to_half():
+    assert run("AD").gain(("demo_wide", "H1")) == 2
+    short = dataclasses.replace(run("AD"), cells={("demo_wide", "H1"): np.array([[1.0, 2, 3, 5, 8]])})
+    assert short.gain(("demo_wide", "H1")) == 6.5 - 1.5
+
+
+@pytest.mark.parametrize(
+    "labels", [("a", "b"), ("quite a long label",) * 6, ("no room for more than one of these",) * 3]
+)
+def test_legends_fit_their_figures(labels):
+    figure = Figure(figsize=(3.5, 3), layout="constrained")
+    axes = figure.add_subplot()
+    for number, label in enumerate(labels):
+        axes.plot([0, 1], label=f"{label} {number}")
+    legend_below(figure)
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == len(labels)
+    box = legend.get_window_extent()
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+
+
+def test_sweeps_have_the_papers_points_where_it_states_them():
+    runs = [run("AD", ("test_wide",), variant=("K", k)) for k in (250, 500, 1000)]
+    assert [(p.value, p.mean, p.published) for p in sweep(runs, "K")["test_wide"]["AD"]] == [
+        (250, 11.0, None),
+        (500, 11.0, -7.9),
+        (1000, 11.0, -7.6),
+    ]
+    assert sweep(runs, "size") == {}
+
+
+def test_the_papers_averages_are_those_of_its_cells():
+    """A slip in copying a table would show; all are rounded to a tenth."""
+    for layouts in read_published()["methods"].values():
+        for families in layouts.values():
+            if "H1" in families:
+                mean = np.mean([families[family][0] for family in HEURISTICS])
+                assert abs(mean - families[AVERAGE][0]) < 0.11
+
+
+def test_models_of_different_layouts_are_one_agent():
+    one, two = run("AD", ("demo_wide",)), run("AD", ("coord_simple",))
+    (both,) = merge([one, two])
+    assert next(iter(both.cells)) == ("coord_simple", "H1")
+    assert len(both.cells) == 8
+    assert [source.layouts for source in both.sources] == [("demo_wide",), ("coord_simple",)]
+    assert [found.label for found in merge([one, run("AD", value=3.0)])] == ["AD", "AD [runs/AD]"]
+    assert len(merge([one, run("AD", ("coord_simple",), variant=("K", 250))])) == 2
+
+
+def test_trained_models_have_cards(tmp_path):
+    histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": ["demo_wide"], "data_version": "1.0.0"}
+    config = {"model": {"layers": 4}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+    histories["sizes"] = {"train": 14}
+    trained = run("AD")
+    source = trained.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12"})
+    (path,) = write_model_cards([run("stay"), dataclasses.replace(trained, sources=(source,))], tmp_path)
+    card = path.read_text()
+    assert path.name == "AD-seeded.md"
+    assert "| data | you/icrl4aht, data version 1.0.0 |" in card
+    assert "| 14 of demo_wide; the release's manifest has SHA-256 `ab12` |" in card
+    assert "* layers: 4\n* seed: 3" in card
+    assert "| H4 | 11.0 ± 0.0" in card
+    assert "It is one run, of seed 3" in card
+
+
+def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
+    """Where the family leaves headroom; every agent before any twice, reference egos last."""
+    (tmp_path / "a.gif").write_bytes(GIF)
+    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    monkeypatch.setattr(watching, "ego_of", lambda source: source)
+    tasks = read_tasks(manifest_path("teammate", "test"))
+    played = {(task.layout.name, task.teammate_family): task for task in tasks}
+
+    def with_tasks(agent: str, **options) -> Run:
+        found = run(agent, ("coord_simple", "demo_wide"), families=("H1", "H4"), **options)
+        settings = SETTINGS | {"protocol": dataclasses.asdict(PROTOCOLS["seeded"])}
+        own = {cell: played[cell] for cell in found.cells}
+        return dataclasses.replace(found, sources=(found.sources[0]._replace(settings=settings, tasks=own),))
+
+    runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
+    runs.insert(3, with_tasks("AD", variant=("K", 250)))
+    text = write_page_with_films(runs, tmp_path / "report.html").read_text()
+    found = re.findall(r"<figcaption>([^<]+? beside \S+ on \S+): team return 7 ", text)
+    assert found == [
+        f"{agent} beside {mate} on demo_wide" for mate in ("H1/t4", "H4/t4") for agent in ("AD", "DPT", "AD, K = 250")
+    ]
+    assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
+    assert "An episode per family" not in write_page_with_films(runs, tmp_path / "r.html", films=False).read_text()
+
+
+def test_egos_that_cannot_be_made_again_say_why(tmp_path):
+    source = Source("runs/AD", ("demo_wide",), SETTINGS | {"details": {"step": 3}}, None)
+    with pytest.raises(OptionError, match="AD is neither a reference ego nor of a run folder"):
+        ego_of(source)
+    with pytest.raises(OptionError, match=r"its run folder .*/gone is gone"):
+        ego_of(source._replace(trained={"run": str(tmp_path / "gone")}))
+
+
+def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
+    theta = next(t for t in read_tasks(manifest_path("teammate", "test")) if t.teammate_family == "H4").teammate
+    write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
+    monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 2, 5))
+    played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
+    assert CliRunner().invoke(cli, played, catch_exceptions=False).exit_code == 0
+    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "report.html").read_text()
+    assert Outside(text).images.count("data:image/gif") == 1
+    (task,) = read_tasks(tmp_path / "own.jsonl")
+    assert f"stay beside H4/t77 on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
+    (tmp_path / "run" / "tasks.jsonl").unlink()
+    with pytest.raises(OptionError, match=r"not one of the published test tasks, and tasks\.jsonl beside the results"):
+        CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)

@@ -1,0 +1,268 @@
+"""Experiments as commands: trained, evaluated, reported; what is finished is kept; held-out teammates."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+from click.testing import CliRunner
+
+from baselines import experiments
+from baselines.commands.cli import cli
+from baselines.evaluate.results import read_result
+from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, Plan, held_out_tasks, run_experiment
+from baselines.methods.method import ModelOptions
+from baselines.report.episode_gifs import film_families
+from baselines.report.results import TEST_LAYOUTS, read_run
+from baselines.training.run_folder import Checkpoints
+from generation.learners.checkpoint import WEIGHTS, save_policy
+from generation.learners.network import ActorCritic, Widths
+from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.random_play import random_release
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+MODEL: dict[str, Any] = {"layers": 1, "width": 8, "heads": 2}
+TRAIN: dict[str, Any] = {"steps": 2, "batch_size": 2, "validation_batches": 1}
+SMALL = Plan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, films=False)
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory) -> Path:
+    """Random play long enough for K = 500."""
+    root = tmp_path_factory.mktemp("experiments") / "release"
+    random_release(root, layouts=("demo_wide", "cramped_up"), teammates=1, streams=2, episodes=6, length=100)
+    return root
+
+
+def test_the_settings_are_the_papers():
+    assert [entry.train["context"] for entry in EXPERIMENTS["sweep context"].entries] == [*CONTEXTS]
+    sizes = EXPERIMENTS["sweep size"].entries
+    found = [(e.name, e.model["layers"], e.model["width"], e.train["steps"]) for e in sizes]
+    assert found == [("small", 4, 256, 20_000), ("medium", 8, 512, 50_000), ("large", 12, 768, 100_000)]
+    auxiliary = [
+        (e.model.get("teammate_actions", False), e.model.get("next_obs", False))
+        for e in EXPERIMENTS["ablate ta"].entries
+    ]
+    assert auxiliary == [(False, False), (True, False), (False, True), (True, True)]
+    assert {TESTED_ON[layout] for layout in EXPERIMENTS["tracks"].layouts} == {*TEST_LAYOUTS}
+    assert TESTED_ON["demo_wide"] == "demo_wide"
+    assert (TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]) == ("asymm_right", "cramped_down")
+
+
+def killed(what: str):
+    """A run that dies when this is done."""
+
+    def progress(task: str, done: int, of: int) -> None:
+        if what in task and done == of:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.fixture(scope="module")
+def swept(release, tmp_path_factory) -> tuple[Path, Plan]:
+    """Killed twice, then run to its end."""
+    out = tmp_path_factory.mktemp("swept")
+    plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
+    for what in ("K250 on demo_wide: training", "K250 on demo_wide: evaluation"):
+        with pytest.raises(KeyboardInterrupt):
+            run_experiment("sweep context", plan, out, killed(what))
+    assert Checkpoints(out / "ad-K250" / "demo_wide" / "run").latest == 2
+    done = run_experiment("sweep context", plan, out)
+    assert done.notes[1] == "left out, the release has no training histories of them: test_wide"
+    return out, plan
+
+
+def test_a_sweep_ends_in_a_report(swept):
+    out, _ = swept
+    page = (out / "report" / "report.html").read_text()
+    assert "Context length" in page
+    assert "left out, the release has no training histories of them: test_wide" in page
+    lines = (out / "report" / "report.csv").read_text().splitlines()
+    assert [line.split(",")[-1] for line in lines] == ["variant", "K = 250"]
+    assert lines[1].startswith("AD,seeded,demo_wide,H4,1,2,")
+
+
+def test_what_is_finished_is_not_done_again(swept, monkeypatch):
+    out, plan = swept
+    results = sorted(out.rglob("tasks/*.json"))
+    before = [(path, path.stat().st_mtime_ns) for path in results]
+    assert len(results) == 1
+    steps = []
+    monkeypatch.setattr(experiments, "write_page_with_films", lambda *a, **k: out)
+    run_experiment("sweep context", plan, out, lambda what, done, of: steps.append((what.split(": ")[1], done, of)))
+    assert [(path, path.stat().st_mtime_ns) for path in results] == before
+    assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 0, 1), ("evaluation", 1, 1)]
+    with pytest.raises(OptionError, match=r"train\.seed: the run has 0, asked for 3"):
+        run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
+
+
+@pytest.fixture(scope="module")
+def asked(release, tmp_path_factory) -> Path:
+    """DPT, with all that it can be given."""
+    out = tmp_path_factory.mktemp("asked")
+    plan = dataclasses.replace(
+        SMALL,
+        root=str(release),
+        methods=("dpt",),
+        layouts=("demo_wide",),
+        values=("ta-next_obs",),
+        films=True,
+        tensorboard=True,
+    )
+    run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), out)
+    return out
+
+
+def test_dpt_is_trained_evaluated_and_reported(asked):
+    where = asked / "dpt-ta-next_obs" / "demo_wide"
+    losses = [json.loads(line) for line in (where / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert {"prior_accuracy", "next_obs_loss"} <= losses[-1].keys()
+    assert list((where / "run" / "tensorboard" / "train").iterdir())
+    lines = (asked / "report" / "report.csv").read_text().splitlines()
+    assert [line.split(",")[:6] for line in lines[1:]] == [["DPT+TA+next_obs", "seeded", "demo_wide", "H4", "1", "2"]]
+
+
+def test_the_page_shows_the_reported_agent(asked, tmp_path):
+    where = asked / "dpt-ta-next_obs" / "demo_wide"
+    (result,) = (read_result(path) for path in where.rglob("tasks/*.json"))
+    page = (asked / "report" / "report.html").read_text()
+    told = f"DPT+TA+next_obs beside H4/t0 on demo_wide: team return {result.returns[0][0]:g} in episode 1 of 2. "
+    assert f"{told}Task {result.task_id}, protocol seeded, seed 0." in page
+    assert page.count("data:image/gif") == 1
+
+    other = shutil.copytree(where, tmp_path / "other")
+    about = json.loads((other / "results" / "run.json").read_text())
+    for folder, why in ((tmp_path / "gone", "is gone"), (other / "run", "holds another model than these results")):
+        if folder.exists():
+            config = json.loads((folder / "config.json").read_text())
+            (folder / "config.json").write_text(json.dumps(config | {"package_version": "0.0.0"}))
+        (other / "results" / "run.json").write_text(json.dumps(about | {"run": str(folder)}))
+        (film,) = film_families([read_run(other / "results")], tmp_path)
+        assert film.path is None
+        assert "on demo_wide: no picture, " in film.told
+        assert f"{folder} {why}" in film.told
+
+
+def test_what_cannot_be_trained_on_fails_before_any_work(release, tmp_path):
+    random_release(tmp_path / "plain", layouts=("demo_wide",), teammates=1, streams=2, episodes=6, labels=False)
+    plan = dataclasses.replace(SMALL, root=str(tmp_path / "plain"), methods=("ad", "dpt"))
+    with pytest.raises(LabelsMissingError, match=r"dpt none on demo_wide: DPT needs expert actions.* leave it out, by"):
+        run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), tmp_path / "out")
+    with pytest.raises(OptionError, match=r"ad K1000 on demo_wide: context = 1000: the shortest history of .* has 600"):
+        run_experiment("sweep context", dataclasses.replace(plan, root=str(release)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
+    asked = []
+
+    def note(name, plan, out, progress):
+        asked.append((name, plan, out))
+        return Done([tmp_path / "report.html"], ["left out: nothing"])
+
+    monkeypatch.setattr(experiments, "run_experiment", note)
+    small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-films"]
+    chosen = ["--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]
+    result = CliRunner().invoke(cli, ["ablate", "ta", *chosen, *small], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "left out: nothing" in result.output
+    ((name, plan, out),) = asked
+    assert (name, out) == ("ablate ta", Path("runs/ablate-ta"))
+    options: dict[str, Any] = {
+        "layouts": ("cramped_up",),
+        "values": ("ta",),
+        "train": {"steps": 1, "batch_size": 2},
+        "episodes": 3,
+    }
+    rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
+    assert plan == Plan(**options, **rest)
+    assert CliRunner().invoke(cli, ["tracks", *small], catch_exceptions=False).exit_code == 0
+    assert (asked[1][0], asked[1][2]) == ("tracks", Path("runs/tracks"))
+
+
+# Held-out teammates.
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory) -> Path:
+    """One untrained checkpoint, held out on cramped_up."""
+    root = tmp_path_factory.mktemp("suite")
+    layout = get_layout("cramped_up")
+    network = ActorCritic(Widths((4,), (4,), 8, 8, 8))
+    where = "cramped_up/fcp/m0/c0"
+    save_policy(root / where, network, network.untrained(jax.random.key(0), layout.channels), {"seed": 0})
+    entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
+    entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / WEIGHTS)}
+    (root / "manifests").mkdir()
+    write_tasks(root / "manifests" / "layout_heldout.jsonl", [make_task("layout", "heldout", "cramped_up", entry, 1)])
+    return root
+
+
+def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path, monkeypatch):
+    monkeypatch.setattr(experiments, "ModelOptions", lambda **own: ModelOptions(**(own | MODEL)))
+    arguments = ["heldout-rl", "--suite", str(suite), "--method", "ad", "--layout", "cramped_up"]
+    small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "2"]
+    command = [*arguments, *small, "--root", str(release), "--out", str(tmp_path)]
+    result = CliRunner().invoke(cli, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "AD,seeded,cramped_up,rl,1,2," in (tmp_path / "report" / "report.csv").read_text()
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "cramped_up, learned" in page
+    assert "AD beside rl/t0 on cramped_up: team return" in page
+    assert "| rl |" in (tmp_path / "report" / "report.md").read_text()
+    about = json.loads((tmp_path / "ad-plain" / "cramped_up" / "results" / "run.json").read_text())
+    assert about["config"]["histories"]["layouts"] == ["cramped_up"]
+    assert about["manifest_sha256"] == file_hash(release / "MANIFEST.sha256")
+
+
+def test_suites_without_held_out_teammates(release, suite, tmp_path):
+    with pytest.raises(OptionError, match=r"teammate_heldout\.jsonl: missing: the suite has no held-out teammates"):
+        held_out_tasks(suite, "demo_wide", str(release))
+    (tmp_path / "manifests").mkdir()
+    (tmp_path / "manifests" / "layout_heldout.jsonl").touch()
+    with pytest.raises(OptionError, match="no held-out teammate on cramped_up; train that layout's populations"):
+        held_out_tasks(tmp_path, "cramped_up", str(release))
+    with pytest.raises(OptionError, match="expected a suite, found none; give --suite"):
+        held_out_tasks(None, "cramped_up", str(release))
+
+
+def test_teammates_that_were_trained_with_are_refused(suite, tmp_path):
+    random_release(tmp_path, layouts=("cramped_up",), teammates=1, streams=2, episodes=2)
+    (task,) = read_tasks(suite / "manifests" / "layout_heldout.jsonl")
+    met = make_task("layout", "train", "cramped_up", task.teammate, 0)
+    write_tasks(tmp_path / "meta" / "tasks.jsonl", [met])
+    with pytest.raises(OptionError, match=f"has the teammate of {met.task_id} in .*expected teammates that are not"):
+        held_out_tasks(suite, "cramped_up", str(tmp_path))
+
+
+def test_impossible_plans(release, tmp_path):
+    def fails(error, match, name="ablate ta", **changes):
+        with pytest.raises(error, match=match):
+            run_experiment(name, dataclasses.replace(SMALL, root=str(release), **changes), tmp_path)
+
+    fails(UnknownNameError, "unknown experiment 'sweep contexts'.*Did you mean 'sweep context'", "sweep contexts")
+    fails(UnknownNameError, "unknown setting of ablate ta 'tb'; valid: none, ta, next_obs", values=("tb",))
+    fails(UnknownNameError, "unknown training layout 'asymm_right'", layouts=("asymm_right",))
+    fails(
+        EmptySelectionError,
+        "no training histories on coord_ring; it has cramped_up, demo_wide",
+        layouts=("coord_ring",),
+    )
+    fails(UnknownNameError, "unknown teammate family of these tasks 'rl'; valid: H1, H2, H3, H4", families=("rl",))
+    fails(OptionError, "tasks = 0: expected at least 1", tasks=0)
+    result = CliRunner().invoke(cli, ["sweep", "context", "--context", "9"])
+    assert "`sweep context` varies it; choose by --only" in str(result.exception)
+    assert (
+        "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'"
+        in CliRunner().invoke(cli, ["sweep", "sizes"]).output
+    )

@@ -1,0 +1,281 @@
+"""The trainer: its step, exact resume, many devices, held-out parts, run folders, the commands."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import socket
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
+
+from baselines.methods.registry import get_method
+from baselines.training.histories import HistoryOptions, hold_out, prepare
+from baselines.training.run_folder import Checkpoints
+from baselines.training.trainer import Data, State, Trainer, TrainOptions, train
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import LabelsMissingError, OptionError
+from tests.helpers.flat_world import FLAT, TINY, ad_batch
+from tests.helpers.random_play import random_release
+from tests.helpers.tiny import start
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+OPTIONS = TrainOptions(
+    steps=7, batch_size=4, context=7, log_every=2, validate_every=3, validation_batches=1, save_every=3, warmup=0.3
+)
+MODEL = dataclasses.replace(TINY, layers=1)
+
+
+class Rows:
+    """Batches of the flat world, each a function of its number."""
+
+    def __init__(self, seed: int = 0, die_at: int | None = None) -> None:
+        self.seed, self.die_at = seed, die_at
+
+    def batch(self, i: int, out: Any = None) -> Any:
+        if i == self.die_at:
+            raise KeyboardInterrupt
+        return ad_batch(rows=4, seed=1000 * self.seed + i)
+
+    def empty(self) -> Any:
+        return self.batch(0)
+
+
+def trained(folder: Path, die_at: int | None = None, tensorboard: bool = False) -> State:
+    method = get_method("amago_offline")(MODEL, FLAT)
+    data = Data(Rows(0, die_at), {"held out": Rows(1)})
+    return train(method, data, OPTIONS, folder, {}, tensorboard=tensorboard)
+
+
+@pytest.fixture(scope="module")
+def through(tmp_path_factory) -> tuple[Path, State]:
+    """An uninterrupted run, of the method with most state: slow parameters too."""
+    folder = tmp_path_factory.mktemp("runs") / "through"
+    return folder, trained(folder)
+
+
+def assert_same(one: Any, two: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+
+
+def scalars(folder: Path) -> list[tuple[str, int, str, float]]:
+    """(part, step, name, value) of a run's event files, whose records are length, checksum, event, checksum."""
+    found = []
+    for path in folder.glob("tensorboard/*/*"):
+        content, at = path.read_bytes(), 0
+        while at < len(content):
+            (length,) = struct.unpack_from("<Q", content, at)
+            event = Event.FromString(content[at + 12 : at + 12 + length])
+            found += [(path.parent.name, event.step, value.tag, value.simple_value) for value in event.summary.value]
+            at += length + 16
+    return sorted(found)
+
+
+class TestResume:
+    def test_a_killed_run_goes_on_to_the_same_bits(self, through, tmp_path):
+        with pytest.raises(KeyboardInterrupt):
+            trained(tmp_path, die_at=5, tensorboard=True)  # behind the checkpoint of step 3, and behind a logged line
+        assert Checkpoints(tmp_path).latest == 3
+        with (tmp_path / "metrics.jsonl").open("a") as log:
+            log.write('{"step": 5, "cut o')
+        assert {step for _, step, *_ in scalars(tmp_path)} == {2, 3, 4}
+        state = trained(tmp_path, tensorboard=True)
+        assert_same(state, through[1])
+        assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
+        assert (tmp_path / "config.json").read_bytes() == (through[0] / "config.json").read_bytes()
+        assert scalars(tmp_path) == sorted(
+            (line["part"], line["step"], name, np.float32(value))
+            for line in metrics(tmp_path)
+            for name, value in line.items()
+            if name not in ("part", "step")
+        )
+
+    def test_a_finished_run_is_left_as_it_is(self, through):
+        log = (through[0] / "metrics.jsonl").read_bytes()
+        assert_same(trained(through[0]), through[1])
+        assert (through[0] / "metrics.jsonl").read_bytes() == log
+
+    def test_what_is_written(self, through):
+        folder, state = through
+        lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        assert [(line["step"], line["part"]) for line in lines] == [
+            (2, "train"),
+            (3, "held out"),
+            (4, "train"),
+            (6, "train"),
+            (6, "held out"),
+            (7, "train"),
+            (7, "held out"),
+        ]
+        assert {"loss", "actor_loss", "critic_loss", "next_obs_loss", "gradient_norm", "learning_rate"} <= lines[
+            0
+        ].keys()
+        assert int(state.step) == 7
+        assert (folder / "curves.png").stat().st_size > 5000
+        config = json.loads((folder / "config.json").read_text())
+        assert config["train"]["steps"] == 7
+        assert config["method"] == "amago_offline"
+        assert not list(folder.rglob("*.pkl")) + list(folder.rglob("*.pickle"))
+
+    def test_tensorboard_asked_for_later_has_it_all(self, through):
+        trained(through[0], tensorboard=True)
+        assert {step for _, step, *_ in scalars(through[0])} == {2, 3, 4, 6, 7}
+
+    def test_tensorboard_that_is_not_installed(self, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "tensorboardX", None)
+        with pytest.raises(OptionError, match=r"needs tensorboardX: pip install 'icrl4aht-data\[tensorboard\]'"):
+            trained(tmp_path / "run", tensorboard=True)
+        assert not (tmp_path / "run").exists()
+
+    def test_other_settings_are_refused(self, through):
+        method = get_method("amago_offline")(MODEL, FLAT)
+        other = dataclasses.replace(OPTIONS, seed=3)
+        with pytest.raises(
+            OptionError, match=r"other settings \(train.seed: the run has 0, asked for 3\); give another"
+        ):
+            train(method, Data(Rows(), {}), other, through[0], {})
+
+
+class TestStep:
+    def test_parts_of_a_batch_add_up(self):
+        """The gradient, and so the step, is that of the whole batch; padding is not the same in all parts."""
+        whole, parts = (
+            Trainer(
+                get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT),
+                dataclasses.replace(OPTIONS, accumulate=n),
+            )
+            for n in (1, 2)
+        )
+        batch = Rows().batch(0)
+        batch = batch._replace(attention_mask=np.arange(7) < np.array([7, 2, 5, 7])[:, None])
+        batch = jax.device_put(batch, whole.rows)
+        states = [trainer.init() for trainer in (whole, parts)]
+        results = [trainer.step(state, batch) for trainer, state in zip((whole, parts), states, strict=True)]
+        (_, one), (_, two) = results
+        for name in one:
+            np.testing.assert_allclose(one[name], two[name], rtol=1e-5, err_msg=name)
+
+    def test_the_learning_rate_is_the_papers(self):
+        schedule = TrainOptions(steps=100, warmup=0.05).schedule
+        rates = [np.asarray(schedule(t)) for t in (0, 3, 5, 50, 100)]
+        cosine = 1e-3 * (1 + np.cos(np.pi * (50 - 5) / 95)) / 2
+        np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
+
+    def test_gradients_are_clipped(self):
+        optimizer = dataclasses.replace(OPTIONS, clip=1.0, warmup=0.0).optimizer
+        params = {"w": jnp.zeros(4)}
+        for scale in (1e3, 1e6):
+            _, state = optimizer.update({"w": scale * jnp.ones(4)}, optimizer.init(params), params)
+            mean = np.asarray(jax.tree.leaves(state)[1])
+            np.testing.assert_allclose(np.linalg.norm(mean), 0.1, rtol=1e-5)  # (1 - b1) of norm 1
+
+    def test_batches_that_cannot_be_divided(self):
+        with pytest.raises(OptionError, match="batch_size = 4: expected a multiple of 3, 1 devices x 3 parts"):
+            Trainer(get_method("ad")(MODEL, FLAT), dataclasses.replace(OPTIONS, accumulate=3))
+
+
+class TestHeldOut:
+    def test_no_history_and_no_teammate_is_in_two_parts(self, tmp_path):
+        random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
+        dataset = load_icrl4aht(tmp_path / "r", obs="state")
+        split = hold_out(dataset, 0.25)
+        assert split.teammates is not None
+        parts = (split.train, split.histories, split.teammates)
+        assert [len(part) for part in parts] == [12, 4, 4]
+        assert sorted(np.concatenate([part.ids for part in parts]).tolist()) == list(range(20))
+        tasks = [set(part.column("task_id").tolist()) for part in parts]
+        assert tasks[0] == tasks[1]
+        assert not tasks[0] & tasks[2]
+        again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.25)
+        assert set(again.train.ids) == set(split.train.ids)
+
+    def test_one_teammate_cannot_be_held_out(self):
+        split = hold_out(load_icrl4aht(layout="coord_simple"))
+        assert split.teammates is None
+        assert [len(split.train), len(split.histories)] == [7, 1]
+
+    def test_what_cannot_be_trained_on(self, tmp_path, lite):
+        random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
+        wide = HistoryOptions(("demo_wide",), str(tmp_path / "r"))
+        with pytest.raises(LabelsMissingError, match="DPT needs expert actions"):
+            prepare("dpt", MODEL, OPTIONS, wide)
+        long = dataclasses.replace(OPTIONS, context=121)
+        for name in ("ad", "dpt"):
+            with pytest.raises(
+                OptionError, match=r"context = 121: the shortest history of .* has 120 steps; take fewer"
+            ):
+                prepare(name, MODEL, long, HistoryOptions(("demo_wide",), str(lite[0])))
+        with pytest.raises(OptionError, match="unequal shape"):
+            prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_wide", "coord_simple"), str(lite[0])))
+
+
+DEVICES = """
+import json, os, sys
+import jax
+if len(sys.argv) > 2:
+    jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
+from pathlib import Path
+from baselines.training.histories import HistoryOptions, prepare
+from baselines.methods.method import ModelOptions
+from baselines.training.trainer import TrainOptions, train
+options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
+model = ModelOptions(layers=1, width=8, heads=2)
+root, out = sys.argv[1].split(",")
+job = prepare("ad", model, options, HistoryOptions(("demo_wide",), root))
+state = train(job.method, job.data, options, Path(out), job.about)
+print(json.dumps({"devices": jax.device_count()}))
+"""
+
+
+def metrics(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def on_one_device(lite, tmp_path_factory) -> list[dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("one")
+    return across(lite[0], folder, [{}])
+
+
+def across(root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str) -> list[dict[str, Any]]:
+    """Train in one process per environment; the log."""
+    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+    processes = [
+        start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **quick, **environment)
+        for environment in environments
+    ]
+    outputs = [process.communicate(timeout=240) for process in processes]
+    for process, (out, error) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, error
+        assert json.loads(out.splitlines()[-1])["devices"] == (2 if environments != [{}] else 1)
+    return metrics(folder / "run")
+
+
+def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
+    assert [(line["step"], line["part"]) for line in one] == [(line["step"], line["part"]) for line in two]
+    for a, b in zip(one, two, strict=True):
+        for name in a.keys() - {"part"}:
+            np.testing.assert_allclose(a[name], b[name], rtol=2e-5, atol=1e-7, err_msg=name)
+
+
+def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
+    """Dropout, accumulation and validation among it."""
+    two = across(lite[0], tmp_path, [{"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}])
+    assert_close(two, on_one_device)
+
+
+def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
+    with socket.socket() as held:  # which JAX's coordinator may share, and nothing else takes
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        held.bind(("127.0.0.1", 0))
+        port = held.getsockname()[1]
+        two = across(lite[0], tmp_path, [{"PROCESS": "0"}, {"PROCESS": "1"}], f"127.0.0.1:{port}")
+    assert_close(two, on_one_device)

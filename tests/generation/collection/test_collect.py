@@ -1,0 +1,175 @@
+"""A task's artefact: killed at any moment and resumed, it is that of an uninterrupted run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from generation.collection import task as collect
+from generation.collection import task_folder as artefacts
+from generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, partial_folder
+from generation.learners.state_file import read_card
+from generation.profiles import Profile, load_profile
+from generation.releases.check import compare
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import OptionError
+from tests.helpers.tiny import TINY, artefact, start
+
+COLLECT = """
+import sys, time
+from pathlib import Path
+from generation.collection.task import run_task
+from generation.profiles import Profile, load_profile
+
+def report(update, metrics):
+    print(update, flush=True)
+    time.sleep(0.1)
+
+profile = load_profile(sys.argv[1])
+run_task(*profile.heuristic_tasks(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
+"""
+
+
+@pytest.fixture
+def task(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    return profile.heuristic_tasks()[0], profile
+
+
+def run_task(task: tuple[Task, Profile], *arguments, **options) -> bool:
+    return collect.run_task(task[0], task[1], *arguments, **options)
+
+
+def stop_after(update: int):
+    def report(number, metrics):
+        if number == update:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_killed_at_three_random_moments_the_artefact_is_the_same(built, tmp_path):
+    folder = tmp_path / artefact(built / "a").name
+    command = ["-c", COLLECT, str(built / "tiny.toml"), str(folder), "0.1"]
+    random, firsts, killed = np.random.default_rng(), [], []
+    for _ in range(3):
+        updates, then = int(random.integers(2, 5)), float(random.uniform(0, 0.1))
+        killed.append(f"after {updates} updates and {then:.3f} s")
+        process = start(*command)
+        assert process.stdout is not None
+        printed = [process.stdout.readline() for _ in range(updates)]
+        time.sleep(then)
+        process.kill()
+        _, errors = process.communicate()
+        assert process.returncode == -9, errors
+        assert not folder.exists(), killed
+        firsts.append(int(printed[0]))
+    output, errors = start(*command).communicate()
+    assert folder.exists(), errors
+    firsts.append(int(output.split()[0]))
+    assert firsts[0] == 0
+    assert firsts == sorted(set(firsts)), f"killed {killed}, began at {firsts}"
+    assert not compare(folder, artefact(built / "a")).differences, killed
+    assert not partial_folder(folder).exists()
+
+
+def test_resumed_from_the_last_saved_update(built, task, tmp_path):
+    folder = tmp_path / "task"
+    with pytest.raises(KeyboardInterrupt):
+        run_task(task, folder, stop_after(11), save_seconds=0)
+    seen = []
+    run_task(task, folder, lambda number, metrics: seen.append(number))
+    assert seen == list(range(11, 25))
+    assert not compare(folder, artefact(built / "a")).differences
+
+
+def test_what_came_after_the_last_save_is_done_again(built, task, tmp_path):
+    folder = tmp_path / "task"
+    with pytest.raises(KeyboardInterrupt):
+        run_task(task, folder, stop_after(6), save_seconds=0)
+    partial = partial_folder(folder)
+    assert (read_card(partial / LEARNER) or {})["updates"] == "6"
+    with (partial / METRICS).open("a") as stream:
+        stream.write('{"update": 6, "half a li')
+    rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
+    rewards[:, 180:] = 77  # six updates of 80 steps led to the first 180 that are kept
+    rewards.flush()
+    run_task(task, folder)
+    assert not compare(folder, artefact(built / "a")).differences
+
+
+def test_killed_after_the_last_update(built, task, tmp_path, monkeypatch):
+    folder = tmp_path / "task"
+
+    def kill(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(collect, "finish", kill)
+        with pytest.raises(KeyboardInterrupt):
+            run_task(task, folder)
+    assert run_task(task, folder, kill)
+    assert not compare(folder, artefact(built / "a")).differences
+
+
+def test_killed_before_it_got_its_name(built, task, tmp_path):
+    folder = tmp_path / "task"
+    shutil.copytree(artefact(built / "a"), partial_folder(folder))
+    (partial_folder(folder) / LEARNER).write_bytes(b"no longer needed")
+    assert run_task(task, folder)
+    assert not compare(folder, artefact(built / "a")).differences
+
+
+def test_a_partial_of_other_settings_is_begun_anew(built, task, tmp_path, monkeypatch):
+    folder = tmp_path / "task"
+    with pytest.raises(KeyboardInterrupt):
+        run_task(task, folder, stop_after(3), save_seconds=0)
+    (tmp_path / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 80\nclip = 0.1"))
+    firsts = []
+
+    def writer(partial, task, config, first):
+        firsts.append(first)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(collect, "Writer", writer)
+    for profile in (task[1], load_profile(str(tmp_path / "other.toml"))):
+        with pytest.raises(KeyboardInterrupt):
+            run_task((task[0], profile), folder)
+    assert firsts == [3, 0]
+
+
+def test_a_damaged_state_is_named_not_guessed_at(task, tmp_path):
+    partial = partial_folder(tmp_path / "task")
+    partial.mkdir()
+    (partial / LEARNER).write_bytes(b"junk")
+    with pytest.raises(OptionError, match=r"learner\.safetensors: not a state of this learner: .*begin the task anew"):
+        run_task(task, tmp_path / "task")
+
+
+def test_a_finished_task_is_left_alone(built, task, tmp_path):
+    folder = tmp_path / "task"
+    shutil.copytree(artefact(built / "a"), folder)
+    before = (folder / METADATA).stat().st_mtime_ns
+    assert not run_task(task, folder, stop_after(0))
+    assert (folder / METADATA).stat().st_mtime_ns == before
+
+
+def test_wall_clock_figures_are_apart_from_what_is_hashed(built):
+    folder = artefact(built / "a")
+    metadata = json.loads((folder / METADATA).read_text())
+    assert TIMING not in metadata["files"]
+    for name in (METADATA, METRICS):
+        assert "seconds" not in (folder / name).read_text()
+        assert "steps_per_second" not in (folder / name).read_text()
+    timing = artefacts.last_timing(folder)
+    assert timing is not None
+    assert timing["update"] == 24
+    assert 0 < timing["recording"] < timing["seconds"]
+
+
+def test_no_timing_yet(tmp_path):
+    assert artefacts.last_timing(tmp_path / "task") is None

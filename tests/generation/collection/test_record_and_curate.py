@@ -1,0 +1,222 @@
+"""What a run keeps of its roll-outs, which streams a release takes, and how they are labelled."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.collection import curate, record
+from generation.learners.network import ActorCritic, Widths
+from generation.learners.ppo import PPOConfig, Rollout
+from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import record_size
+from tests.helpers.scenes import random_records
+
+LAYOUT = LAYOUTS["cramped_up"]
+TABLES = 3
+UNTOUCHED = 99  # no action, no reward and no record byte below
+
+
+# Keeping.
+
+
+def make_config(length: int, updates: int) -> PPOConfig:
+    return PPOConfig(total_steps=TABLES * length * updates, environments=TABLES, rollout=length, minibatches=1)
+
+
+def empty_histories(config: PPOConfig) -> record.Histories:
+    shapes = record.shapes(LAYOUT, config)
+    return record.Histories(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
+
+
+def random_rollouts(length: int, updates: int) -> list[Rollout]:
+    rng = np.random.default_rng(length)
+    shape = (length, TABLES)
+
+    def one() -> Rollout:
+        fields: dict[str, Any] = {
+            "record": rng.integers(0, UNTOUCHED, (*shape, record_size(LAYOUT)), np.uint8),
+            "actions": rng.integers(0, 6, (*shape, 2), np.int32),
+            "reward": rng.choice([-25, -20, -5, 0, 20], shape).astype(np.float32),
+        }
+        rest: dict[str, Any] = {name: rng.normal(size=shape) for name in Rollout._fields if name not in fields}
+        return Rollout(**fields, **rest)
+
+    return [one() for _ in range(updates)]
+
+
+def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> record.Histories:
+    """One step of one table at a time: the first 100 of each 400, and the state after them."""
+    kept = empty_histories(config)
+    for update, rollout in enumerate(rollouts):
+        for t in range(config.rollout):
+            episode, clock = divmod(update * config.rollout + t, 400)
+            for n in range(TABLES):
+                if episode >= config.episodes:
+                    continue
+                if clock < 100:
+                    row = episode * 100 + clock
+                    kept.state[n, row] = rollout.record[t, n]
+                    kept.actions[n, row] = rollout.actions[t, n, 0]
+                    kept.teammate_actions[n, row] = rollout.actions[t, n, 1]
+                    kept.rewards[n, row] = rollout.reward[t, n]
+                elif clock == 100:
+                    kept.episode_end_state[n, episode] = rollout.record[t, n]
+    return kept
+
+
+@pytest.mark.parametrize(
+    ("length", "updates"), [(256, 5), (256, 4), (96, 13), (7, 120), (900, 2), (400, 2), (100, 9), (100, 10)]
+)
+def test_keep_equals_a_loop_over_steps(length, updates):
+    config = make_config(length, updates)
+    rollouts = random_rollouts(length, updates)
+    expected = kept_by_loop(rollouts, config)
+    found = empty_histories(config)
+    for number, rollout in enumerate(rollouts):
+        record.keep(found, number, rollout)
+    for name, array in expected._asdict().items():
+        assert array.size and not (array == UNTOUCHED).any(), name  # every place is filled
+        np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
+        assert getattr(found, name).dtype == array.dtype
+
+
+def test_keeping_twice_changes_nothing_and_order_does_not_matter():
+    config = make_config(96, 9)
+    rollouts = random_rollouts(96, 9)
+    once, again = empty_histories(config), empty_histories(config)
+    for number, rollout in enumerate(rollouts):
+        record.keep(once, number, rollout)
+    for number in (4, 8, 4, 1, 0, 2, 3, 5, 6, 7, 1):
+        record.keep(again, number, rollouts[number])
+    for name, array in once._asdict().items():
+        np.testing.assert_array_equal(getattr(again, name), array, err_msg=name)
+
+
+def test_shapes():
+    config = PPOConfig(total_steps=64 * 100 * 25, environments=64, rollout=100, minibatches=1)
+    size = record_size(LAYOUT)
+    assert record.shapes(LAYOUT, config) == {
+        "state": ((64, 600, size), "uint8"),
+        "actions": ((64, 600), "int8"),
+        "teammate_actions": ((64, 600), "int8"),
+        "rewards": ((64, 600), "int8"),
+        "episode_end_state": ((64, 6, size), "uint8"),
+    }
+
+
+# Choosing.
+
+
+def rewards_of(returns: list[list[int]]) -> np.ndarray:
+    """int8 (N, T): rewards, at any steps, that add up to these episode returns."""
+    rng = np.random.default_rng(0)
+    rewards = np.zeros((len(returns), len(returns[0]), 100), np.int8)
+    for n, curve in enumerate(returns):
+        for e, total in enumerate(curve):
+            places = rng.permutation(100)
+            pieces = [5 * int(np.sign(total))] * (abs(total) // 5)
+            rewards[n, e, places[: len(pieces)]] = pieces
+    assert rewards.sum(axis=-1).tolist() == returns
+    return rewards.reshape(len(returns), -1)
+
+
+def score_by_hand(curve: list[int]) -> float:
+    w = max(5, math.floor(0.1 * len(curve)))
+    start, end = sum(curve[:w]) / w, sum(curve[-w:]) / w
+    return end + (end - start)
+
+
+@pytest.mark.parametrize("episodes", [5, 12, 40, 59, 60, 146])
+def test_best_streams_follow_the_formula(episodes):
+    rng = np.random.default_rng(episodes)
+    returns = (rng.integers(-20, 80, (30, episodes)) * 5).tolist()  # also above an int8
+    scores = [score_by_hand(curve) for curve in returns]
+    assert len(set(scores)) > 20
+    expected = sorted(range(30), key=lambda n: -scores[n])
+    rewards = rewards_of(returns)
+    assert curate.best_streams(rewards, 30).tolist() == expected
+    assert curate.best_streams(rewards, 7).tolist() == expected[:7]
+
+
+def test_best_streams_by_hand():
+    """w = 5 of 12 episodes: the middle two count nothing, and improvement counts as much as the end."""
+    flat = [60] * 12  # 60 + 0
+    risen = [0] * 5 + [0, 0] + [40] * 5  # 40 + 40
+    fallen = [100] * 5 + [0, 0] + [70] * 5  # 70 - 30
+    busy = [0] * 5 + [200, 200] + [10] * 5  # 10 + 10
+    late = [0] * 7 + [0, 0, 0, 0, 175]  # 35 + 35
+    assert [score_by_hand(curve) for curve in (flat, risen, fallen, busy, late)] == [60, 80, 40, 20, 70]
+    assert curate.best_streams(rewards_of([flat, risen, fallen, busy, late]), 4).tolist() == [1, 4, 0, 2]
+
+
+def test_equal_streams_come_in_the_order_of_their_numbers():
+    low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # 0, 40, 40
+    rewards = rewards_of([low, high, low, also_high, high, low])
+    assert curate.best_streams(rewards, 6).tolist() == [1, 3, 4, 0, 2, 5]
+    assert curate.best_streams(rewards, 2).tolist() == [1, 3]
+    many = np.repeat(rewards_of([low, high]), 100, axis=0)
+    assert curate.best_streams(many, 200).tolist() == [*range(100, 200), *range(100)]
+
+
+# Labelling.
+
+
+@pytest.fixture(scope="module")
+def labelled():
+    """Two streams of two episodes; the labels, and every step's logits under three ways to carry the memory."""
+    widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
+    network = ActorCritic(widths)
+    rng = np.random.default_rng(3)
+    states = random_records(LAYOUT, 400, rng).reshape(2, 200, -1)
+    obs = observe(LAYOUT, states, EGO)
+    hidden = network.initial_hidden(2)
+    tree = jax.eval_shape(network.init, jax.random.key(0), hidden, obs[None, :, 0], np.zeros((1, 2), bool))
+
+    def random(weight) -> np.ndarray:  # actions as different as the states
+        if len(weight.shape) == 1:
+            return np.zeros(weight.shape, np.float32)
+        return (rng.normal(size=weight.shape) * 2 / np.prod(weight.shape[:-1]) ** 0.5).astype(np.float32)
+
+    params = jax.tree.map(random, tree)
+    params["params"]["encoder"]["LayerNorm_0"]["scale"] += 1
+    step = jax.jit(network.apply, compiler_options={"xla_backend_optimization_level": 0})
+
+    def logits_with_memory_from(starts) -> np.ndarray:
+        hidden, rows = network.initial_hidden(2), []
+        for t in range(200):
+            if t in starts:
+                hidden = jnp.zeros_like(hidden)
+            out: Any = step(params, hidden, obs[None, :, t], jnp.zeros((1, 2), bool))
+            hidden = out[0]
+            rows.append(np.asarray(out[1][0]))
+        return np.stack(rows, axis=1)
+
+    labels = list(curate.relabel(LAYOUT, network, params, states))
+    ways = {"episode": {0, 100}, "step": set(range(200)), "never": {0}}
+    return labels, {name: logits_with_memory_from(starts) for name, starts in ways.items()}
+
+
+def test_labels_equal_the_network_stepped_through_each_episode(labelled):
+    labels, logits = labelled
+    assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * 2
+    chosen = np.take_along_axis(logits["episode"], np.stack(labels)[..., None].astype(int), axis=-1)[..., 0]
+    # Two sums in another order: an action that is best up to rounding is a right label.
+    np.testing.assert_allclose(chosen, logits["episode"].max(axis=-1), rtol=0, atol=1e-4)
+    assert len(np.unique(labels)) > 2
+
+
+def test_labels_need_the_memory_and_its_restart(labelled):
+    """The data would show it if the memory were dropped at every step, or carried into the next episode."""
+    labels, logits = labelled
+    without, across = (logits[way].argmax(axis=-1) for way in ("step", "never"))
+    assert (np.stack(labels) != without).mean() > 0.1
+    assert (np.stack(labels)[:, 100:] != across[:, 100:]).any()
+    np.testing.assert_array_equal(across[:, :100], logits["episode"][:, :100].argmax(axis=-1))

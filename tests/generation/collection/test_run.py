@@ -1,0 +1,224 @@
+"""All tasks of a rebuild: failures, retries, two collectors at once, Ray."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import shutil
+import sys
+import time
+from io import StringIO
+from pathlib import Path
+
+import psutil
+import pytest
+from filelock import FileLock
+from rich.console import Console
+
+from generation.cli import main
+from generation.collection import run
+from generation.collection.job import CollectionError
+from generation.collection.options import Options
+from generation.collection.run import collect_tasks
+from generation.collection.task import TaskBusyError
+from generation.collection.task_folder import LEARNER, lock_file, partial_folder
+from generation.profiles import load_profile
+from generation.progress import Board
+from generation.releases import build
+from generation.releases.check import compare
+from icrl4aht_data import verify_release
+from tests.helpers.tiny import artefact, start
+
+
+@pytest.fixture
+def tasks(built):
+    profile = load_profile(str(built / "pair.toml"))
+    return profile.heuristic_tasks(), profile
+
+
+def failures(out: Path) -> list[dict]:
+    path = out / "failed.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def collect(tasks, out: Path, **options) -> str:
+    """What the collection printed."""
+    output = StringIO()
+    collect_tasks(tasks[0], tasks[1], out, Console(file=output, width=200), Options(**options))
+    return output.getvalue()
+
+
+def failing(monkeypatch, *errors: Exception | None) -> list[int]:
+    """Replace the runner by one whose n-th call raises the n-th error; returns the seeds it was called with."""
+    calls: list[int] = []
+
+    def run_task(task, profile, folder, report, *, suite, wait):
+        calls.append(task.seed)
+        error = errors[len(calls) - 1] if len(calls) <= len(errors) else None
+        if error is not None:
+            raise error
+        return True
+
+    monkeypatch.setattr(run, "run_task", run_task)
+    return calls
+
+
+def test_a_task_that_raises_is_reported_and_the_others_are_done(tasks, tmp_path, monkeypatch):
+    calls = failing(monkeypatch, ZeroDivisionError("no steps"))
+    with pytest.raises(CollectionError, match=r"1 of 2 tasks have no artefact: .*_s0_.*failed\.jsonl says why"):
+        collect(tasks, tmp_path)
+    assert calls == [0, 1]
+    (line,) = failures(tmp_path)
+    assert (line["task_id"], line["attempts"]) == (tasks[0][0].task_id, 1)
+    assert line["error"] == "ZeroDivisionError: no steps"
+    assert "Traceback" in line["traceback"]
+    assert "finished" in collect(tasks, tmp_path)
+    assert not (tmp_path / "failed.jsonl").exists()
+
+
+def test_retries(tasks, tmp_path, monkeypatch):
+    calls = failing(monkeypatch, OSError("once"), OSError("twice"))
+    collect(tasks, tmp_path, retries=2)
+    assert calls == [0, 0, 0, 1]
+    calls = failing(monkeypatch, *[OSError("always")] * 3)
+    with pytest.raises(CollectionError):
+        collect(tasks, tmp_path, retries=2)
+    assert calls == [0, 0, 0, 1]
+    assert [line["attempts"] for line in failures(tmp_path)] == [3]
+
+
+def test_fail_fast(tasks, tmp_path, monkeypatch):
+    calls = failing(monkeypatch, OSError("first"))
+    with pytest.raises(CollectionError, match=r"failed\.jsonl: the first failure: OSError: first"):
+        collect(tasks, tmp_path, fail_fast=True)
+    assert calls == [0]
+    assert len(failures(tmp_path)) == 1
+
+
+def test_an_interrupt_is_no_failure(tasks, tmp_path, monkeypatch):
+    failing(monkeypatch, KeyboardInterrupt())  # type: ignore[arg-type]
+    with pytest.raises(KeyboardInterrupt):
+        collect(tasks, tmp_path, retries=3)
+    assert not failures(tmp_path)
+
+
+def test_a_task_that_another_collector_is_at_comes_last(tasks, tmp_path, monkeypatch):
+    calls = failing(monkeypatch, TaskBusyError("busy"))
+    assert "another collector is at it" in collect(tasks, tmp_path)
+    assert calls == [0, 1, 0]
+
+
+def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
+    """The other one finishes its task; it is not done again."""
+    task, profile = tasks[0][0], tasks[1]
+    folder = tmp_path / "artefacts" / task.task_id
+    folder.parent.mkdir()
+    with FileLock(lock_file(folder)):
+        assert run.Job(profile, folder.parent, None, wait=False)(task) == "busy"
+        shutil.copytree(pair / "artefacts" / task.task_id, folder)
+    before = (folder / "metadata.json").stat().st_mtime_ns
+    assert run.Job(profile, folder.parent, None, wait=True)(task) == "done"
+    assert (folder / "metadata.json").stat().st_mtime_ns == before
+
+
+def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(built, pair, tmp_path, monkeypatch, capsys):
+    shutil.copytree(pair / "artefacts", tmp_path / "artefacts")
+    second = artefact(tmp_path, 1)
+    partial = partial_folder(second)
+    second.rename(partial)
+    (partial / "metadata.json").unlink()
+    (partial / LEARNER).write_bytes(b"junk")
+    monkeypatch.setattr(
+        sys, "argv", ["generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
+    )
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    captured = capsys.readouterr()
+    assert "1 of 2 tasks have no artefact" in captured.err
+    assert "finished before" in captured.out
+    assert not (tmp_path / "lite").exists()
+
+
+def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
+    command = ["-m", "generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
+    processes = [start(*command) for _ in range(2)]
+    outputs = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], outputs
+    for folder in (artefact(tmp_path, 0), artefact(tmp_path, 1)):
+        updates = [json.loads(line)["update"] for line in (folder / "timing.jsonl").read_text().splitlines()]
+        assert updates == list(range(25))
+    assert not compare(tmp_path, pair).differences
+
+
+def listening(process: psutil.Process) -> set[str]:
+    """The addresses that a process and its children listen on."""
+    found = set()
+    for child in [process, *process.children(recursive=True)]:
+        try:
+            found |= {c.laddr.ip for c in child.net_connections("inet") if c.status == psutil.CONN_LISTEN}
+        except (psutil.NoSuchProcess, psutil.AccessDenied):
+            continue
+    return found
+
+
+def test_ray_with_two_workers(built, pair, tmp_path):
+    """A damaged task fails and the other is finished; then both, bit-equal to the collection in one process; all that
+    time, nothing listens beyond the loopback."""
+    broken = partial_folder(tmp_path / "artefacts" / artefact(pair, 1).name)
+    broken.mkdir(parents=True)
+    (broken / LEARNER).write_bytes(b"junk")
+    command = ["-m", "generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
+    command += ["--executor", "ray", "--workers", "2", "--retries", "1"]
+    addresses: set[str] = set()
+    process = start(*command)
+    while process.poll() is None:
+        addresses |= listening(psutil.Process(process.pid))
+        time.sleep(0.2)
+    output, errors = process.communicate()
+    assert process.returncode == 1, output + errors
+    assert "1 of 2 tasks have no artefact" in errors
+    (line,) = failures(tmp_path)
+    assert line["attempts"] == 2
+    assert line["error"].startswith("OptionError: ")
+    assert "in load_state" in line["traceback"] or "in read_card" in line["traceback"]
+    assert "\x1b" not in line["traceback"]
+    assert artefact(tmp_path).name == artefact(pair).name
+    shutil.rmtree(broken)
+    output, errors = (process := start(*command)).communicate()
+    assert process.returncode == 0, output + errors
+    assert not compare(tmp_path, pair).differences
+    assert verify_release(tmp_path / "lite").ok
+    assert addresses
+    assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
+
+
+def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
+    from icrl4aht_data.errors import OptionError
+
+    with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 has its own"):
+        collect(tasks, tmp_path, executor="ray", address="there:6379", workers=2)
+
+
+def test_the_board_counts_tasks_speed_and_time_left():
+    output = StringIO()
+    console = Console(file=output, force_terminal=True, width=160)
+    with Board(console, tasks=2, updates=10) as board:
+        board.running("one", 5, 1_000.0)
+        board.running("two", 2, 500.0)
+        board.ended("one")
+    text = output.getvalue()
+    assert "1/2 tasks, 500 steps/s" in text
+    assert "12/20" in text
+
+
+def test_statistics_are_printed_and_kept(built):
+    output = StringIO()
+    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output, width=100))
+    for row in ("Original transitions", "4,000", "Filtered transitions", "1,500", "(5, 5, 45)", "Disk size"):
+        assert row in output.getvalue()
+    info = json.loads((built / "a" / "lite" / "meta" / "info.json").read_text())
+    statistics = info["statistics"]["demo_wide"]
+    assert statistics["original_transitions"] == 8 * 500
+    assert statistics["filtered_transitions"] == 3 * 500
+    assert (statistics["history_length"], statistics["teammates"]) == ([500, 500], 1)
+    assert statistics["disk_bytes"] == sum(p.stat().st_size for p in (built / "a" / "lite" / "data").rglob("*.h5"))

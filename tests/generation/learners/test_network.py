@@ -1,0 +1,203 @@
+"""The network equals a plain Flax form of the same parameters, and its memory restarts where it is told to."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.learners.network import ActorCritic, Widths
+from tests.helpers.jit import compiled
+
+STEPS, TABLES, CHANNELS = 4, 3, 40
+
+TOLERANCE = 1e-5
+"""Relative to the largest value. Both forms add up the same float32 products in another order, at most some 1,000 in a
+sum, so a layer is off by a few epsilons (1.2e-7), and eleven layers and four steps carry that on: 1.3e-6 was the worst
+seen. A wrong tap, gate or bias is off by the size of the values themselves."""
+
+
+class PlainActorCritic(nn.Module):
+    """The network of the paper (App. B.1 and C.2.1) from Flax's own layers; a loop over time."""
+
+    widths: Widths
+
+    @nn.compact
+    def __call__(self, hidden, obs, reset):
+        widths = self.widths
+        x = obs.astype(jnp.float32)
+        for i, width in enumerate(widths.pointwise):
+            x = nn.relu(nn.Conv(width, (1, 1), name=f"pointwise_{i}")(x))
+        for i, width in enumerate(widths.spatial):
+            x = nn.relu(nn.Conv(width, (3, 3), padding="SAME", name=f"spatial_{i}")(x))
+        x = nn.relu(nn.Dense(widths.dense, name="dense")(x.reshape(*x.shape[:2], -1)))
+        x = nn.LayerNorm(name="norm")(x)
+        cell, states = nn.GRUCell(widths.gru, name="gru"), []
+        for t in range(obs.shape[0]):
+            hidden, state = cell(hidden * ~reset[t][:, None], x[t])
+            states.append(state)
+        x = jnp.stack(states)
+        logits = nn.Dense(6, name="actor")(nn.relu(nn.Dense(widths.head, name="actor_hidden")(x)))
+        value = nn.Dense(1, name="critic")(nn.relu(nn.Dense(widths.head, name="critic_hidden")(x)))
+        return hidden, logits, value[..., 0]
+
+
+def plain_names(params: Any, widths: Widths) -> dict[str, Any]:
+    """The parameters, or their gradients, under the names of the plain form."""
+    tree = jax.tree.map(np.asarray, params["params"])
+    encoder, gru = tree["encoder"], tree["gru"]
+    plain: dict[str, Any] = {name: tree[name] for name in ("actor_hidden", "actor", "critic_hidden", "critic")}
+    for i in range(len(widths.pointwise)):
+        layer = encoder[f"Dense_{i}"]
+        plain[f"pointwise_{i}"] = layer | {"kernel": layer["kernel"][None, None]}
+    for i in range(len(widths.spatial)):
+        plain[f"spatial_{i}"] = encoder[f"Conv3x3_{i}"]
+    plain["dense"] = encoder[f"Dense_{len(widths.pointwise)}"]
+    plain["norm"] = encoder["LayerNorm_0"]
+    kernels = np.split(gru["input"]["kernel"], 3, axis=1)
+    biases = np.split(gru["input"]["bias"], 3)
+    recurrent = np.split(gru["recurrent"], 3, axis=1)
+    plain["gru"] = {
+        **{f"i{gate}": {"kernel": kernels[k], "bias": biases[k]} for k, gate in enumerate("rzn")},
+        **{f"h{gate}": {"kernel": recurrent[k]} for k, gate in enumerate("rzn")},
+    }
+    plain["gru"]["hn"]["bias"] = gru["candidate_bias"]
+    return {"params": plain}
+
+
+class Case(NamedTuple):
+    network: ActorCritic
+    params: Any
+    hidden: jax.Array
+    obs: jax.Array
+    reset: jax.Array
+
+
+def make_case(widths: Widths) -> Case:
+    """Random parameters, none of them zero, and a sequence with three resets."""
+    network = ActorCritic(widths)
+    rng = np.random.default_rng(1)
+    shape = (STEPS, TABLES, 5, 5, CHANNELS)
+    obs = jnp.asarray(rng.integers(0, 20, shape, np.uint8) * (rng.random(shape) < 0.15))
+    hidden = jnp.asarray(rng.normal(size=(TABLES, widths.gru)), jnp.float32)
+    reset = np.zeros((STEPS, TABLES), bool)
+    reset[0, 0] = reset[2, 1] = reset[3, 1] = True
+
+    def random(weight) -> jax.Array:
+        fan_in = np.prod(weight.shape[:-1]) if len(weight.shape) > 1 else 16
+        return jnp.asarray(rng.normal(size=weight.shape) * (2 / fan_in) ** 0.5, jnp.float32)
+
+    params = jax.tree.map(random, jax.eval_shape(network.init, jax.random.key(0), hidden, obs, reset))
+    return Case(network, params, hidden, obs, jnp.asarray(reset))
+
+
+@pytest.fixture(scope="module")
+def paper() -> Case:
+    return make_case(Widths())
+
+
+@pytest.fixture(scope="module")
+def small() -> Case:
+    """Other numbers of layers, and widths that are not all alike."""
+    return make_case(Widths(pointwise=(6,), spatial=(3, 5), dense=11, gru=7, head=9))
+
+
+@pytest.fixture(scope="module")
+def apply(small):
+    return compiled(small.network.apply)
+
+
+def assert_close(found: Any, expected: Any, what: str = "") -> None:
+    """Nowhere further off than `TOLERANCE` times the largest value."""
+    size = np.abs(np.asarray(expected)).max()
+    assert size > 0, what
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * size, err_msg=what)
+
+
+def test_number_of_parameters(paper):
+    assert sum(w.size for w in jax.tree.leaves(paper.params)) == 273_375
+
+
+@pytest.mark.parametrize("which", ["paper", "small"])
+def test_outputs_and_gradients_equal_the_plain_form(which, request):
+    case: Case = request.getfixturevalue(which)
+    plain = PlainActorCritic(case.network.widths)
+    names = plain_names(case.params, case.network.widths)
+    weights = jax.random.normal(jax.random.key(4), (STEPS, TABLES, 7))
+
+    def both(network):
+        """Outputs, and the gradients of a sum that weighs every output."""
+
+        def total(params, hidden):
+            outputs = network.apply(params, hidden, case.obs, case.reset)
+            last, logits, values = outputs
+            return jnp.sum(weights[..., :6] * logits) + jnp.sum(weights[..., 6] * values) + jnp.sum(last), outputs
+
+        return compiled(jax.grad(total, argnums=(0, 1), has_aux=True))
+
+    (gradient, to_hidden), outputs = both(case.network)(case.params, case.hidden)
+    (plain_gradient, plain_to_hidden), plain_outputs = both(plain)(names, case.hidden)
+    for found, expected in zip(outputs, plain_outputs, strict=True):
+        assert found.shape == expected.shape
+        assert_close(found, expected)
+    found = plain_names(gradient, case.network.widths)
+    assert jax.tree.structure(found) == jax.tree.structure(plain_gradient)
+    for (path, expected), leaf in zip(jax.tree.leaves_with_path(plain_gradient), jax.tree.leaves(found), strict=True):
+        assert_close(leaf, expected, jax.tree_util.keystr(path))
+    assert_close(to_hidden, plain_to_hidden)
+
+
+def test_a_sequence_with_a_reset_equals_two_sequences(small, apply):
+    cut = 2
+    none = jnp.zeros_like(small.reset)
+    hidden, logits, values = apply(small.params, small.hidden, small.obs, none.at[cut].set(True))
+    _, first_logits, first_values = apply(small.params, small.hidden, small.obs[:cut], none[:cut])
+    zero = small.network.initial_hidden(TABLES)
+    last, second_logits, second_values = apply(small.params, zero, small.obs[cut:], none[cut:])
+    np.testing.assert_allclose(logits, np.concatenate([first_logits, second_logits]), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(values, np.concatenate([first_values, second_values]), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(hidden, last, rtol=0, atol=1e-6)
+
+
+def test_resets_one_table_at_one_step_and_nothing_else(small, apply):
+    none = jnp.zeros_like(small.reset)
+    _, carried, _ = apply(small.params, small.hidden, small.obs, none)
+    _, cut, _ = apply(small.params, small.hidden, small.obs, none.at[2, 1].set(True))
+    changed = np.abs(np.asarray(cut - carried)).max(axis=-1) > 1e-4
+    expected = np.zeros((STEPS, TABLES), bool)
+    expected[2:, 1] = True
+    np.testing.assert_array_equal(changed, expected)
+
+
+def test_a_reset_at_the_first_step_drops_the_given_hidden_state(small, apply):
+    at_start = jnp.zeros_like(small.reset).at[0].set(True)
+    given = apply(small.params, small.hidden, small.obs, at_start)
+    zero = apply(small.params, small.network.initial_hidden(TABLES), small.obs, jnp.zeros_like(small.reset))
+    for found, expected in zip(given, zero, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_initial_weights(small):
+    """Orthogonal, of the published code's scales; every bias zero."""
+    init = compiled(small.network.init)
+    params = init(jax.random.key(0), small.hidden, small.obs, small.reset)
+    tree = plain_names(params, small.network.widths)["params"]
+    scales = {"pointwise_0": 2**0.5, "spatial_0": 2**0.5, "spatial_1": 2**0.5}
+    scales |= {"actor_hidden": 2.0, "actor": 0.01, "critic_hidden": 2.0, "critic": 1.0}
+    for name, scale in scales.items():
+        kernel = np.asarray(tree[name]["kernel"])
+        values = np.linalg.svd(kernel.reshape(-1, kernel.shape[-1]), compute_uv=False)
+        np.testing.assert_allclose(values, scale, rtol=1e-4, err_msg=name)
+        np.testing.assert_array_equal(tree[name]["bias"], 0, err_msg=name)
+
+
+def test_widths_from_a_table():
+    table = {"pointwise": [4], "spatial": [5, 6], "dense": 7, "gru": 8, "head": 9}
+    assert Widths.from_table(table) == Widths((4,), (5, 6), 7, 8, 9)
+    assert Widths.from_table({"gru": 8}) == Widths(gru=8)
+    with pytest.raises(TypeError, match="grus"):
+        Widths.from_table({"grus": 8})

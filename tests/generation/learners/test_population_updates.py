@@ -1,0 +1,302 @@
+"""One update of a whole population: what it learns from negative weights, what it changes, what it carries on."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.learners.population.comedi import CoMeDi
+from generation.learners.population.lbrdiv import LBRDiv, Multipliers
+from generation.learners.population.population import Algorithm, Population, PopulationState
+from generation.learners.ppo import Batch, Sequences, sequences
+from generation.learners.rollout import Rollout, Seats, roll_out
+from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.observe import observe
+from tests.helpers.jit import compiled, same_bytes
+from tests.helpers.populations import CONFIG, EPISODE, LAYOUT, plain_adapt, population
+
+# Negative weights.
+
+
+class Parts(NamedTuple):
+    """Two policies with their parts of one roll-out, leaves (2, ...)."""
+
+    params: Any
+    optimizer: Any
+    played: Sequences
+
+
+REWARDED = 2
+
+
+@pytest.fixture(scope="module")
+def parts(lbrdiv) -> Parts:
+    """Made-up sequences in which one action brings a reward at once; the second policy's weights are -1."""
+    before, rng = lbrdiv.before, np.random.default_rng(2)
+    steps, places = EPISODE, 16
+    action = rng.integers(0, 6, (2, steps, places))
+    record = np.asarray(before.seats.env.record)[rng.integers(0, 32, (2, steps, places))]
+    zeros = np.zeros((2, steps, places), np.float32)
+    arrays: dict[str, Any] = {
+        "record": record,
+        "reset": np.broadcast_to(np.arange(steps)[:, None] == 0, zeros.shape),
+        "action": action,
+        "log_prob": zeros - np.log(6, dtype=np.float32),
+        "value": zeros,
+        "reward": (action == REWARDED).astype(np.float32),
+        "done": zeros > -1,
+        "hidden": np.zeros((2, 1, places, 8), np.float32),
+        "partner": np.zeros((2, 1, places), np.int32),
+        "weight": np.array([1, -1], np.float32)[:, None, None] * np.ones((2, 1, places), np.float32),
+        "last_value": zeros[:, :1],
+    }
+    optimizer = jax.tree.map(
+        lambda x: jnp.full_like(x, 20) if jnp.issubdtype(x.dtype, jnp.integer) else x, before.optimizer
+    )  # past the warm-up
+    params, optimizer = (jax.tree.map(lambda leaf: leaf[:2], tree) for tree in (before.params, optimizer))
+    return Parts(params, optimizer, Sequences(**{name: jnp.asarray(array) for name, array in arrays.items()}))
+
+
+def part(tree: Any, number: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[number], tree)
+
+
+@pytest.fixture(scope="module")
+def surrogate(lbrdiv):
+    """The policy loss's gradient, and the other losses."""
+
+    def policy_loss(params, batch):
+        losses = dict(lbrdiv.population.ppo.loss(params, batch)[1])
+        return losses.pop("policy_loss"), losses
+
+    return compiled(jax.grad(policy_loss, has_aux=True))
+
+
+def test_the_surrogate_of_weight_minus_1_is_that_of_negated_advantages(surrogate, parts):
+    params, played = part(parts.params, 0), part(parts.played, 0)
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, params)  # ratios are clipped
+    advantage, target = jnp.asarray(rng.normal(size=(2, *played.done.shape)), jnp.float32)
+    down, others = surrogate(params, Batch(played._replace(weight=-played.weight), advantage, target))
+    negated, same_others = surrogate(params, Batch(played, -advantage, target))
+    up, _ = surrogate(params, Batch(played, advantage, target))
+    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(down)) > 1e-2
+    for a, b in zip(jax.tree.leaves(down), jax.tree.leaves(negated), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
+    assert same_bytes(others, same_others)
+    assert set(others) == {"value_loss", "entropy"}
+    assert not same_bytes(down, up)
+
+
+def test_weights_scale_the_surrogate_place_by_place(surrogate, parts):
+    """At unchanged parameters the surrogate is linear in the weights."""
+    params, played = part(parts.params, 0), part(parts.played, 0)
+    rng = np.random.default_rng(5)
+    advantage = jnp.asarray(rng.normal(size=played.done.shape), jnp.float32)
+    weights = jnp.asarray(rng.normal(size=(2, *played.weight.shape)), jnp.float32)
+
+    def gradient(weight):
+        return surrogate(params, Batch(played._replace(weight=weight), advantage, advantage))[0]
+
+    both = jax.tree.map(jnp.add, gradient(weights[0]), gradient(weights[1]))
+    for a, b in zip(jax.tree.leaves(gradient(weights.sum(axis=0))), jax.tree.leaves(both), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def learn(lbrdiv):
+    """Of one policy."""
+    return compiled(lbrdiv.population.ppo.learn)
+
+
+@pytest.fixture(scope="module")
+def learned(lbrdiv, parts) -> tuple[Any, Any, dict[str, Any]]:
+    """Both parts at once."""
+    return compiled(jax.vmap(lbrdiv.population.ppo.learn))(*parts, jax.random.split(jax.random.key(8), 2))
+
+
+def test_policies_that_learn_at_once_learn_as_each_alone(learn, parts, learned):
+    keys = jax.random.split(jax.random.key(8), 2)
+    for number in range(2):
+        expected = learn(*part(parts, number), keys[number])
+        for a, b in zip(jax.tree.leaves(part(learned, number)), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5)
+        assert not same_bytes(expected[0], part(parts.params, number))
+
+
+def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
+    """Of the two policies the first plays the rewarded action more often than before, the second less often."""
+    obs = observe(LAYOUT, np.asarray(parts.played.record[0, 0]), EGO)[None]
+
+    def probability(params):
+        hidden, reset = jnp.zeros((obs.shape[1], 8)), jnp.ones(obs.shape[:2], bool)
+        outputs: Any = lbrdiv.population.network.apply(params, hidden, obs, reset)
+        return jax.nn.softmax(outputs[1])[..., REWARDED].mean()
+
+    probability = compiled(jax.vmap(probability))
+    change = np.asarray(probability(learned[0]) - probability(parts.params))
+    assert change[0] > 0.005
+    assert change[1] < -0.005
+
+
+# A whole update.
+
+
+class Updated(NamedTuple):
+    population: Population
+    update: Any
+    before: PopulationState
+    after: PopulationState
+    metrics: dict[str, float]
+    seats: Seats  # of the roll-out made anew
+    rollout: Rollout
+
+
+def updated(algorithm: Algorithm) -> Updated:
+    """The second update, in which the warm-up of the learning rate is over; its roll-out once more by itself."""
+    whole = population(algorithm)
+    update = compiled(whole.update)
+    before, _ = update(compiled(whole.init)(jax.random.key(5)))
+    after, metrics = update(before)
+
+    def again(state):
+        rolling = jax.random.split(jax.random.fold_in(state.key, state.update), 3)[0]
+        players, restart = whole._players(state.params), whole._restart(state.visited)
+        return roll_out(whole.env, players, state.seats, EPISODE, rolling, restart)
+
+    seats, rollout = compiled(again)(before)
+    return Updated(whole, update, before, after, {n: float(v) for n, v in metrics.items()}, seats, rollout)
+
+
+@pytest.fixture(scope="module")
+def comedi() -> Updated:
+    return updated(CoMeDi())
+
+
+@pytest.fixture(scope="module")
+def lbrdiv() -> Updated:
+    return updated(LBRDiv(2))
+
+
+@pytest.fixture(params=["comedi", "lbrdiv"])
+def either(request) -> Updated:
+    return request.getfixturevalue(request.param)
+
+
+def test_an_update_is_a_pure_function_of_the_state(either):
+    assert same_bytes(either.update(either.before)[0], either.after)
+    other = either.update(either.before._replace(key=jax.random.key(77)))[0]
+    assert not same_bytes(other.params, either.after.params)
+    later = either.update(either.before._replace(update=jnp.int32(5)))[0]
+    assert not same_bytes(later.params, either.after.params)
+
+
+def test_the_state_moves_on(either):
+    assert int(either.after.update) == 2
+    assert same_bytes(either.after.key, either.before.key)
+    np.testing.assert_array_equal(either.after.seats.env.record, either.seats.env.record)
+    np.testing.assert_array_equal(either.after.seats.env.episode, 2)
+
+
+def test_all_learning_policies_change_and_no_other(either):
+    learning = either.population.seating.learning
+    for number in range(either.population.seating.policies):
+        same = same_bytes(part(either.before.params, number), part(either.after.params, number))
+        assert same == (number >= learning)
+
+
+def test_untrained_policies_differ(either):
+    flat = [np.concatenate([w[n].ravel() for w in jax.tree.leaves(either.before.params)]) for n in range(2)]
+    assert np.abs(flat[0] - flat[1]).max() > 0.1
+
+
+def test_metrics_tell_self_play_from_cross_play(either):
+    seating, done = either.population.seating, np.asarray(either.rollout.done)
+    returns = np.asarray(either.rollout.returns)
+    fresh, kin = seating.starts_from < 0, seating.policy[0] % 2 == seating.policy[1] % 2
+    assert done[-1].all()
+    assert either.metrics["episodes"] == seating.tables
+    np.testing.assert_allclose(either.metrics["self_play"], returns[-1][kin & fresh].mean(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(either.metrics["cross_play"], returns[-1][~kin].mean(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(either.metrics["shaping"], 1 - 96 / CONFIG.shaping_horizon, rtol=1e-6)
+
+
+def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(lbrdiv, learn):
+    """Policy by policy, each from its own places of the roll-out."""
+    whole, before = lbrdiv.population, lbrdiv.before
+    seating = whole.seating
+    key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]
+    keys = jax.random.split(jax.random.fold_in(key, 0), 4)
+    weight = np.asarray(whole._place_weights(before.memory))
+    (group,) = whole.groups
+
+    def sequences_of_all(state, seats, rollout):
+        last = whole._players(state.params)[0].act(seats.memories[0], seats.env, key)[0].value
+        shaping = CONFIG.shaping(state.update)
+        return sequences(rollout, 0, group.places.ravel(), state.seats.memories[0], last, shaping)
+
+    everyone = jax.tree.map(np.asarray, compiled(sequences_of_all)(before, lbrdiv.seats, lbrdiv.rollout))
+    for number in range(4):
+        places = seating.places(number)[0]
+        chosen = np.array([group.places.ravel().tolist().index(place) for place in places])
+        played = jax.tree.map(lambda leaf, chosen=chosen: leaf[:, chosen], everyone)._replace(
+            weight=jnp.asarray(weight[places])[None],
+            partner=jnp.asarray(seating.policy[1 - places[0] // seating.tables, places % seating.tables])[None],
+        )
+        expected = learn(part(before.params, number), part(before.optimizer, number), played, keys[number])[0]
+        for a, b in zip(jax.tree.leaves(part(lbrdiv.after.params, number)), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5)
+
+
+def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
+    whole, before = lbrdiv.population, lbrdiv.before
+    lowered = np.asarray(whole._place_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
+    assert 0 < lowered.sum() < lowered.size
+    shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
+
+    @compiled
+    def learned(shaped):
+        rollout = lbrdiv.rollout._replace(shaped=shaped)
+        return whole._learn(before, whole._players(before.params), lbrdiv.seats, rollout, jax.random.key(1))[0]
+
+    params = learned(shaped)
+    assert same_bytes(params, learned(np.where(lowered, 0.0, shaped)))
+    assert not same_bytes(params, learned(np.where(lowered, shaped, 0.0)))
+
+
+def test_the_multipliers_follow_the_returns_of_the_tables(lbrdiv):
+    seating, returns = lbrdiv.population.seating, np.asarray(lbrdiv.rollout.returns)[-1]
+    table = np.full((4, 4), np.nan)
+    seen = np.zeros((4, 4), bool)
+    for left, right in product((2, 3), (0, 1)):
+        table[left, right] = returns[(seating.policy[0] == left) & (seating.policy[1] == right)].mean()
+        seen[left, right] = True
+    expected = plain_adapt(lbrdiv.before.memory, table, seen, 0.1, 0.01)
+    for name, one, other in zip(Multipliers._fields, lbrdiv.after.memory, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi):
+    """A quarter of the tables starts from states that the third quarter went through in the roll-out before."""
+    source = comedi.population.seating.starts_from
+    started = np.asarray(comedi.after.seats.env.record)
+    visited = np.asarray(comedi.before.visited)
+    moved = source >= 0
+    assert moved.sum() == 4
+    np.testing.assert_array_equal(started[moved], visited[source[moved]])
+    env = comedi.after.seats.env
+    fresh = np.asarray(compiled(comedi.population.env.first_record)(env.key, env.episode))
+    np.testing.assert_array_equal(started[~moved], fresh[~moved])
+    assert (started[moved] != fresh[moved]).any(axis=1).all()
+
+
+def test_a_visited_state_is_one_of_the_tables_own_last_roll_out(comedi):
+    record, visited = np.asarray(comedi.rollout.record), np.asarray(comedi.after.visited)
+    steps = [(record[:, table] == visited[table]).all(axis=1).nonzero()[0].tolist() for table in range(len(visited))]
+    assert all(steps)
+    assert len({own[0] for own in steps if len(own) == 1}) > 2, "the step is drawn"

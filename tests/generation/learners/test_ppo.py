@@ -1,0 +1,487 @@
+"""The one PPO: advantages, replay of the recurrent state, purity, schedules, and that it learns.
+
+One tiny learner for all tests. Its ego stands in a closet between two buttons, a pile and a pot, so pressing (-5) and
+placing (+3 shaped) happen often; of every three roll-outs of 8 steps, an episode of 12 ends inside the second and one
+with the third.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.env import Environment
+from generation.learners.ego import Learner, LearnerState
+from generation.learners.network import Widths
+from generation.learners.ppo import PPO, Batch, PPOConfig, Sequences, generalised_advantage, sequences
+from generation.learners.rollout import Choice, Rollout, policy_player, roll_out
+from generation.policy import Policy
+from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+from tests.helpers.jit import compiled, same_bytes
+
+CLOSET = Layout("closet", "test_closet", ("WLWW01BW", "LA0WA  W", "WPWWPXWW"))
+EPISODE = 12
+
+CONFIG = PPOConfig(
+    total_steps=4800,
+    environments=4,
+    rollout=8,
+    minibatches=2,
+    learning_rate=0.01,
+    shaping_horizon=960,
+    widths=Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8),
+)
+
+UpdateFunction = Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str, jax.Array]]]
+
+
+PARAMS = {"turn": np.uint32(0)}
+"""Of the stand-in teammate: how far it turns from where it would go."""
+
+
+class Diary(NamedTuple):
+    """What the stand-in teammate remembers."""
+
+    offset: jax.Array  # from the episode's key
+    steps: jax.Array  # it has acted in the episode
+
+
+def begin(params, key) -> Diary:
+    return Diary(jax.random.key_data(key)[1] % 4, jnp.uint32(0))
+
+
+def acts(params, memory: Diary, view, key):
+    """A step in a direction that tells its memory and what it sees."""
+    action = (memory.offset + memory.steps + view.sum(dtype=jnp.uint32) + params["turn"]) % 4
+    return action.astype(jnp.int32), memory._replace(steps=memory.steps + 1)
+
+
+@pytest.fixture(scope="module")
+def learner() -> Learner:
+    return Learner(Environment(CLOSET, max_steps=EPISODE), Policy(PARAMS, begin, acts, "observation"), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def update(learner) -> UpdateFunction:
+    return compiled(learner.update)
+
+
+@pytest.fixture(scope="module")
+def untrained(learner) -> LearnerState:
+    return compiled(learner.init)(jax.random.key(3))
+
+
+@pytest.fixture(scope="module")
+def frozen(untrained) -> LearnerState:
+    """A state at the end of the learning-rate schedule, where nothing is learned any more; its logits and values are
+    wide apart and depend on the hidden state."""
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, untrained.params)
+    steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
+    return untrained._replace(params=params, optimizer=counted(untrained.optimizer, steps))
+
+
+@pytest.fixture(scope="module")
+def learning(frozen) -> LearnerState:
+    """The same in the middle of the schedule."""
+    steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
+    return frozen._replace(optimizer=counted(frozen.optimizer, steps // 2))
+
+
+def counted(optimizer: Any, steps: int) -> Any:
+    """The optimizer's state, its counters set."""
+    return jax.tree.map(lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, optimizer)
+
+
+class Played(NamedTuple):
+    before: list[LearnerState]
+    rollouts: list[Rollout]  # NumPy
+    metrics: list[dict[str, float]]
+    after: LearnerState
+
+
+def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
+    before, rollouts, metrics = [], [], []
+    for _ in range(updates):
+        before.append(state)
+        state, rollout, values = update(state)
+        rollouts.append(jax.tree.map(np.asarray, rollout))
+        metrics.append({name: float(value) for name, value in values.items()})
+    return Played(before, rollouts, metrics, state)
+
+
+@pytest.fixture(scope="module")
+def played(update, frozen) -> Played:
+    """40 roll-outs of one policy."""
+    return play(update, frozen, 40)
+
+
+@pytest.fixture(scope="module")
+def trained(update, untrained) -> Played:
+    return play(update, untrained, CONFIG.updates)
+
+
+def joined(rollouts: list[Rollout]) -> Rollout:
+    """Successive roll-outs as one."""
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *rollouts)
+
+
+def egos(rollout: Rollout) -> Choice:
+    """What the ego chose."""
+    return rollout.choices[EGO]
+
+
+def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
+    """What the roll-out from this state is to the ego's learning."""
+    places, hidden = np.arange(CONFIG.environments), state.seats.memories[EGO]
+    return sequences(rollout, EGO, places, hidden, jnp.zeros(places.size), jnp.float32(0))
+
+
+# Advantages.
+
+
+def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -> np.ndarray:
+    """GAE by a loop over tables and steps."""
+    out = np.zeros(reward.shape)
+    for n in range(reward.shape[1]):
+        trace, following = 0.0, last_value[n]
+        for t in reversed(range(reward.shape[0])):
+            if done[t, n]:
+                trace, following = 0.0, 0.0
+            trace = reward[t, n] + gamma * following - value[t, n] + gamma * lam * trace
+            following = value[t, n]
+            out[t, n] = trace
+    return out
+
+
+@pytest.mark.parametrize(("gamma", "lam"), [(0.99, 0.95), (0.9, 0.0), (0.5, 1.0)])
+def test_generalised_advantage(gamma, lam):
+    rng = np.random.default_rng(2)
+    reward, value = rng.normal(size=(2, 20, 6)).astype(np.float32)
+    done = rng.random((20, 6)) < 0.15
+    done[-1, 0], done[0, 1], done[:, 2] = True, True, False
+    done[-1, 1] = False
+    last = rng.normal(size=6).astype(np.float32)
+    config = replace(CONFIG, discount=gamma, gae_lambda=lam)
+    compute = jax.jit(generalised_advantage, static_argnums=4)
+    found = compute(reward, value, done, last, config)
+    np.testing.assert_allclose(found, plain_advantage(reward, value, done, last, gamma, lam), rtol=0, atol=1e-5)
+
+
+# Replay.
+
+
+def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log-probabilities and values as the loss has them, read from its derivatives.
+
+    At unchanged parameters the ratio is the derivative of the policy loss by the old log-probability, over the
+    advantage; the value is the target less the derivative of the value loss by the target.
+    """
+    rng = np.random.default_rng(9)
+    advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
+    normalised = (advantage - advantage.mean()) / advantage.std()
+    own = egos_sequences(state, rollout)._replace(reset=jnp.asarray(reset))
+
+    def losses(log_prob, target):
+        batch = Batch(own._replace(log_prob=log_prob), jnp.asarray(advantage), target)
+        return learner.ppo.loss(state.params, jax.tree.map(jnp.asarray, batch))[1]
+
+    by_log_prob = compiled(jax.grad(lambda p, t: losses(p, t)["policy_loss"]))
+    by_target = compiled(jax.grad(lambda t, p: losses(p, t)["value_loss"]))
+    log_prob = egos(rollout).log_prob
+    ratio = np.asarray(by_log_prob(log_prob, target)) * target.size / normalised
+    value = target - np.asarray(by_target(target, log_prob)) * target.size
+    return np.log(np.maximum(ratio, 1e-6)) + log_prob, value
+
+
+def test_the_loss_replays_the_rollout_across_an_episode_end(learner, played):
+    """The second roll-out: it starts within an episode, with a hidden state, and the next episode starts at step 4."""
+    state, rollout = played.before[1], played.rollouts[1]
+    np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)
+    np.testing.assert_array_equal(rollout.done.nonzero()[0], [3] * 4)
+    assert np.abs(state.seats.memories[EGO]).min() > 0
+    log_prob, value = replay(learner, state, rollout, rollout.reset)
+    np.testing.assert_allclose(log_prob, egos(rollout).log_prob, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(value, egos(rollout).value, rtol=0, atol=1e-4)
+    # The same from dones that are not shifted: wrong from the step of the end on.
+    _, value = replay(learner, state, rollout, rollout.done)
+    wrong = np.abs(value - egos(rollout).value).max(axis=1)
+    assert wrong[:3].max() < 1e-4 < 1e-2 < wrong[3:].min()
+
+
+def test_loss_against_plain_numpy(learner, played):
+    """At moved parameters, where ratios and value changes are clipped, from hand-written formulas."""
+    rollout = played.rollouts[1]
+    rng = np.random.default_rng(6)
+    params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)
+    hidden = played.before[1].seats.memories[EGO]
+    advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
+    batch = jax.tree.map(jnp.asarray, Batch(egos_sequences(played.before[1], rollout), advantage, target))
+    total, parts = compiled(learner.ppo.loss)(params, batch)
+
+    obs = observe(CLOSET, rollout.record, EGO)
+    output: Any = compiled(learner.network.apply)(params, hidden, obs, rollout.reset)
+    logits, value = np.asarray(output[1], np.float64), np.asarray(output[2], np.float64)
+    log_probs = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
+    chosen = np.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
+    ratio = np.exp(chosen - egos(rollout).log_prob)
+    change = value - egos(rollout).value
+    assert (np.abs(ratio - 1) > CONFIG.clip).any() and (np.abs(change) > CONFIG.clip).any()
+    normalised = (advantage - advantage.mean()) / advantage.std()
+    policy = -np.minimum(ratio * normalised, np.clip(ratio, 0.8, 1.2) * normalised).mean()
+    near = egos(rollout).value + np.clip(change, -0.2, 0.2)
+    value_loss = 0.5 * np.maximum((value - target) ** 2, (near - target) ** 2).mean()
+    entropy = -(np.exp(log_probs) * log_probs).sum(axis=-1).mean()
+    expected = {"policy_loss": policy, "value_loss": value_loss, "entropy": entropy}
+    assert set(parts) == set(expected)
+    for name, loss in expected.items():
+        np.testing.assert_allclose(parts[name], loss, rtol=1e-4, atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(total, policy + 0.5 * value_loss - 0.01 * entropy, rtol=1e-4, atol=1e-5)
+
+
+def test_update_reports_the_loss_of_the_shaped_advantages(learner, played):
+    """While nothing is learned, every minibatch sees ratio 1, and the value error is the advantage."""
+    shaped = 0
+    for number, (rollout, metrics) in enumerate(zip(played.rollouts, played.metrics, strict=True)):
+        assert abs(metrics["policy_loss"]) < 1e-5
+        if number + 1 < len(played.rollouts):
+            weight = max(0.0, 1 - number * 32 / 960)
+            following = egos(played.rollouts[number + 1]).value[0]  # of the same policy
+            reward = rollout.reward + weight * rollout.shaped[..., EGO]
+            advantage = plain_advantage(reward, egos(rollout).value, rollout.done, following, 0.99, 0.95)
+            np.testing.assert_allclose(metrics["value_loss"], 0.5 * (advantage**2).mean(), rtol=1e-4)
+            shaped += 0 < weight < 1 and rollout.shaped[..., EGO].any()
+    assert shaped, "no shaped reward while its weight was between 0 and 1"
+
+
+# Purity.
+
+
+def test_update_is_a_pure_function(update, played):
+    state = played.before[3]
+    once, again = update(state), update(state)
+    assert same_bytes(once, again)
+    other_state, other_rollout, _ = update(state._replace(key=jax.random.key(77)))
+    assert not np.array_equal(other_rollout.actions[..., EGO], once[1].actions[..., EGO])
+    assert not same_bytes(other_state.seats.memories[EGO], once[0].seats.memories[EGO])
+
+
+def test_learning_is_a_pure_function_too(update, learning, trained):
+    once = update(learning)[0]
+    assert same_bytes(once, update(learning)[0])
+    assert not same_bytes(once.params, learning.params)
+    assert not same_bytes(once.params, update(learning._replace(key=jax.random.key(5)))[0].params)
+    assert same_bytes(update(trained.before[60])[0], trained.before[61])
+
+
+def test_each_update_draws_anew(update, frozen):
+    actions = [update(frozen._replace(update=jnp.int32(n)))[1].actions[..., EGO] for n in (0, 1)]
+    assert not np.array_equal(actions[0], actions[1])
+
+
+def test_minibatches_are_shuffled_by_the_key(update, learning):
+    """An ego that always stays plays the same under every key, and still learns in another order."""
+    actor = learning.params["params"]["actor"]
+    bias = jnp.zeros_like(actor["bias"]).at[STAY].set(1e3)
+    params = {"params": learning.params["params"] | {"actor": {"kernel": actor["kernel"], "bias": bias}}}
+    one, other = (update(learning._replace(params=params, key=jax.random.key(k))) for k in (5, 6))
+    assert same_bytes(one[1], other[1])
+    assert not same_bytes(one[0].params, other[0].params)
+
+
+def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
+    """Of four sequences for three minibatches; which one, the key says."""
+    ppo = PPO(CLOSET, learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
+    learn = compiled(ppo.learn)
+    given = egos_sequences(played.before[1], played.rollouts[1])
+
+    def learned_from(sequence: int, seed: int) -> bool:
+        spoilt = given._replace(reward=given.reward.at[:, sequence].set(np.nan))
+        params, _, _ = learn(learning.params, learning.optimizer, spoilt, jax.random.key(seed))
+        return any(np.isnan(leaf).any() for leaf in jax.tree.leaves(params))
+
+    left_out = [[n for n in range(4) if not learned_from(n, seed)] for seed in range(6)]
+    assert all(len(sequences) == 1 for sequences in left_out)
+    assert len({sequence for (sequence,) in left_out}) > 1
+
+
+# Episodes.
+
+
+def test_resets_follow_ends(played):
+    whole = joined(played.rollouts)
+    step = np.arange(len(whole.done))[:, None]
+    np.testing.assert_array_equal(whole.done, np.broadcast_to(step % EPISODE == EPISODE - 1, whole.done.shape))
+    np.testing.assert_array_equal(whole.reset, np.broadcast_to(step % EPISODE == 0, whole.done.shape))
+
+
+def test_metrics_hold_the_sum_of_rewards_of_ended_episodes(played):
+    whole = joined(played.rollouts)
+    episodes = len(whole.reward) // EPISODE
+    sums = whole.reward[: episodes * EPISODE].reshape(episodes, EPISODE, -1).sum(axis=1)
+    assert len(np.unique(sums)) > 2
+    np.testing.assert_array_equal(whole.returns[EPISODE - 1 :: EPISODE], sums)
+    for number, metrics in enumerate(played.metrics):
+        ended = [e for e in range(episodes) if number * 8 <= (e + 1) * EPISODE - 1 < number * 8 + 8]
+        assert metrics["episodes"] == 4 * len(ended)
+        assert metrics["return"] == (sums[ended].mean() if ended else 0)
+        np.testing.assert_allclose(metrics["reward_per_step"], played.rollouts[number].reward.mean(), rtol=1e-6)
+        shaped = played.rollouts[number].shaped[..., EGO].mean()
+        np.testing.assert_allclose(metrics["shaped_per_step"], shaped, rtol=1e-6)
+
+
+def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
+    """The stand-in teammate only walks, so every shaped reward is the ego's; all are placements."""
+    whole = joined(played.rollouts)
+    assert whole.shaped.shape == (*whole.done.shape, 2)
+    assert set(np.unique(whole.shaped[..., EGO])) == {0, 3}
+    acted = whole.actions[..., EGO] == INTERACT
+    assert acted[whole.shaped[..., EGO] > 0].all()
+    assert (whole.actions[..., TEAMMATE] != INTERACT).all()
+    assert not whole.shaped[..., TEAMMATE].any()
+
+
+def expected_teammate_actions(learner: Learner, state: LearnerState, whole: Rollout) -> np.ndarray:
+    step = np.arange(len(whole.done))
+    seen = np.asarray(observe(CLOSET, whole.record, TEAMMATE)).sum(axis=(2, 3, 4))
+    out = np.zeros_like(seen)
+    for episode in np.unique(step // EPISODE):
+        keys = learner.env.episode_key(state.seats.env._replace(episode=jnp.full(4, episode)))
+        own = jax.vmap(jax.random.fold_in)(keys, jnp.full(4, TEAMMATE))
+        rows = step // EPISODE == episode
+        offset = np.asarray(jax.random.key_data(own))[:, 1] % 4
+        out[rows] = (offset + (step[rows] % EPISODE)[:, None] + seen[rows]) % 4
+    return out
+
+
+def test_the_teammates_memory_restarts_with_each_episode(learner, frozen, played):
+    whole = joined(played.rollouts[:9])  # 72 steps, six episodes
+    expected = expected_teammate_actions(learner, frozen, whole)
+    np.testing.assert_array_equal(whole.actions[..., TEAMMATE], expected)
+
+
+def test_a_teammate_that_sees_the_state_is_given_the_record(learner, played):
+    def reads(params, memory, view, key):
+        return view.sum(dtype=jnp.int32) % 4, memory
+
+    state, rollout = played.before[2], played.rollouts[2]
+    mate = policy_player(learner.env, Policy({}, begin, reads, "state"), {}, TEAMMATE, CONFIG.environments)
+    players = learner.players(state.params, {})[EGO], mate
+    turn = compiled(lambda seats, key: roll_out(learner.env, players, seats, 1, key))
+    _, turned = turn(state.seats, jax.random.key(0))
+    np.testing.assert_array_equal(turned.record[0], rollout.record[0])
+    np.testing.assert_array_equal(turned.actions[0, :, TEAMMATE], rollout.record[0].sum(axis=-1, dtype=np.int32) % 4)
+    np.testing.assert_array_equal(turned.actions[0, :, EGO], egos(turned).action[0])
+
+
+def test_the_teammates_parameters_travel_in_the_state(update, frozen, played):
+    """So that one compiled update serves every teammate of a family."""
+    state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
+    first = played.rollouts[0].actions[0, :, TEAMMATE]
+    np.testing.assert_array_equal(rollout.actions[0, :, TEAMMATE], (first + 1) % 4)
+    assert int(state.teammate["turn"]) == 1
+
+
+# Schedules.
+
+
+def test_shaping_weight_goes_linearly_to_zero(played):
+    found = [metrics["shaping"] for metrics in played.metrics]
+    expected = [1 - n / 30 if n < 30 else 0 for n in range(len(found))]  # 32 of 960 steps an update
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_learning_rate_schedule():
+    """Read from the optimizer: under a constant gradient g, Adam moves by rate * g / (g + eps)."""
+    steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
+    warm = steps // 10
+    gradient = jnp.float32(1e-3)
+
+    def one(state, _):
+        change, state = CONFIG.optimizer.update(gradient, state)
+        return state, change
+
+    changes = jax.lax.scan(one, CONFIG.optimizer.init(gradient), length=steps + 1)[1]
+    rates = -np.asarray(changes, np.float64) * (1e-3 + 1e-5) / 1e-3
+    t = np.arange(steps + 1)
+    expected = np.where(t < warm, t / warm, 0.5 * (1 + np.cos(np.pi * (t - warm) / (steps - warm))))
+    assert (expected[0], expected[warm], expected[-1]) == (0, 1, 0)
+    np.testing.assert_allclose(rates / CONFIG.learning_rate, expected, rtol=0, atol=1e-3)
+    assert rates[0] == 0
+    assert rates.argmax() == warm
+    assert rates[-1] == 0
+
+
+def test_gradients_are_clipped_by_their_global_norm():
+    """Adam forgets the scale of its gradients but not their proportions: after one too large the next, at the bound,
+    moves as much as if both had been at the bound."""
+    bound = CONFIG.max_grad_norm
+    directions = {"a": jnp.float32(0.6), "b": jnp.float32(-0.8)}
+
+    def second(first: float) -> list[float]:
+        state = CONFIG.optimizer.init(directions)
+        for size in (first, bound):
+            change, state = CONFIG.optimizer.update(jax.tree.map(lambda x, s=size: x * s, directions), state)
+        return [float(x) for x in jax.tree.leaves(change)]
+
+    np.testing.assert_allclose(second(100.0), second(bound), rtol=1e-5)
+    assert abs(second(0.1 * bound)[0] / second(bound)[0] - 1) > 0.05
+
+
+def test_nothing_is_learned_at_the_end_of_the_schedule(update, frozen, learning, played):
+    assert same_bytes(played.after.params, frozen.params)
+    assert not same_bytes(update(learning)[0].params, frozen.params)
+
+
+# Configuration.
+
+
+def test_derived_numbers():
+    config = PPOConfig(total_steps=10_000, environments=8, rollout=100, minibatches=4)
+    assert (config.steps_per_update, config.updates, config.episodes) == (800, 12, 3)
+
+
+@pytest.mark.parametrize("steps", [1, 100, 101, 400, 500, 501, 899, 901, 58_368])
+def test_episodes_are_those_with_a_hundred_steps_and_the_state_after_them(steps):
+    """The records of `steps` steps hold what is kept of an episode if they reach its step 100."""
+    complete = sum(start + 100 < steps for start in range(0, steps, 400))
+    assert PPOConfig(total_steps=steps, environments=1, rollout=1, minibatches=1).episodes == complete
+
+
+def test_minibatches_must_divide_the_environments():
+    with pytest.raises(ValueError, match=r"environments = 10: not a multiple of minibatches = 4"):
+        PPOConfig(environments=10, minibatches=4)
+
+
+def test_defaults_are_the_papers_ego_table():
+    config = PPOConfig()
+    assert (config.total_steps, config.environments, config.rollout) == (60_000_000, 1024, 256)
+    assert (config.epochs, config.minibatches, config.learning_rate, config.warmup) == (4, 64, 2.5e-4, 0.1)
+    assert (config.discount, config.gae_lambda, config.clip, config.max_grad_norm) == (0.99, 0.95, 0.2, 0.25)
+    assert (config.entropy, config.value, config.shaping_horizon) == (0.01, 0.5, 60_000_000)
+    assert config.widths == Widths((128, 128, 8), (16, 32, 32), 128, 128, 128)
+
+
+# Learning.
+
+
+def test_the_ego_learns_not_to_press(trained):
+    """A press costs 5, and a random ego presses about once an episode."""
+    early = np.mean([rollout.reward.mean() for rollout in trained.rollouts[:5]])
+    late = np.mean([rollout.reward.mean() for rollout in trained.rollouts[-20:]])
+    assert early < -0.1
+    assert late > 0.2 * early
+
+
+def test_training_moves_the_state_on(trained, untrained):
+    assert int(trained.after.update) == CONFIG.updates == 150
+    assert same_bytes(trained.after.key, untrained.key)
+    np.testing.assert_array_equal(trained.after.seats.env.episode, 100)

@@ -1,0 +1,90 @@
+"""`python -m generation plan`."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from generation.cli import cli
+from generation.planning import plan
+from generation.profiles import load_profile
+from tests.helpers.tiny import LEARNED, artefact
+
+
+@pytest.fixture
+def measured(monkeypatch) -> None:
+    """A machine that makes 100,000 steps/s of egos, 50,000 of populations, and compiles in 36 s."""
+    speeds = {1024: 100_000.0, 64: 100_000.0, 256: 50_000.0}
+    monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.Speed(speeds[config.environments], 36.0))
+
+
+def test_the_papers_numbers(measured):
+    """8 layouts x 80 teammates; FCP has 10 members of 256 tables, BRDiv and LBRDiv too, CoMeDi ten in turn."""
+    profile = load_profile("paper")
+    found = plan.cost(profile, devices=16)
+    steps = 228 * 262_144
+    assert (found.tasks, found.environment_steps) == (640, 640 * steps)
+    assert found.kept_transitions == 640 * 128 * 146 * 100
+    population = 457 * 256 * 256 * 10
+    assert (found.populations, found.teammate_steps) == (32, 32 * population)
+    hours, teammate_hours = (steps / 100_000 + 36) / 3600, (population / 50_000 + 36) / 3600
+    assert found.teammate_hours_on_one == pytest.approx(32 * teammate_hours, abs=0.01)
+    assert found.hours_on_one == pytest.approx(640 * hours + 32 * teammate_hours, abs=0.01)
+    assert found.hours_on_devices == pytest.approx(40 * hours + 32 * teammate_hours, abs=0.01)
+    assert 1 < found.lite_bytes / found.kept_transitions < 3 < found.full_bytes / found.kept_transitions < 12
+
+
+def test_disk_of_artefacts(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    arrays = sum(path.stat().st_size for path in artefact(built / "a").glob("*.npy"))
+    assert plan.artefact_bytes(profile.layouts, profile.ego) == arrays - 5 * 128  # NumPy's headers
+
+
+def test_the_command(measured):
+    result = CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--devices", "2"])
+    assert result.exit_code == 0, result.output
+    for expected in ("environment steps", "100,000 steps/s", "hours on one such device", "hours on 2 of them"):
+        assert expected in result.output
+    found = json.loads(CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--json"]).output)
+    assert (found["profile"], found["tasks"], found["devices"]) == ("smoke", 2, 8)
+
+
+def test_learned_teammates_are_in_the_bill(measured):
+    result = CliRunner().invoke(cli, ["plan", "--profile", "paper"])
+    assert result.exit_code == 0, result.output
+    for expected in ("populations of teammates     32", "50,000 steps/s", "hours, teammates"):
+        assert expected in result.output
+
+
+def test_calibration_measures_a_share_then_the_whole(built, monkeypatch):
+    ego = load_profile(str(built / "tiny.toml")).ego
+    widths = []
+
+    def measure(config):
+        widths.append(config.environments)
+        return plan.Speed(50.0 if len(widths) == 1 else 70.0, 1.0), config.steps_per_update
+
+    def make(config) -> Any:
+        return config
+
+    monkeypatch.setattr(plan, "_measure", measure)
+    assert plan.calibrate(ego, make).steps_per_second == 70.0
+    assert widths == [4, 8]
+    monkeypatch.setattr(plan, "_WORTH_MEASURING", 1.0)
+    widths.clear()
+    assert plan.calibrate(ego, make).steps_per_second == 50.0
+    assert widths == [4]
+
+
+@pytest.mark.parametrize("make", [plan.task_learner, plan.population])
+def test_measuring(tmp_path, make):
+    path = tmp_path / "learned.toml"
+    path.write_text(LEARNED)
+    profile = load_profile(str(path))
+    speed, steps = plan._measure(make(profile, profile.ego))
+    assert steps == (2 if make is plan.population else 1) * 8 * 80
+    assert speed.steps_per_second > 0
+    assert speed.compile_seconds > 0

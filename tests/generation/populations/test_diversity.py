@@ -1,0 +1,145 @@
+"""Hamming distances: by hand, between families, and of policies that watch the same episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.policy import Policy
+from generation.populations import diversity
+from generation.populations.diversity import actions_on_common_states, between_families, hamming
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import observe
+
+LAYOUT = get_layout("cramped_up")
+STEPS = 6
+
+
+def count(params, key) -> jax.Array:
+    return jnp.int32(0)
+
+
+def turning(params, steps, view, key):
+    """Acts by the steps it has watched and what it sees."""
+    return (params["turn"] + steps + view.sum(dtype=jnp.int32)) % 6, steps + 1
+
+
+def turning_too(params, steps, view, key):
+    """The same by another function."""
+    return turning(params, steps, view, key)
+
+
+def by_state(params, steps, view, key):
+    """Acts by the position of agent 1."""
+    return (view[1].astype(jnp.int32) + params["turn"]) % 6, steps
+
+
+def policy(turn: int, act: Any = turning) -> Policy:
+    return Policy({"turn": jnp.int32(turn)}, count, act, "state" if act is by_state else "observation")
+
+
+POLICIES = [policy(0), policy(1, by_state), policy(0), policy(1), policy(0, turning_too)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_fast() -> Iterator[None]:
+    """Small programs, made anew by every call: compiling is their cost."""
+    least = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
+    jax.config.update("jax_disable_most_optimizations", True)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+
+
+@pytest.fixture(scope="module")
+def actions(compiled_fast) -> np.ndarray:
+    return actions_on_common_states(LAYOUT, POLICIES, seed=3, steps=STEPS)
+
+
+@pytest.fixture(scope="module")
+def records(compiled_fast) -> jax.Array:
+    """(T, episodes, S) of random agents."""
+    env = diversity.Environment(LAYOUT, STEPS)
+    players = [diversity.random_player(seat, 3) for seat in (0, 1)]
+    seats = diversity.take_seats(env, players, jax.random.split(jax.random.key(0), 3))
+    play = jax.jit(lambda seats: diversity.roll_out(env, players, seats, STEPS, jax.random.key(1))[1].record)
+    return play(seats)
+
+
+# By hand.
+
+
+def test_hamming_is_the_share_of_states_with_other_actions():
+    actions = np.array([[0, 1, 2, 3], [0, 1, 2, 5], [5, 4, 3, 2]], np.int8)
+    np.testing.assert_array_equal(hamming(actions), [[0, 0.25, 1], [0.25, 0, 1], [1, 1, 0]])
+
+
+def test_hamming_against_a_loop():
+    actions = np.random.default_rng(0).integers(0, 6, (4, 50)).astype(np.int8)
+    found = hamming(actions)
+    for a in range(4):
+        for b in range(4):
+            assert found[a, b] == sum(x != y for x, y in zip(actions[a], actions[b], strict=True)) / 50
+
+
+def test_families_are_as_far_as_their_policies_on_average():
+    """Within a family a policy's distance to itself counts, as in the paper's formula."""
+    distances = np.array([[0, 0.5, 1, 0.2], [0.5, 0, 0.6, 0.4], [1, 0.6, 0, 0.8], [0.2, 0.4, 0.8, 0]])
+    found = between_families(distances, {"A": [0, 2], "B": [1], "C": range(1, 4)})
+    expected = [
+        [(0 + 1 + 1 + 0) / 4, (0.5 + 0.6) / 2, (0.5 + 1 + 0.2 + 0.6 + 0 + 0.8) / 6],
+        [(0.5 + 0.6) / 2, 0, (0 + 0.6 + 0.4) / 3],
+        [(0.5 + 1 + 0.2 + 0.6 + 0 + 0.8) / 6, (0 + 0.6 + 0.4) / 3, 2 * (0.6 + 0.4 + 0.8) / 9],
+    ]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+# On common states.
+
+
+def test_every_policy_answers_on_the_episodes_of_all(actions):
+    assert actions.shape == (len(POLICIES), len(POLICIES) * 2 * STEPS)
+    assert actions.dtype == np.int8
+    assert len(np.unique(actions)) == 6
+
+
+def test_identical_policies_have_distance_0_and_others_do_not(actions):
+    """Also where their functions are not the same objects."""
+    distances = hamming(actions)
+    assert distances[0, 2] == distances[0, 4] == 0
+    assert distances[0, 3] == 1  # always one action further
+    assert 0 < distances[0, 1] < 1
+
+
+def test_the_result_is_a_pure_function_of_the_seed(actions):
+    again = actions_on_common_states(LAYOUT, POLICIES, seed=3, steps=STEPS)
+    np.testing.assert_array_equal(again, actions)
+    other = actions_on_common_states(LAYOUT, POLICIES, seed=4, steps=STEPS)
+    assert (other != actions).any()
+
+
+def test_policies_watch_from_seat_1_with_a_memory(records, monkeypatch):
+    """Against a loop over the same states: counted from each episode's start, seen as the teammate sees it."""
+    monkeypatch.setattr(diversity, "_play", lambda env, numbers, family, key: records)
+    found = actions_on_common_states(LAYOUT, [policy(2), policy(1, by_state)], steps=STEPS)
+    whole = np.concatenate([records, records], axis=1)  # once for either family
+    seen = observe(LAYOUT, whole, TEAMMATE).sum(axis=(2, 3, 4))
+    expected = (2 + np.arange(STEPS)[:, None] + seen) % 6
+    np.testing.assert_array_equal(found[0].reshape(seen.shape), expected)
+    np.testing.assert_array_equal(found[1].reshape(seen.shape), (whole[..., 1] + 1) % 6)
+
+
+@pytest.mark.parametrize("order", [[4, 3, 2, 1, 0], [1, 3, 0, 4, 2]])
+def test_on_the_same_states_the_order_of_policies_does_not_matter(records, monkeypatch, order: Sequence[int]):
+    monkeypatch.setattr(diversity, "_play", lambda env, numbers, family, key: records)
+    plain = actions_on_common_states(LAYOUT, POLICIES, steps=STEPS)
+    other = actions_on_common_states(LAYOUT, [POLICIES[k] for k in order], steps=STEPS)
+    np.testing.assert_array_equal(other, plain[order])
+    np.testing.assert_array_equal(hamming(other), hamming(plain)[np.ix_(order, order)])

@@ -1,0 +1,450 @@
+"""Populations on disk: checkpoints and their cards, runs that are killed and go on, the filter, the manifests.
+
+All four algorithms are trained once, by the shipped profile `smoke`: two members, six updates of 2,048 steps each.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from generation.env import Environment
+from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
+from generation.learners.network import ActorCritic, Widths
+from generation.learners.rollout import network_player, policy_player, random_player, roll_out, take_seats
+from generation.policy import stacked
+from generation.populations import cross_play
+from generation.populations import train as suite
+from generation.populations.select import Selection, layout_number, make_tasks, select, write_manifests
+from generation.populations.train import Checkpoint, Run, checkpoints, is_finished, play_matrix, train
+from generation.profiles import load_profile
+from generation.releases.check import compare
+from generation.teammates import learned
+from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.benchmark.tasks import read_tasks, write_tasks
+from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+LAYOUT = get_layout("cramped_up")
+SMOKE = load_profile("smoke").teammates
+CONFIG, WIDTHS = SMOKE.ppo, SMOKE.ppo.widths
+
+CHILD = """
+import sys, time
+from pathlib import Path
+from tests.generation.populations import test_suite
+from generation.populations import train as suite
+
+def report(update, updates, metrics):
+    print(update, flush=True)
+    time.sleep(0.02)
+
+suite._SAVE_SECONDS = 0.0
+suite.train(test_suite.run_of(sys.argv[1]), Path(sys.argv[2]), report)
+"""
+
+TWO_DEVICES = """
+import sys
+import jax
+import numpy as np
+from tests.generation.populations import test_suite
+from flax.traverse_util import flatten_dict
+
+(population,) = test_suite.run_of("fcp").stages
+state = jax.jit(population.init)(jax.random.fold_in(jax.random.key(0), 0))
+update = jax.jit(population.update)
+state, _ = update(state)
+assert jax.device_count() == 2
+used = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.params)}
+assert used == {2}, used
+np.savez(sys.argv[1], **flatten_dict(jax.tree.map(np.asarray, state.params), sep="/"))
+"""
+
+
+def run_of(algorithm: str) -> Run:
+    return Run(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, compiled_quickly) -> Path:
+    """A suite of all four algorithms on cramped_up. Read only."""
+    root = tmp_path_factory.mktemp("trained")
+    for algorithm in ALGORITHMS:
+        train(run_of(algorithm), root / LAYOUT.name / algorithm)
+    return root
+
+
+def population(root: Path, algorithm: str) -> Path:
+    return root / LAYOUT.name / algorithm
+
+
+def weights(folder: Path) -> dict[str, str]:
+    """The hash of every policy of a population."""
+    return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(WEIGHTS))}
+
+
+def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[str]:
+    settings = {
+        "PYTHONPATH": str(ROOT),
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),  # type: ignore[attr-defined]
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    }
+    if devices > 1:
+        settings["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+    command = [sys.executable, "-c", script, *arguments]
+    return subprocess.Popen(command, env=os.environ | settings, stdout=subprocess.PIPE, text=True)
+
+
+# What a population is on disk.
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
+    found = list(checkpoints(trained, LAYOUT.name, algorithm))
+    names = [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(2) for c in range(5)]
+    assert [point.path for point in found] == names
+    folder = population(trained, algorithm)
+    responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
+    assert sorted(path.name for path in folder.glob("responses/*")) == responses
+    assert len(set(weights(folder).values())) == 10 + len(responses), "all differ"
+    assert is_finished(folder, run_of(algorithm))
+    assert not list(folder.glob("resume*"))
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_cards_say_what_a_checkpoint_is(trained, algorithm):
+    for number, point in enumerate(checkpoints(trained, LAYOUT.name, algorithm)):
+        member, checkpoint = divmod(number, 5)
+        card = point.card
+        assert (card["algorithm"], card["layout"], card["seed"]) == (algorithm, "cramped_up", 0)
+        assert (card["member"], card["checkpoint"]) == (member, checkpoint)
+        assert card["step"] == 2048 * (checkpoint + 2)
+        assert card["seats"] == ([1] if algorithm in ("brdiv", "lbrdiv") else [0, 1])
+        assert card["shapes"]["params/actor/kernel"] == [16, 6]
+        assert Widths.from_table(card["widths"]) == WIDTHS
+        assert isinstance(card["return"], float)
+        assert isinstance(card["teammate_return"], float)
+        assert card["code_version"]
+
+
+def test_a_cards_return_is_that_checkpoints_own(trained):
+    """With its best response or itself, evaluated anew."""
+    folder = population(trained, "fcp")
+    for checkpoint in (0, 4):
+        loaded = [load_policy(folder / f"m{m}" / f"c{checkpoint}") for m in range(2)]
+        members = stacked([params for _, params, _ in loaded])
+        for name, greedy in (("return", False), ("teammate_return", True)):
+            returns = cross_play.together(LAYOUT, loaded[0][0], members, members, greedy=greedy)
+            assert [card[name] for _, _, card in loaded] == returns.tolist()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_log_has_a_line_for_each_update(trained, algorithm):
+    lines = [json.loads(line) for line in (population(trained, algorithm) / "metrics.jsonl").read_text().splitlines()]
+    stages = 2 if algorithm == "comedi" else 1
+    assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
+    for line in lines:
+        assert line["step"] == 2048 * (line["update"] + 1)
+        ended = line["update"] in (1, 3, 4)  # with steps 400, 800 and 1200, in roll-outs of 256
+        assert (line["episodes"] > 0, "self_play" in line) == (ended, ended)
+        meets_others = algorithm in ("brdiv", "lbrdiv") or line["stage"] > 0
+        assert ("cross_play" in line) == (ended and meets_others)
+        np.testing.assert_allclose(line["shaping"], max(0, 1 - line["update"] * 2048 / 6144), atol=1e-6)
+    timing = [json.loads(line) for line in (population(trained, algorithm) / "timing.jsonl").read_text().splitlines()]
+    assert [(line["stage"], line["update"]) for line in timing] == [(line["stage"], line["update"]) for line in lines]
+    assert all(line["steps_per_second"] > 0 for line in timing)
+    assert (population(trained, algorithm) / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_as_a_teammate_seat_1_alone_is_greedy(trained, monkeypatch):
+    network, params, _ = load_policy(population(trained, "fcp") / "m0/c4")
+    made = []
+
+    def player(env, network, params, places, partner, greedy):
+        made.append((bool((places >= places.size).all()), greedy))
+        return network_player(env, network, params, places, partner, greedy)
+
+    monkeypatch.setattr(cross_play, "network_player", player)
+    for greedy in (False, True):
+        cross_play.together(LAYOUT, network, stacked([params]), stacked([params]), episodes=2, greedy=greedy)
+    assert made == [(False, False), (True, False), (False, False), (True, True)]
+
+
+def test_the_play_matrix_seats_best_responses_opposite_members(trained):
+    folder = population(trained, "brdiv")
+    network, _, _ = load_policy(folder / "m0/c4")
+    members, responses = (
+        stacked([load_policy(folder / where.format(m))[1] for m in range(2)]) for where in ("m{}/c4", "responses/m{}")
+    )
+    expected = cross_play.matrix(LAYOUT, network, responses, members)
+    assert expected.shape == (2, 2)
+    assert len(np.unique(expected)) > 1
+    np.testing.assert_array_equal(play_matrix(trained, LAYOUT, "brdiv"), expected)
+
+
+def test_every_result_plays_as_a_teammate_in_both_seats(trained):
+    env, tables = Environment(LAYOUT), 3
+    for seat in (EGO, TEAMMATE):
+        first = learned.build(LAYOUT, population(trained, "fcp") / "m0/c0")
+
+        def play(params, seat=seat, policy=first):
+            players = [policy_player(env, policy, params, seat, tables), random_player(1 - seat, tables)]
+            seats = take_seats(env, players, jax.random.split(jax.random.key(0), tables))
+            return roll_out(env, players, seats, 30, jax.random.key(1))[1].actions[..., seat]
+
+        play, seen = jax.jit(play), set()
+        for algorithm in ALGORITHMS:
+            for point in checkpoints(trained, LAYOUT.name, algorithm):
+                policy = learned.build(LAYOUT, trained / point.path)
+                assert policy.act is first.act
+                seen.add(np.asarray(play(policy.params)).tobytes())
+        assert len(seen) > 4, "policies act differently"
+
+
+# Runs that stop and go on.
+
+
+def test_a_killed_run_goes_on_to_the_same_policies(trained, tmp_path):
+    """Killed at a random moment; CoMeDi trains its members one after the other."""
+    folder = tmp_path / "comedi"
+    moment = int(np.random.default_rng().integers(1, 12))
+    process = child(CHILD, "comedi", str(folder))
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) == moment:
+            process.send_signal(signal.SIGKILL)
+            break
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL, f"killed after update {moment}"
+    assert not is_finished(folder, run_of("comedi"))
+    done: list[int] = []
+    train(run_of("comedi"), folder, lambda update, updates, metrics: done.append(update))
+    assert done[-1] == 12
+    assert moment == 1 or len(done) < 12, f"killed after update {moment}, but began at {done[0]}"
+    assert weights(folder) == weights(population(trained, "comedi")), f"killed after update {moment}"
+    assert is_finished(folder, run_of("comedi"))
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch) -> Path:
+    """LBRDiv, stopped in the last update: the first episodes are over, and the multipliers have moved."""
+
+    def stop(update: int, updates: int, metrics: dict[str, float]) -> None:
+        if update == updates:
+            raise Stopped
+
+    monkeypatch.setattr(suite, "_SAVE_SECONDS", 0.0)
+    with pytest.raises(Stopped):
+        train(run_of("lbrdiv"), tmp_path / "lbrdiv", stop)
+    return tmp_path / "lbrdiv"
+
+
+def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(trained, stopped):
+    before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
+    with pytest.raises(OptionError, match=r"lbrdiv: holds an unfinished run of other settings, .*; remove it"):
+        train(replace(run_of("lbrdiv"), seed=1), stopped)
+    assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
+
+    done: list[int] = []
+    train(run_of("lbrdiv"), stopped, lambda update, updates, metrics: done.append(update))
+    assert done == [6]
+    whole = population(trained, "lbrdiv")
+    assert weights(stopped) == weights(whole)
+    assert not compare(stopped, whole).differences
+
+
+def test_a_run_beside_another_in_the_same_folder_is_refused(tmp_path):
+    with suite.FileLock(tmp_path / ".fcp.lock"), pytest.raises(OptionError, match="another process is training"):
+        train(run_of("fcp"), tmp_path / "fcp")
+
+
+@pytest.mark.parametrize("name", [f"m0/c0/{WEIGHTS}", f"m1/c4/{CARD}", f"responses/m1/{WEIGHTS}"])
+def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained, tmp_path, name):
+    folder, run = tmp_path / "brdiv", run_of("brdiv")
+    shutil.copytree(population(trained, "brdiv"), folder)
+    assert is_finished(folder, run)
+    content = bytearray((folder / name).read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / name).write_bytes(content)
+    assert not is_finished(folder, run)
+    (folder / name).unlink()
+    assert not is_finished(folder, run)
+
+
+def test_a_population_of_other_settings_is_not_finished(trained):
+    folder, run = population(trained, "fcp"), run_of("fcp")
+    others = [
+        replace(run, seed=1),
+        replace(run, members=3),
+        replace(run, layout=get_layout("cramped_down")),
+        replace(run, config=replace(CONFIG, entropy=0.02)),
+        run_of("brdiv"),
+    ]
+    assert [is_finished(folder, other) for other in (run, *others)] == [True] + [False] * len(others)
+
+
+def test_an_unknown_algorithm_is_refused():
+    with pytest.raises(UnknownNameError, match=r"unknown algorithm 'fpc'.*Did you mean 'fcp'"):
+        Run(LAYOUT, "fpc", 2, CONFIG, 0)
+
+
+def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
+    with pytest.raises(OptionError, match=r"fcp: no finished population; run .*--layout cramped_up"):
+        list(checkpoints(tmp_path, "cramped_up", "fcp"))
+
+
+def test_a_population_learns_the_same_shared_out_over_two_devices(tmp_path):
+    """To rounding: half of the policies on each device, one update."""
+    (whole,) = run_of("fcp").stages
+    state, _ = jax.jit(whole.update)(jax.jit(whole.init)(jax.random.fold_in(jax.random.key(0), 0)))
+    process = child(TWO_DEVICES, str(tmp_path / "weights.npz"), devices=2)
+    process.communicate(timeout=300)
+    assert process.returncode == 0
+    found = np.load(tmp_path / "weights.npz")
+    for path, leaf in jax.tree.leaves_with_path(state.params):
+        name = "/".join(str(part.key) for part in path)
+        np.testing.assert_allclose(found[name], leaf, rtol=0, atol=1e-4, err_msg=name)
+
+
+# The filter and the manifests.
+
+
+def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
+    """A suite with these returns as teammates by (member, checkpoint); every weight file differs."""
+    folder = population(root, algorithm)
+    for (member, checkpoint), greedy in returns.items():
+        params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}
+        card = {"algorithm": algorithm, "seed": 7, "teammate_return": greedy, "return": -greedy}
+        path = folder / f"m{member}" / f"c{checkpoint}"
+        save_policy(path, ActorCritic(WIDTHS), params, card)
+    (folder / "population.json").write_text("{}")
+    return root
+
+
+@pytest.fixture(scope="module")
+def candidates(tmp_path_factory) -> Path:
+    """50 checkpoints of each algorithm; 40 of them exceed the threshold, 5 are at it."""
+    root = tmp_path_factory.mktemp("candidates")
+    for algorithm in ALGORITHMS:
+        returns = {(m, c): 21.0 + m + c for m in range(10) for c in range(5)}
+        returns |= {(m, 0): 20.0 for m in range(5)} | {(m, 1): -3.0 for m in range(5)}
+        made_up(root, returns, algorithm)
+    return root
+
+
+def paths(points: list[Checkpoint]) -> list[str]:
+    return [point.path for point in points]
+
+
+def test_candidates_are_sorted_by_number(candidates):
+    """Not by name, where m10 comes before m2."""
+    found = paths(list(checkpoints(candidates, LAYOUT.name, "fcp")))
+    assert found == [f"{LAYOUT.name}/fcp/m{m}/c{c}" for m in range(10) for c in range(5)]
+
+
+def test_sorted_by_number_with_more_than_ten_members(tmp_path):
+    made_up(tmp_path, {(m, 0): 0.0 for m in (10, 2, 0, 11)})
+    found = paths(list(checkpoints(tmp_path, LAYOUT.name, "fcp")))
+    assert [path.split("/")[2] for path in found] == ["m0", "m2", "m10", "m11"]
+
+
+def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
+    chosen = select(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
+    assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
+    everyone = chosen.train + chosen.heldout
+    assert len(set(paths(everyone))) == 40
+    assert all(point.card["teammate_return"] > 20 for point in everyone)
+
+
+def test_train_and_heldout_are_disjoint_and_of_the_wanted_numbers(candidates):
+    chosen = select(candidates, LAYOUT.name, "brdiv", train=20, heldout=5)
+    assert (len(chosen.train), len(chosen.heldout)) == (20, 5)
+    assert len({*paths(chosen.train), *paths(chosen.heldout)}) == 25
+
+
+def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates):
+    draws = {(a, s): select(candidates, LAYOUT.name, a, 20, 5, seed=s) for a in ("fcp", "brdiv") for s in (0, 1)}
+    again = select(candidates, LAYOUT.name, "fcp", 20, 5, seed=0)
+    assert (paths(again.train), paths(again.heldout)) == (paths(draws["fcp", 0].train), paths(draws["fcp", 0].heldout))
+    names = [[path.partition("/m")[2] for path in paths(draw.train)] for draw in draws.values()]
+    assert len({tuple(own) for own in names}) == 4
+    assert names[0] != sorted(names[0])
+
+
+@pytest.mark.parametrize(
+    ("good", "train", "heldout"),
+    [(0, 0, 0), (1, 1, 0), (4, 4, 0), (5, 4, 1), (10, 8, 2), (22, 18, 4), (24, 20, 4), (25, 20, 5), (50, 20, 5)],
+)
+def test_few_candidates_are_shared_four_to_one(tmp_path, good, train, heldout):
+    """20 for training and 5 held out are wanted."""
+    made_up(tmp_path, {(k // 5, k % 5): 30.0 if k < good else 5.0 for k in range(50)})
+    chosen = select(tmp_path, LAYOUT.name, "fcp", 20, 5)
+    assert (chosen.good, len(chosen.train), len(chosen.heldout)) == (good, train, heldout)
+    assert not {*paths(chosen.train)} & {*paths(chosen.heldout)}
+
+
+def test_manifests_read_back(candidates, tmp_path):
+    root = tmp_path / "suite"
+    shutil.copytree(candidates, root)
+    selections = [select(root, LAYOUT.name, algorithm, 20, 5) for algorithm in ALGORITHMS]
+    written = write_manifests(root, selections)
+    assert [path.name for path in written] == ["layout_train.jsonl", "layout_heldout.jsonl"]
+    for path, split, count in zip(written, ("train", "heldout"), (20, 5), strict=True):
+        tasks = read_tasks(path)
+        assert tasks == make_tasks(root, selections, split)
+        first = 20 if split == "heldout" else 0
+        place = layout_number(LAYOUT.name) + 1
+        numbers = [10_000 * place + 1_000 * a + first + n for a in range(4) for n in range(count)]
+        assert [task.seed for task in tasks] == numbers
+        assert {task.split for task in tasks} == {split}
+        assert [task.teammate_kind for task in tasks] == [a for a in ALGORITHMS for _ in range(count)]
+        chosen = [point for own in selections for point in (own.train if split == "train" else own.heldout)]
+        for task, point in zip(tasks, chosen, strict=True):
+            assert (task.layout_name, task.teammate_family) == ("cramped_room_up", "rl")
+            hashed = file_hash(root / point.path / WEIGHTS)
+            assert task.teammate["theta"] == {"checkpoint": point.path, "sha256": hashed}
+            assert task.teammate["base_seed"] == 7
+
+
+def test_tracks_without_teammates_have_no_manifest(tmp_path):
+    made_up(tmp_path, {(0, 0): 30.0})
+    written = write_manifests(tmp_path, [select(tmp_path, LAYOUT.name, "fcp", 20, 5)])
+    assert [path.name for path in written] == ["layout_train.jsonl"]
+
+
+def test_a_tasks_teammate_is_built_and_another_hash_refused(trained, tmp_path):
+    points = list(checkpoints(trained, LAYOUT.name, "comedi"))
+    tasks = make_tasks(trained, [Selection(LAYOUT.name, "comedi", 10, 10, points, [])], "train")
+    write_tasks(tmp_path / "tasks.jsonl", tasks)
+    for task, point in zip(read_tasks(tmp_path / "tasks.jsonl"), points, strict=True):
+        built: Any = learned.build_entry(task.layout, task.teammate, trained)
+        expected = load_policy(trained / point.path)[1]["params"]["actor"]["kernel"]
+        np.testing.assert_array_equal(built.params["params"]["actor"]["kernel"], expected)
+
+    wrong = tasks[0].teammate | {"theta": tasks[0].teammate["theta"] | {"sha256": "0" * 64}}
+    with pytest.raises(TaskFormatError, match=f"expected {'0' * 64} as the task says"):
+        learned.build_entry(LAYOUT, wrong, trained)
+    write_tasks(tmp_path / "wrong.jsonl", [replace(tasks[0], teammate=wrong)])
+    with pytest.raises(TaskFormatError, match=r"line 1: task_id .* does not match the task's content"):
+        read_tasks(tmp_path / "wrong.jsonl")

@@ -1,0 +1,70 @@
+"""`python -m generation check A B`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from generation.cli import cli
+from generation.releases.check import compare
+from icrl4aht_data.errors import OptionError
+from tests.helpers.tiny import artefact
+
+
+def test_equal_folders(built):
+    result = CliRunner().invoke(cli, ["check", str(built / "a"), str(built / "a")])
+    assert result.exit_code == 0
+    assert "bit-equal" in result.output
+
+
+def test_what_differs_is_said(built, tmp_path):
+    ours = artefact(built / "a")
+    theirs = tmp_path / "other"
+    shutil.copytree(ours, theirs)
+    actions = np.load(theirs / "actions.npy", mmap_mode="r+")
+    actions[2, 7] += 1
+    actions.flush()
+    np.save(theirs / "rewards.npy", np.zeros((2, 3), np.int8))
+    lines = (theirs / "metrics.jsonl").read_text().splitlines()
+    (theirs / "metrics.jsonl").write_text("\n".join([*lines[:2], "{}", *lines[3:]]) + "\n")
+    (theirs / "policy.json").unlink()
+    (theirs / "notes.txt").touch()
+    for name in ("timing.jsonl", "filter.png"):
+        (theirs / name).write_bytes(b"another clock")
+    result = CliRunner().invoke(cli, ["check", "--json", str(ours), str(theirs)])
+    assert result.exit_code == 1
+    compared = json.loads(result.output)
+    found = compared["differences"]
+    assert not compared["equal"]
+    assert set(found) == {"actions.npy", "rewards.npy", "metrics.jsonl", "policy.json", "notes.txt"}
+    was = int(np.load(ours / "actions.npy")[2, 7])
+    assert found["actions.npy"] == f"1 of 4000 values, the first at (2, 7): {was} and {was + 1}"
+    assert found["rewards.npy"] == "int8 (8, 500) and int8 (2, 3)"
+    assert found["metrics.jsonl"].endswith(", line 3")
+    assert found["policy.json"] == f"only in {ours}"
+    assert found["notes.txt"] == f"only in {theirs}"
+    text = CliRunner().invoke(cli, ["check", str(ours), str(theirs)])
+    assert text.exit_code == 1
+    assert "5 differ" in text.output
+
+
+def test_an_array_that_is_none(tmp_path):
+    for name, content in (("a", b"junk"), ("b", b"juno"), ("c", b"")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "x.npy").write_bytes(content)
+    assert compare(tmp_path / "a", tmp_path / "b").differences == {"x.npy": "4 bytes, the first difference at byte 3"}
+    assert compare(tmp_path / "a", tmp_path / "c").differences == {
+        "x.npy": "4 and 0 bytes, the first difference at byte 0"
+    }
+
+
+def test_nothing_to_compare(tmp_path):
+    (tmp_path / ".hidden").touch()
+    with pytest.raises(OptionError, match="no files to compare"):
+        compare(tmp_path, tmp_path)
+    with pytest.raises(OptionError, match=r"nowhere: no such folder"):
+        compare(tmp_path, tmp_path / "nowhere")

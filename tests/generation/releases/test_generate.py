@@ -1,0 +1,382 @@
+"""The whole rebuild at its smallest: collect, resume, pack, verify, sample; the learner's speed."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from rich.console import Console
+
+from generation.cli import cli
+from generation.collection import run
+from generation.collection import task as collect
+from generation.collection import task_folder as artefacts
+from generation.collection.job import CollectionError
+from generation.collection.task_folder import METADATA
+from generation.learners.checkpoint import load_policy
+from generation.populations import select
+from generation.populations import train as suite
+from generation.populations.build import build_suite
+from generation.profiles import FOLDER, load_profile
+from generation.releases import build, package
+from generation.teammates.registry import recover_teammate
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from tests.helpers.tiny import LEARNED, TINY, artefact
+
+
+@pytest.mark.parametrize("kind", ["lite", "full"])
+def test_releases_are_whole_and_replay(built, kind):
+    report = verify_release(built / "a" / kind, deep=True)
+    assert report.ok, report.findings
+    assert (report.histories, report.transitions) == (3, 3 * 500)
+
+
+def test_history_is_the_first_100_of_each_400_steps(built):
+    history = load_icrl4aht(built / "a" / "lite")[0]
+    assert (history.entry.T, history.entry.episodes) == (500, 5)
+    assert np.flatnonzero(history.dones[:]).tolist() == [99, 199, 299, 399, 499]
+    metrics = [json.loads(line) for line in (artefact(built / "a") / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in metrics] == [640 * (k + 1) for k in range(25)]
+
+
+def test_the_best_streams_are_kept_best_first(built):
+    rewards = np.load(artefact(built / "a") / "rewards.npy")
+    returns = rewards.reshape(8, 5, 100).sum(axis=-1)
+    scores = 2 * returns.mean(axis=1) - returns.mean(axis=1)  # w = 5: start and end are the same five episodes
+    kept = [entry.env_idx for entry in load_icrl4aht(built / "a" / "lite").entries]
+    assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
+
+
+def test_entries_say_where_they_come_from(built):
+    root = built / "a" / "lite"
+    entry = load_icrl4aht(root).entries[0]
+    assert (entry.teammate_family, entry.teammate_kind, entry.split) == ("H4", "utility_greedy", "train")
+    assert entry.has_expert_actions
+    provenance = json.loads((root / "meta" / "provenance.json").read_text())[entry.task_id]
+    assert provenance["ego"]["environments"] == 8
+    assert provenance["streams_kept"] == 3
+    assert "What it is not" in (root / "README.md").read_text()
+
+
+def test_the_final_ego_is_kept(built):
+    network, params, card = load_policy(artefact(built / "a"))
+    assert network.widths.gru == 8
+    assert card["steps"] == 16_000
+    assert params["params"]["actor"]["kernel"].shape == (8, 6)
+
+
+def test_a_finished_task_is_not_done_again(built, monkeypatch):
+    def never(*arguments):
+        raise AssertionError("the task was collected again")
+
+    monkeypatch.setattr(run, "run_task", never)
+    output = StringIO()
+    before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
+    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
+    assert "finished before" in output.getvalue()
+    assert (built / "a" / "lite" / "MANIFEST.sha256").read_bytes() == before
+
+
+def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_path):
+    profile = load_profile(str(built / "tiny.toml"))
+    (task,) = profile.heuristic_tasks()
+    folder = tmp_path / "copy"
+    shutil.copytree(artefact(built / "a"), folder)
+    assert artefacts.is_finished(folder, task, profile)
+    (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
+    assert not artefacts.is_finished(folder, task, load_profile(str(built / "other.toml")))
+    actions = bytearray((folder / "actions.npy").read_bytes())
+    actions[-1] ^= 1
+    (folder / "actions.npy").write_bytes(actions)
+    assert not artefacts.is_finished(folder, task, profile)
+    (folder / METADATA).unlink()
+    assert not artefacts.is_finished(folder, task, profile)
+
+
+def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    (task,) = profile.heuristic_tasks()
+    folder = built / "b" / task.task_id
+
+    def stop(update, metrics):
+        if update == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect.run_task(task, profile, folder, stop)
+    assert not folder.exists()
+    collect.run_task(task, profile, folder)
+    for name in ("state", "actions", "teammate_actions", "rewards", "episode_end_state"):
+        assert (folder / f"{name}.npy").read_bytes() == (artefact(built / "a") / f"{name}.npy").read_bytes(), name
+    weights = "policy.safetensors"
+    assert (folder / weights).read_bytes() == (artefact(built / "a") / weights).read_bytes()
+
+
+def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
+    shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
+    (tmp_path / "lite").mkdir()
+    (tmp_path / "lite" / "notes.txt").write_text("mine")
+    with pytest.raises(OptionError, match="is not a release"):
+        build.build_releases(str(built / "tiny.toml"), tmp_path, ["lite"], Console(file=StringIO()))
+    assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
+
+
+def test_nothing_but_lines_where_output_is_no_terminal(built):
+    output = StringIO()
+    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
+    assert not re.search(r"\x1b|━", output.getvalue())
+
+
+def test_two_collectors_never_do_one_task_together(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    (task,) = profile.heuristic_tasks()
+    folder = built / "c" / task.task_id
+
+    def meanwhile(update, metrics):
+        with pytest.raises(OptionError, match="another process is collecting this task"):
+            collect.run_task(task, profile, folder)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect.run_task(task, profile, folder, meanwhile)
+
+
+def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
+    monkeypatch.setattr(package, "MINI", tmp_path / "mini")
+    for _ in range(2):
+        package.bundle_release(built / "a" / "lite")
+        assert verify_release(tmp_path / "mini").ok
+
+
+def test_the_teammate_can_be_rebuilt(built):
+    from generation.teammates.registry import build as build_teammate
+
+    spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
+    assert (spec["slot"], spec["noise"]) == (1, "seeded")
+    assert build_teammate(LAYOUTS["demo_wide"], spec, spec["slot"], spec["noise"]).sees == "state"
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> Path:
+    """A rebuild beside learned teammates, of which none is too bad to be one. Read only."""
+    out = tmp_path_factory.mktemp("learned")
+    (out / "learned.toml").write_text(LEARNED)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(select, "THRESHOLD", -np.inf)
+        build.build_releases(str(out / "learned.toml"), out, ["lite", "full"], Console(file=StringIO()))
+    return out
+
+
+def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned):
+    """The whole recorded episode: what the rebuilt teammate does on its observations is what it did."""
+    dataset = load_icrl4aht(learned / "lite")
+    assert [task.teammate_kind for task in dataset.entries[::3]] == ["fcp", "brdiv"]
+    assert {entry.teammate_family for entry in dataset.entries} == {"rl"}
+    layout = get_layout("demo_wide")
+    for history in (dataset[0], dataset[3]):
+        mate = recover_teammate(dataset, history.entry.history_id)
+        act = jax.jit(mate.act)
+        obs = observe(layout, history.state[:100], TEAMMATE)
+        memory, played = mate.init(mate.params, jax.random.key(0)), []
+        for view in np.asarray(obs):
+            action, memory = act(mate.params, memory, view, jax.random.key(0))
+            played.append(int(action))
+        assert played == history.teammate_actions[:100].tolist()
+
+
+def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_path):
+    root = tmp_path / "lite"
+    shutil.copytree(learned / "lite", root)
+    assert verify_release(root, deep=True).ok
+    assert verify_release(learned / "full", deep=True).ok
+    weights = next(root.glob("teammates/**/policy.safetensors"))
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    write_manifest(root)
+    (finding,) = verify_release(root).findings
+    assert finding.file == str(weights.relative_to(root))
+    assert "as task 'teammate_train_demo_cook_wide_" in finding.problem
+
+
+def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
+    dataset = load_icrl4aht(learned / "lite")
+    half = to_release(dataset.filter(teammate_kind="brdiv"), tmp_path / "half", "full")
+    other = to_release(dataset.filter(teammate_kind="fcp"), tmp_path / "other", "full")
+    both = combine_releases(tmp_path / "both", [half, other])
+    for root, count in ((half, 1), (both, 2)):
+        assert len(list(root.glob("teammates/**/policy.safetensors"))) == count
+        assert verify_release(root, deep=True).ok
+        recover_teammate(load_icrl4aht(root), 0)
+
+
+def test_two_rebuilds_whose_teammates_have_the_same_place_in_their_suites(learned, tmp_path, monkeypatch):
+    """Another seed, another suite folder; together the releases hold all four teammates."""
+    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
+    arguments = ["generate", "--profile", str(learned / "learned.toml"), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli, [*arguments, "--suite", str(tmp_path / "other"), "--seed", "1"])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "other/demo_wide/fcp/population.json").is_file()
+    assert not (tmp_path / "out/suite").exists()
+    combine_releases(tmp_path / "both", [learned / "lite", tmp_path / "out/lite"])
+    assert verify_release(tmp_path / "both", deep=True).ok
+    both = load_icrl4aht(tmp_path / "both")
+    weights = {
+        np.asarray(jax.tree.leaves(recover_teammate(both, number).params)[0]).tobytes() for number in range(0, 12, 3)
+    }
+    assert len(weights) == 4
+
+
+def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
+    dataset = load_icrl4aht(learned / "lite")
+    root = to_release(dataset, tmp_path / "lite", "lite")
+    shutil.rmtree(root / "teammates")
+    write_manifest(root)
+    report = verify_release(root)
+    assert report.ok
+    assert any("2 tasks have learned teammates whose checkpoints" in note for note in report.notes)
+    with pytest.raises(OptionError, match=r"lacks checkpoint \w{64}, the teammate of history 0: .*came without it"):
+        recover_teammate(load_icrl4aht(root), 0)
+
+
+HOLD = """
+import filelock, select, sys
+with filelock.FileLock(sys.argv[1]):
+    print(flush=True)
+    select.select([sys.stdin], [], [], 60)
+"""
+"""Holds a lock until its standard input is closed, or for a minute."""
+
+
+class Heard(StringIO):
+    """Calls `then` once it has been told `message`."""
+
+    def __init__(self, message: str, then: Callable[[], object]) -> None:
+        super().__init__()
+        self.message, self.then = message, then
+
+    def write(self, text: str) -> int:
+        count = super().write(text)
+        if self.message in self.getvalue():
+            self.then()
+        return count
+
+
+def test_a_population_that_another_process_trains_is_waited_for(learned, monkeypatch):
+    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
+    lock = learned / "suite/demo_wide/.brdiv.lock"
+    profile = load_profile(str(learned / "learned.toml"))
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"\n"
+        output = Heard("another process is training it", other.stdin.close)
+        selections = build_suite(profile, learned / "suite", {"demo_wide": ["brdiv", "fcp"]}, 0, Console(file=output))
+    lines = [line for line in output.getvalue().splitlines() if " on demo_wide: " in line][:3]
+    assert [line.partition(": ")[2] for line in lines] == [
+        "another process is training it",
+        "finished before",
+        "finished before",
+    ]
+    assert {selection.algorithm for selection in selections} == {"brdiv", "fcp"}
+
+
+def test_the_card_says_who_the_teammates_are(learned):
+    card = (learned / "lite" / "README.md").read_text()
+    assert "Learned teammates on demo_wide: populations of 2 by fcp, brdiv, 4,000 steps a member" in card
+    assert "| demo_wide | train | brdiv | 1 | 3 |" in card
+    assert "Here egos for 16,000, teammates for 4,000." in card
+    assert "policies learned by fcp, brdiv" in card
+    assert "fewer training teammates" not in card
+    assert "stand in for the learned ones" not in card
+
+
+def test_the_card_says_which_teammates_are_missing(learned, tmp_path):
+    part = to_release(load_icrl4aht(learned / "lite", teammate_kind="fcp"), tmp_path / "part", "lite")
+    assert "than its profile wanted of brdiv on demo_wide (0 of 1)." in (part / "README.md").read_text()
+
+
+def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
+    def never(*arguments):
+        raise AssertionError("something was done again")
+
+    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
+    monkeypatch.setattr(suite._Training, "run_on", never)
+    monkeypatch.setattr(run, "run_task", never)
+    output = StringIO()
+    build.build_releases(str(learned / "learned.toml"), learned, ["lite"], Console(file=output))
+    assert output.getvalue().count("finished before") == 4
+
+
+def test_teammates_that_are_all_too_bad(learned, tmp_path):
+    shutil.copytree(learned / "suite", tmp_path / "suite")
+    with pytest.raises(
+        CollectionError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
+    ):
+        build.build_releases(str(learned / "learned.toml"), tmp_path, ["lite"], Console(file=StringIO()))
+    assert not (tmp_path / "lite").exists()
+
+
+def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
+    shutil.copytree(learned / "suite", tmp_path / "suite")
+    path = tmp_path / "suite/demo_wide/fcp/m0/c3/policy.json"
+    card = json.loads(path.read_text())
+    del card["teammate_return"]
+    path.write_text(json.dumps(card))
+    with pytest.raises(OptionError, match=r"demo_wide/fcp/m0/c3: its card lacks 'teammate_return'.*anew"):
+        select.select(tmp_path / "suite", "demo_wide", "fcp", 1, 1)
+
+
+def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("generation.populations.build.build_suite", lambda *arguments: asked.append(dict(arguments[2])))
+    path = tmp_path / "own.toml"
+    path.write_text((FOLDER / "mini.toml").read_text().replace(', "comedi"]', "]"))
+
+    def teammates(*options: str) -> Result:
+        return CliRunner().invoke(cli, ["teammates", "--suite", str(tmp_path / "suite"), *options])
+
+    for options in (
+        ("--profile", str(path)),
+        ("--profile", str(path), "--algorithm", "fcp"),
+        ("--profile", "smoke"),
+        ("--layout", "cramped_room_up", "--layout", "cramped_up", "--algorithm", "comedi"),
+    ):
+        assert teammates(*options).exit_code == 0, options
+    everywhere = load_profile(str(path)).algorithms
+    assert asked == [
+        {layout: list(names) for layout, names in everywhere.items()},
+        {layout: ["fcp"] if "fcp" in names else [] for layout, names in everywhere.items()},
+        {layout: list(ALGORITHMS) for layout in load_profile("smoke").layouts},
+        {"cramped_up": ("comedi",)},
+    ]
+    assert isinstance(teammates("--profile", str(path), "--algorithm", "comedi").exception, OptionError)
+    assert len(asked) == 4
+
+
+def test_unknown_profile_is_one_line(tmp_path):
+    from generation.cli import main
+
+    result = CliRunner().invoke(cli, ["generate", "--profile", "huge", "--out", str(tmp_path)])
+    assert "unknown profile 'huge'; valid: mini, paper, smoke" in str(result.exception)
+    assert callable(main)

@@ -1,0 +1,498 @@
+"""The heuristic teammates: the published play, digit by digit, the published means, every family on every layout from
+both seats, rules that no published play reaches, their noise, and the registry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.env import Environment
+from generation.policy import Noise, draw
+from generation.teammates.heuristics import assembly_line, recipe_aware_button, territory, utility_greedy
+from generation.teammates.heuristics.paths import Paths, Scene
+from generation.teammates.instances import published_thetas
+from generation.teammates.registry import build, heuristic_teammate, sample
+from icrl4aht_data.errors import TaskFormatError, UnknownNameError
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
+from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, PLATE, Layout
+from icrl4aht_data.overcooked.state import faults
+from tests.helpers.scenes import random_records, scene
+
+H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
+MODULES = {H1: recipe_aware_button, H2: territory, H3: assembly_line, H4: utility_greedy}
+# These programs are compiled to run a few times: neither optimise them nor use the newer, slower code generator.
+FAST = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+
+PUBLISHED_PLAY = """
+test_simple (5,2) 000 recipe_aware_button 0 325041120202020202020202020240442402020202020202042402020240
+test_simple (5,2) 000 recipe_aware_button 1 444044414444440341314344444444444444444444144444344444444444
+test_simple (5,2) 000 recipe_aware_button 2 444444404444444444443144444444444444444444444444444444444444
+test_simple (5,2) 000 recipe_aware_button 3 444044414444443444134444444444444444444444444444444344441444
+test_simple (5,2) 000 recipe_aware_button 4 325041120204240202020202020240442402402020202020240420202042
+test_simple (5,2) 000 territory 0 444444444444444444444444444444444444444444444444444444444444
+test_simple (5,2) 000 territory 1 030535113355551133555511335555113351355555113351355555113351
+test_simple (5,2) 000 territory 2 444404444441434444444444444414334044144444444444414344444414
+test_simple (5,2) 000 territory 3 030512503051250305125325124440123244401232535051250305125030
+test_simple (5,2) 000 territory 4 030512503051250305125012020202020202020202020202020202020202
+test_simple (5,2) 000 assembly_line 0 044344404454444125043051245043444440444514244454444444444444
+test_simple (5,2) 000 assembly_line 1 013430535020512503051254044340132051123245413244444444402444
+test_simple (5,2) 000 assembly_line 2 043130414305125034143041341430413134130512503130144301444341
+test_simple (5,2) 000 assembly_line 3 034045414235045121503305143143441435051124302502404305125403
+test_simple (5,2) 000 assembly_line 4 344425134444124444444443142444443444124434444142444444444444
+test_simple (5,2) 000 utility_greedy 0 030512503051250305125325124444444444444450530512503051250305
+"""
+"""layout, the teammate's start, recipe, family, instance, 60 actions in the published ids; the ego stands at (1, 1),
+both face up, and the recipe stays. By an independent simulator of the published teammates."""
+PLAYS = [line.split() for line in PUBLISHED_PLAY.split("\n")[1:-1]]
+
+PUBLISHED_MEANS = {
+    "coord_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.2, 0.0], H4: [40.0] * 5},
+    "test_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.8, 0.0], H4: [40.0] * 5},
+}
+"""Mean returns of t0..t4 beside an ego that always stays, 500 episodes of 100 steps, by the same simulator."""
+
+NOISE = """
+0 1 0.403646 0.557784 0.155612 0.673338
+507451445 1853169794 0.828372 0.199526 0.000862 0.100014
+3704974950 1863054868 0.543613 0.206101 0.890238 0.024123
+3779159788 2663927681 0.767915 0.845932 0.815822 0.315233
+2783477504 2669311029 0.067546 0.878911 0.419685 0.275308
+2051959874 1657856991 0.208008 0.492793 0.256239 0.877548
+3808005281 3946009514 0.226624 0.606609 0.665490 0.032333
+3331961082 2320838513 0.669757 0.632860 0.953956 0.912423
+"""
+"""The two words of a step's key and u1..u4, from step 0, as the published code draws them (JAX 0.5.3)."""
+
+
+def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Parameters with a leading axis over thetas."""
+    defaults = MODULES[family].DEFAULTS
+    dtypes = {name: np.int32 if isinstance(default, int) else np.float32 for name, default in defaults.items()}
+    return {name: np.array([theta[name] for theta in thetas], dtype) for name, dtype in dtypes.items()}
+
+
+# The published play.
+
+
+@lru_cache
+def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.ndarray]:
+    """100 steps of t0..t4 in seat 1 under the published noise beside an ego that stays: actions and returns
+    (100, 5, N), (5, N). The last episode starts from the published scene and its recipe stays."""
+    layout = LAYOUTS[name]
+    thetas = published_thetas(name, family)
+    policy = build(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
+    records = Environment(layout).init(jax.random.split(jax.random.key(7), episodes)).record
+    pinned = scene(layout, (1, 1, "up"), (5, 2, "up"))
+    recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
+    recipes[:, -1] = layout.recipe_items[0]
+
+    def one(params, record, recipes):
+        def step(carry, recipe):
+            record, memory = carry
+            action, memory = policy.act(params, memory, record, jax.random.key(0))
+            outcome = rules.step(layout, record, jnp.array([STAY, action]), recipe)
+            return (outcome.state, memory), (action, outcome.reward)
+
+        return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
+
+    batch = jax.vmap(jax.vmap(one, (None, 0, 1), 1), (0, None, None), 1)
+    run = jax.jit(batch, compiler_options=FAST)
+    actions, rewards = run(stacked(family, thetas), np.concatenate([records, pinned]), recipes)
+    return np.asarray(actions), np.asarray(rewards.sum(axis=0))
+
+
+@pytest.mark.parametrize("line", PLAYS, ids=lambda line: f"{line[3]}-t{line[4]}")
+def test_published_actions(line):
+    name, start, recipe, family, number, digits = line
+    assert (start, recipe, len(digits)) == ("(5,2)", "000", 60)
+    actions = played(name, family)[0][:60, int(number), -1]
+    assert "".join(str(PUBLISHED_ACTIONS.index(ACTIONS[action])) for action in actions) == digits
+
+
+@pytest.mark.parametrize("name", PUBLISHED_MEANS)
+@pytest.mark.parametrize("family", MODULES)
+def test_published_means(name, family):
+    returns = played(name, family)[1][:, :-1]
+    published = np.array(PUBLISHED_MEANS[name][family])
+    error = returns.std(axis=1) * np.sqrt(1 / returns.shape[1] + 1 / 500)
+    assert np.all(np.abs(returns.mean(axis=1) - published) <= 4 * error), (returns.mean(axis=1), error)
+
+
+def test_noise_chain_is_the_published_one():
+    key = jax.random.key(1)
+    for line in NOISE.split("\n")[1:-1]:
+        first, second, *expected = line.split()
+        assert jax.random.key_data(key).tolist() == [int(first), int(second)]
+        key, u = draw(key)
+        np.testing.assert_allclose(u, np.array(expected, float), atol=5e-7)
+
+
+@pytest.mark.parametrize("family", [H1, H2, H3])
+def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
+    for slot in (0, 1):
+        teammate = heuristic_teammate(family, "default", 0)
+        fixed, seeded = (build(LAYOUTS["cramped_up"], teammate, slot, noise) for noise in get_args(Noise))
+        assert fixed.init(fixed.params, jax.random.key(123)).key == jax.random.key(slot)
+        assert seeded.init(seeded.params, jax.random.key(123)).key == jax.random.key(123)
+
+
+# One step of every family.
+
+ROWS = 48
+ALL_SEATS = tuple((family, slot) for family in MODULES for slot in (0, 1))
+
+
+@lru_cache
+def table(layout: Layout, seats: tuple[tuple[str, int], ...] = ALL_SEATS) -> tuple[dict, Callable]:
+    """Policies by seat, and one program for them all: params and memories (ROWS, ...) in order of the seats, records
+    (ROWS, S) -> actions and memories."""
+    policies = {seat: build(layout, heuristic_teammate(seat[0], "default", 0), seat[1]) for seat in seats}
+
+    def act(params, memories, record):
+        key = jax.random.key(0)
+        return [policies[s].act(p, m, record, key) for s, p, m in zip(seats, params, memories, strict=True)]
+
+    return policies, jax.jit(jax.vmap(act), compiler_options=FAST)
+
+
+def act_all(layout: Layout, seats, params: dict, memories: dict, records: np.ndarray) -> dict:
+    _, act = table(layout, seats)
+    return dict(zip(seats, act(*([part[seat] for seat in seats] for part in (params, memories)), records), strict=True))
+
+
+@lru_cache
+def first_memories(layout: Layout, seats=ALL_SEATS) -> dict:
+    keys = jax.random.split(jax.random.key(4), ROWS)
+    policies, _ = table(layout, seats)
+    return {seat: jax.vmap(p.init, (None, 0))(p.params, keys) for seat, p in policies.items()}
+
+
+@lru_cache
+def many_params(name: str) -> dict:
+    """Of every seat ROWS parameter sets: the published ones, the presets and sampled ones."""
+    params = {}
+    for family, module in MODULES.items():
+        presets = [heuristic_teammate(family, preset, 0)["theta"] for preset in module.PRESETS]
+        sampled = [sample(family, number, split)["theta"] for number in range(3) for split in ("train", "test")]
+        thetas = [*published_thetas(name, family), *presets, *sampled]
+        params[family, 0] = params[family, 1] = stacked(family, [thetas[i % len(thetas)] for i in range(ROWS)])
+    return params
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_family_plays_every_layout_from_both_seats(name):
+    """Row i is a game of family i % 4 with itself, at which the others look."""
+    layout = LAYOUTS[name]
+    rng = np.random.default_rng(2)
+    params, memories = many_params(name), first_memories(layout)
+    shapes = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), memories)
+    records = random_records(layout, ROWS, rng)
+    for _ in range(25):
+        acted = act_all(layout, ALL_SEATS, params, memories, records)
+        memories = {seat: memory for seat, (_, memory) in acted.items()}
+        actions = np.stack([acted[seat][0] for seat in ALL_SEATS])
+        assert actions.dtype == np.int32
+        assert set(np.unique(actions)) <= set(range(len(ACTIONS)))
+        played = actions.reshape(4, 2, ROWS)[np.arange(ROWS) % 4, :, np.arange(ROWS)]
+        records = rules.step(layout, records, played, rng.choice(layout.recipe_items, ROWS)).state
+        assert faults(layout, records) == []
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), memories) == shapes
+
+
+# Rules that no published play reaches: what a teammate does in one scene, without noise.
+
+ZERO, ONE = 4, 16  # ingredients 0 and 1 in the kitchens below
+SOUP_0 = 3 * ZERO | COOKED
+DISH_0 = SOUP_0 | PLATE
+MIXED = 2 * ZERO + ONE
+
+
+def one_step(
+    layout: Layout, family: str, slot: int, theta: dict[str, float], mine, partner, memory=None, **fields
+) -> tuple[str, Any]:
+    """What a teammate at `mine` (x, y, facing, item in hand) does beside `partner`: action name and memory."""
+    seats = ALL_SEATS if layout.name in LAYOUTS else ((family, slot),)
+    seated = (mine, partner) if slot == 0 else (partner, mine)
+    fields["hands"] = [place[3] for place in seated]
+    records = np.repeat(scene(layout, seated[0][:3], seated[1][:3], **fields), ROWS, axis=0)
+    memories = first_memories(layout, seats)
+    mind = memories[family, slot]
+    mind = mind._replace(**{name: np.full_like(getattr(mind, name), v) for name, v in (memory or {}).items()})
+    params = {seat: stacked(seat[0], [MODULES[seat[0]].DEFAULTS] * ROWS) for seat in seats}
+    params[family, slot] = stacked(family, [MODULES[family].DEFAULTS | theta] * ROWS)
+    actions, after = act_all(layout, seats, params, memories | {(family, slot): mind}, records)[family, slot]
+    assert len(set(actions.tolist())) == 1
+    return ACTIONS[actions[0]], jax.tree.map(lambda leaf: leaf[0], after)
+
+
+SPECIALIST = {"task_specialization": 1.0}
+RUNNER, PLATER = {"role_mode": 0}, {"role_mode": 1}
+FULL = {"pot_items": [3 * ZERO], "pot_timers": [19]}
+DONE = {"pot_items": [SOUP_0]}
+INVADER = {"behavior_mode": territory.INVADER, "strictness": 1.0, "shared_margin": 0}
+TWO = {"pot_items": [2 * ZERO]}
+
+CRAMPED_CASES = [
+    # H1: round the partner, or push.
+    (H1, {}, {}, "1 32- 12- left, 1 32- 22- up, 0 21d 31- down, 0 210 22- right, 0 120 22- right, 0 32- 22- up"),
+    (H1, {}, DONE, "0 21p 22- right, 1 21p 32d down"),
+    # H1 seat 1 leaves the pot to a partner who brings an ingredient and is about as near.
+    (H1, {}, {}, "1 220v 210 right, 1 220v 110 interact, 1 220v 21p interact, 0 220v 210 interact, 0 21d 32- right"),
+    # H1 specialists: seat 1 fetches no plate while the partner has none; seat 0 puts its dish down.
+    (H1, SPECIALIST, {}, "1 21- 32- down, 1 21- 32p left, 0 21d 32- interact"),
+    # H1 with a plate makes way for a dish.
+    (H1, {}, {}, "1 21p 11d down, 1 12p 11d right, 1 32p 11d stay, 1 22p 32d left, 0 31p 32d left, 1 21p 12d stay"),
+    # H1: two chefs fetch different ingredients of a mixed recipe.
+    (H1, {}, {"recipe": MIXED}, "1 22- 12- right, 0 22- 32- left"),
+    (H1, {}, {"recipe": MIXED, "pot_items": [ZERO + ONE]}, "1 22- 32- left"),
+    # H2 waits at a single access, and walks round the partner.
+    (H2, {"yield_bias": 0.1}, {}, "1 21- 12- stay, 1 21- 32- left"),
+    (H2, {"yield_bias": 0.05}, {}, "1 21- 12- left, 1 32- 22- up"),
+    (H2, {"yield_bias": 0.3}, {}, "0 32- 22- up"),
+    (H2, {"yield_bias": 0.2}, {}, "0 32- 22- left"),
+    # H2 picks up what lies on a counter; lays down a plate that nothing needs.
+    (H2, {}, {"counters": {(2, 0): ONE}}, "1 21- 32- interact"),
+    (H2, {}, {}, "1 21p 32- interact"),
+    (H2, {}, FULL, "1 22pv 32- stay"),
+    # H2, strict, for want of a goal or pile of its own uses the other's.
+    (H2, {"strictness": 1.0}, {"recipe": 3 * ONE}, "0 21d 32- right, 0 11- 32- right"),
+    # H3 seat 1, empty-handed, makes room for a partner who carries something; seat 0 does not.
+    (H3, {}, {}, "1 21- 11p right, 1 31- 21p down, 1 21- 220 right, 1 32- 31d left, 0 21- 11p left"),
+    # H3 seat 1 stays where the next cell touches the partner.
+    (H3, {}, {}, "1 32- 12- stay, 0 32- 12- left, 1 22- 31- left"),
+    # H3: an ingredient in the partner's hand counts as in the pot, a dish does not.
+    (H3, {}, TWO, "0 22- 310 down, 0 22- 311 left, 0 22- 31d left"),
+    # H3 roles: a soup calls for a plate; so does a cooking one, if urgent.
+    (H3, {}, DONE, "0 21- 32- left"),
+    (H3, {"plate_urgency": 0.6}, FULL, "0 21- 32- left"),
+    (H3, {"plate_urgency": 0.5}, FULL, "0 21- 32- down"),
+    (H3, PLATER, {}, "0 210 32- interact"),
+    (H3, RUNNER, DONE, "0 21p 32- interact, 0 210 32- interact"),
+    # H3 hands an ingredient off beside the pot, in the middle, or near the partner.
+    (H3, RUNNER | {"handoff_style": 0}, FULL, "0 210 32- down"),
+    (H3, RUNNER | {"handoff_style": 1}, FULL, "0 210 32- interact"),
+    (H3, RUNNER | {"handoff_style": 2}, FULL, "0 210 32- right"),
+]
+ASYMM_CASES = [
+    # H1 brings an ingredient to the pot that lacks it, or to any.
+    (H1, {}, {"recipe": MIXED, "pot_items": [0, 2 * ZERO]}, "1 530< 13- up, 1 531< 13- interact"),
+    (H1, {}, {"pot_items": [0, ZERO]}, "1 531< 13- interact"),
+    # An H2 that invades takes no plate of its own side, and wanders, unless soups pile up.
+    (H2, INVADER, {"pot_items": [SOUP_0, 0]}, "1 53-> 13- right"),
+    (H2, INVADER, {"pot_items": [SOUP_0, SOUP_0]}, "1 53-v 13- interact"),
+]
+DEMO_CASES = [
+    # A stubborn H3 walks home, with empty hands: seat 1 to (5, 3); seat 0's home is a wall.
+    (H3, {"stubbornness": 1.0}, {}, "1 13- 51- right, 1 130 51- right, 0 41- 13- left"),
+    (H3, {}, {}, "1 13- 51- down"),
+]
+SCENES = {"cramped_down": CRAMPED_CASES, "asymm_right": ASYMM_CASES, "demo_wide": DEMO_CASES}
+"""Family, parameters, state, and moves: seat; x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (up if not
+given) of itself; the same of the partner; the action. cramped_down has floor at (1..3, 1..2), plates at (1, 0), the
+goal at (3, 0), pile 0 at (0, 1), pile 1 at (4, 1) and the pot at (2, 3); asymm_right has pots at (4, 2) and (4, 3)."""
+
+
+@pytest.mark.parametrize("case", [(name, *case) for name, cases in SCENES.items() for case in cases], ids=str)
+def test_scenes(case):
+    name, family, theta, fields, moves = case
+    hands = {"-": 0, "p": PLATE, "d": DISH_0, "0": ZERO, "1": ONE}
+    facings = {"": "up", "v": "down", "<": "left", ">": "right"}
+    for move in moves.split(", "):
+        slot, mine, partner, expected = move.split()
+        seated = [(int(p[0]), int(p[1]), facings[p[3:]], hands[p[2]]) for p in (mine, partner)]
+        assert one_step(LAYOUTS[name], family, int(slot), theta, *seated, **fields)[0] == expected, move
+
+
+@pytest.mark.parametrize(
+    ("cell", "stuck", "expected", "stuck_after"), [(7, 3, "right", 4), (8, 3, "right", 0), (7, 2, "interact", 3)]
+)
+def test_h2_wanders_after_four_looks_at_one_cell(cell, stuck, expected, stuck_after):
+    memory, counters = {"cell": cell, "stuck": stuck}, {(2, 0): ONE}
+    mine, partner = (2, 1, "up", 0), (3, 2, "up", 0)
+    action, after = one_step(LAYOUTS["cramped_down"], H2, 1, {}, mine, partner, memory, counters=counters)
+    assert (action, int(after.cell), int(after.stuck)) == (expected, 7, stuck_after)
+
+
+@pytest.mark.parametrize("name", ["coord_simple", "demo_wide", "asymm_both"])
+def test_h2_territories_are_the_written_ones(name):
+    layout = LAYOUTS[name]
+    y, x = np.divmod(np.arange(layout.cells), layout.width)
+    letters = np.array(list("".join(layout.rows)))
+
+    def to_centroid(kinds: str) -> np.ndarray:
+        of = np.isin(letters, list(kinds))
+        return np.abs(x - x[of].mean()) + np.abs(y - y[of].mean())
+
+    to_prep, to_service = to_centroid("P0123"), to_centroid("XB")
+    floor = layout.walkable
+    stations = bool(np.any(to_prep[floor] < to_service[floor]) and np.any(to_service[floor] <= to_prep[floor]))
+    record = random_records(layout, 1, np.random.default_rng(0))[0]
+    for slot, split, m, mode in [(s, k, m, b) for s in (0, 1) for k in (0, 1, 2) for m in (0, 2) for b in (0, 5)]:
+        params = {"split_mode": jnp.int32(split), "shared_margin": jnp.int32(m), "behavior_mode": jnp.int32(mode)}
+        areas = territory.areas(Scene(Paths(layout), jnp.asarray(record), slot), params)
+        seat = 1 - slot if mode == territory.INVADER else slot
+        if split == territory.STATIONS and stations:
+            strict = (to_prep < to_service, to_service <= to_prep)[seat]
+            relaxed = (to_prep < to_service + 1.5 * m, to_service < to_prep + 1.5 * m)[seat]
+        else:
+            along, middle = (y, layout.height // 2) if split == territory.HORIZONTAL else (x, layout.width // 2)
+            strict = (along < middle, along >= middle)[seat]
+            relaxed = (along < middle + m, along >= middle - m)[seat]
+        np.testing.assert_array_equal(areas.strict, strict)
+        np.testing.assert_array_equal(areas.relaxed, relaxed)
+
+
+def links(key: jax.Array, n: int) -> list[int]:
+    for _ in range(n):
+        key = jax.random.split(key)[0]
+    return jax.random.key_data(key).tolist()
+
+
+@pytest.mark.parametrize(
+    ("family", "theta", "hand", "expected"),
+    [
+        (H1, {}, 0, 1),
+        (H1, {"wrong_ingredient_prob": 1.0}, 0, 2),
+        (H1, {"wrong_ingredient_prob": 1.0}, ZERO, 1),
+        (H1, {"wrong_ingredient_prob": 1.0, "idle_prob": 1.0}, 0, 1),
+        (H1, {"wrong_ingredient_prob": 1.0, "path_blocking": 1.0}, 0, 1),
+        (H3, {"stubbornness": 0.1}, 0, 2),
+        (H3, {"stubbornness": 0.1}, ZERO, 1),
+        (H3, {"stubbornness": 0.1, "hesitation_prob": 1.0}, 0, 1),
+    ],
+)
+def test_links_of_the_key_chain(family, theta, hand, expected):
+    layout = LAYOUTS["demo_wide"]
+    _, after = one_step(layout, family, 1, theta, (4, 3, "up", hand), (5, 1, "up", 0))
+    assert jax.random.key_data(after.key).tolist() == links(first_memories(layout)[family, 1].key[0], expected)
+
+
+@pytest.mark.parametrize("stubbornness", [0.0, 0.1])
+def test_h3_wrong_moves_are_the_keys_own(stubbornness):
+    """The chain's next key is split once more, and the second half draws one of right, down, left, up."""
+    layout, seat = LAYOUTS["demo_wide"], (H3, 1)
+    records = np.repeat(scene(layout, (5, 1, "up"), (4, 3, "up")), ROWS, axis=0)
+    memories = first_memories(layout)
+    params = many_params("demo_wide") | {
+        seat: stacked(H3, [assembly_line.DEFAULTS | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)
+    }
+    actions, after = act_all(layout, ALL_SEATS, params, memories, records)[seat]
+    for action, key, start in zip(actions, after.key, memories[seat].key, strict=True):
+        own = jax.random.split(jax.random.split(start)[0])[1]
+        drawn = PUBLISHED_ACTIONS[int(jax.random.randint(own, (), 0, 4))]
+        assert stubbornness or ACTIONS[action] == drawn
+        assert jax.random.key_data(key).tolist() == links(start, 3 if stubbornness else 2)
+    assert len(set(actions.tolist())) == 4
+
+
+UNSIGNED = Layout("unsigned", "test_unsigned", ("WWLWPWW", "0A   AX", "1     B", "WWWWWWW"))
+"""Nothing shows the recipe but the button."""
+SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("theta", "memory", "fields", "expected", "steps"),
+    [
+        (SURE, {}, {}, "left", 1),  # to the button
+        (SURE | {"cost_sensitivity": 1.0}, {}, {}, "stay", 0),  # hovers; the failed roll keeps the key
+        ({"press_L_when_unknown": 0.0, "strict_recipe": 0.3}, {}, {}, "left", 0),  # guesses pile 0
+        ({"press_L_when_unknown": 0.0, "wrong_ingredient_prob": 1.0}, {}, {}, "left", 1),  # -1 + 1 is pile 0
+        (SURE | {"idle_prob": 1.0}, {}, {}, "stay", 1),
+        (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 100}, FULL, "stay", 1),
+        (SURE, {"recipe": 3 * ZERO, "seen": 0, "clock": 101}, FULL, "left", 1),
+        (SURE, {}, FULL | {"buttons": [5]}, "stay", 1),
+    ],
+)
+def test_h1_asks_the_button(theta, memory, fields, expected, steps):
+    action, after = one_step(UNSIGNED, H1, 1, theta, (4, 1, "up", 0), (5, 2, "up", 0), memory, **fields)
+    assert action == expected
+    start = first_memories(UNSIGNED, ((H1, 1),))[H1, 1].key[0]
+    assert jax.random.key_data(after.key).tolist() == links(start, steps)
+    assert int(after.recipe) == (3 * ZERO if fields.get("buttons") else memory.get("recipe", 0))
+
+
+# The registry.
+
+
+@pytest.mark.parametrize("family", MODULES)
+def test_missing_and_unknown_parameters(family):
+    theta = dict(MODULES[family].DEFAULTS)
+    first = next(iter(theta))
+    theta[f"{first}_"] = theta.pop(first)
+    with pytest.raises(TaskFormatError, match=rf"{family}: missing parameters \['{first}'\].*\['{first}_'\]"):
+        build(LAYOUTS["demo_wide"], {"family": family, "theta": theta})
+
+
+@pytest.mark.parametrize(
+    ("family", "name", "value", "expected"),
+    [
+        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number in 0..1\)"),
+        (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected a whole number from 0\)"),
+        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected a whole number in 0..5\)"),
+        (H2, "shared_margin", True, r"shared_margin = True \(expected a whole number from 0\)"),
+        (H3, "role_mode", -1, r"role_mode = -1 \(expected a whole number in 0..2\)"),
+        (H4, "inertia", None, r"inertia = None \(expected a number in 0..1\)"),
+    ],
+)
+def test_impossible_parameters(family, name, value, expected):
+    with pytest.raises(TaskFormatError, match=f"teammate {family}: out of range: {expected}"):
+        build(LAYOUTS["demo_wide"], {"family": family, "theta": MODULES[family].DEFAULTS | {name: value}})
+
+
+def test_unknown_presets_and_splits():
+    with pytest.raises(UnknownNameError, match=r"preset of assembly_line 'plater'.*Did you mean 'plater_deliverer'"):
+        heuristic_teammate(H3, "plater", 0)
+    with pytest.raises(UnknownNameError, match=r"split 'tests'.*Did you mean 'test'"):
+        sample(H1, 0, "tests")
+    with pytest.raises(UnknownNameError, match=r"teammate family 'territori'.*Did you mean 'territory'"):
+        sample("territori", 0, "test")
+
+
+RANGES = """
+recipe_aware_button train default,high_L_priority 0.6-1 50,80,100 0-0.4 0.7-1 *1 *1 *0.9 *1 . . . . .
+recipe_aware_button test lazy_learner,strict_adherent 0.2-0.6 100,150,200 0.4-0.9 0.2-0.6 *1 *1 *0.9 *1 . . . . .
+territory train default,flexible 0,1 0-0.3 1,2,3 0.2-0.4 *1 . .
+territory test flexible,object_stations 1,2 0-0.3 1,2,3 0.2-0.4 *1 . .
+assembly_line train default,ingredient_runner 0,2 . 0-0.6 0.2-0.6 *1 . . . . .
+assembly_line test plater_deliverer 1 . 0.6-1 0-0.3 *1 . . . . .
+utility_greedy train default,delivery_focused 8-18 6-14 *8 3-8 *8 *4.5 *12 *7 0.2-0.7 0.1-0.5 *1
+utility_greedy test prep_focused,high_inertia,distance_sensitive 5-12 3-8 *8 7-12 *8 *4.5 *12 *7 0.6-1.2 0.5-0.9 *1
+"""
+"""Family, split, presets, and of every parameter the range low-high, the list, *width of the full range around the
+preset's value, or . for that value: the published code's, for the splits of the paper's App. B.3."""
+
+
+@pytest.mark.parametrize("line", RANGES.split("\n")[1:-1])
+def test_samples_stay_in_their_ranges(line):
+    family, split, presets, *ranges = line.split()
+    module = MODULES[family]
+    entries = [sample(family, number, split) for number in range(12)]
+    assert entries == [sample(family, number, split) for number in range(12)]
+    assert len({str(entry["theta"]) for entry in entries}) == 12
+    assert sample(family, 0, split, 1)["theta"] != entries[0]["theta"]
+    assert sample(family, 0, ("train", "test")[split == "train"])["theta"] != entries[0]["theta"]
+    for entry in entries:
+        assert list(entry) == ["kind", "family", "theta_id", "base_seed", "theta"]
+        assert list(entry["theta"]) == list(module.DEFAULTS)
+        build(LAYOUTS["demo_wide"], entry)
+        for (name, value), text in zip(entry["theta"].items(), ranges, strict=True):
+            assert type(value) is type(module.DEFAULTS[name])
+            bases = [(module.DEFAULTS | module.PRESETS[preset])[name] for preset in presets.split(",")]
+            assert in_range(value, text, bases), (name, value)
+
+
+def in_range(value: float, text: str, bases: list[float]) -> bool:
+    if text == "." or text.startswith("*"):
+        away = 0.2 * float(text[1:] or 0)
+        return min(abs(value - base) for base in bases) <= away + 1e-6
+    if "-" in text:
+        low, high = map(float, text.split("-"))
+        return low - 1e-6 <= value <= high + 1e-6
+    return str(value) in text.split(",")

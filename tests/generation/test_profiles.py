@@ -1,0 +1,291 @@
+"""Profiles, the tasks they list, and task files."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from generation.learners.network import Widths
+from generation.profiles import FOLDER, load_profile, names
+from generation.teammates.registry import heuristic_teammate
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
+from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_id, write_tasks
+from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+
+VALID = """
+[ego]
+total_steps = 32000
+environments = 8
+rollout = 40
+minibatches = 4
+widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
+
+[release]
+data_version = "0.2.0"
+keep = 8
+
+[tasks]
+layouts = ["coord_simple", "cramped_room_up"]
+presets = ["default", "high_inertia"]
+"""
+
+
+@pytest.fixture
+def changed(tmp_path) -> Callable[[str, str], str]:
+    """The path of a profile file with one text replaced by another."""
+
+    def write(old: str, new: str) -> str:
+        assert VALID.count(old) == 1
+        path = tmp_path / "mine.toml"
+        path.write_text(VALID.replace(old, new), encoding="utf-8")
+        return str(path)
+
+    return write
+
+
+# Shipped profiles.
+
+
+def test_names_are_the_shipped_files():
+    assert names() == sorted(path.stem for path in FOLDER.glob("*.toml"))
+    assert {"mini", "paper", "smoke"} <= set(names())
+
+
+@pytest.mark.parametrize("name", names())
+def test_shipped_profiles_load(name):
+    profile = load_profile(name)
+    assert profile.name == name
+    assert profile.ego.updates > 0
+    assert 0 < profile.keep <= profile.ego.environments
+    for layout in profile.layouts:
+        learned = len(profile.algorithms.get(layout, ())) * profile.teammates.train
+        assert profile.task_layouts.count(layout) == len(profile.presets) + learned > 0
+    tasks = profile.heuristic_tasks()
+    assert len(tasks) == len(profile.layouts) * len(profile.presets)
+    for task in tasks:
+        assert task.layout.name in TRACKS[task.track]["train"]
+        assert task.split == "train"
+
+
+def test_every_task_has_a_seed_and_an_id_of_its_own(changed):
+    tasks = load_profile(changed("keep = 8", "keep = 8")).heuristic_tasks()
+    assert len(tasks) == 4
+    assert len({task.seed for task in tasks}) == len(tasks)
+    assert len({task.task_id for task in tasks}) == len(tasks)
+    assert len({(task.layout_name, json.dumps(task.teammate["theta"])) for task in tasks}) == len(tasks)
+
+
+def test_paper_profile_has_the_papers_numbers():
+    profile = load_profile("paper")
+    ego = profile.ego
+    assert (ego.total_steps, ego.environments, ego.rollout) == (60_000_000, 1024, 256)
+    assert (ego.epochs, ego.minibatches, ego.learning_rate, ego.warmup) == (4, 64, 2.5e-4, 0.1)
+    assert (ego.discount, ego.gae_lambda, ego.clip, ego.max_grad_norm) == (0.99, 0.95, 0.2, 0.25)
+    assert (ego.entropy, ego.value, ego.shaping_horizon) == (0.01, 0.5, 60_000_000)
+    assert ego.widths == Widths((128, 128, 8), (16, 32, 32), 128, 128, 128)
+    assert profile.keep == 128
+    assert (profile.presets, len(profile.task_layouts)) == ((), 8 * 80)
+    assert profile.algorithms == dict.fromkeys(profile.layouts, ALGORITHMS)
+    assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
+
+
+def test_paper_profile_keeps_146_episodes():
+    """T = 146 x 100 = 14,600 (paper, App. D.1), though 228 whole updates are 58,368 steps: the 146th
+    episode has its first 100, and the state after them."""
+    assert load_profile("paper").ego.updates == 228
+    assert load_profile("paper").ego.episodes == 146
+
+
+def test_mini_profile_has_histories_of_full_length():
+    assert load_profile("mini").ego.episodes == 146
+
+
+def test_ego_hash_is_of_the_ego_alone(changed):
+    plain = load_profile(changed("keep = 8", "keep = 8"))
+    assert plain.ego_hash == load_profile(changed("keep = 8", "keep = 7")).ego_hash
+    assert plain.ego_hash == load_profile(changed('"coord_simple", ', "")).ego_hash
+    assert plain.ego_hash != load_profile(changed("rollout = 40", "rollout = 80")).ego_hash
+    assert plain.ego_hash != load_profile(changed("dense = 8", "dense = 9")).ego_hash
+
+
+# Profile files.
+
+
+def test_a_profile_by_its_path(changed):
+    profile = load_profile(changed("keep = 8", "keep = 5"))
+    assert (profile.name, profile.keep, profile.data_version) == ("mine", 5, "0.2.0")
+    assert profile.layouts == ("coord_simple", "cramped_up")
+    assert profile.ego.widths == Widths((4,), (4,), 8, 8, 8)
+    assert (profile.ego.updates, profile.ego.episodes, profile.ego.epochs) == (100, 10, 4)
+    tasks = profile.heuristic_tasks()
+    made = [(task.layout.name, task.track, task.teammate["theta"]["inertia"], task.seed) for task in tasks]
+    assert made == [
+        ("coord_simple", "teammate", 0.3, 0),
+        ("coord_simple", "teammate", 0.7, 1),
+        ("cramped_up", "layout", 0.3, 2),
+        ("cramped_up", "layout", 0.7, 3),
+    ]
+
+
+def test_learned_teammates_on_some_layouts(changed):
+    learned = 'algorithms = { cramped_room_up = ["fcp", "comedi"], coord_simple = [] }\npresets ='
+    profile = load_profile(changed("presets =", learned))
+    assert profile.algorithms == {"cramped_up": ("fcp", "comedi")}
+    assert profile.task_layouts.count("coord_simple") == 2
+    assert profile.task_layouts.count("cramped_up") == 2 + 2 * profile.teammates.train
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[release]", "[releases]", r"unknown key 'releases'; .*Did you mean 'release'\?"),
+        ("[ego]", "speed = 3\n[ego]", r"unknown key 'speed'"),
+        ("rollout = 40", "rolout = 40", r"unknown key 'ego.rolout'; .*Did you mean 'ego.rollout'\?"),
+        ("gru = 8", "grus = 8", r"unknown key 'ego.widths.grus'; .*Did you mean 'ego.widths.gru'\?"),
+        ("keep = 8", "keeps = 8", r"unknown key 'release.keeps'; .*Did you mean 'release.keep'\?"),
+        ("presets =", "preset =", r"unknown key 'tasks.preset'; .*Did you mean 'tasks.presets'\?"),
+        ("keep = 8", "", r"missing key 'keep'"),
+        ('[release]\ndata_version = "0.2.0"\nkeep = 8', "", r"missing key 'release'"),
+        (
+            'presets = ["default", "high_inertia"]',
+            "",
+            r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
+        ),
+        (
+            'presets = ["default", "high_inertia"]',
+            'algorithms = ["fpc"]',
+            r"tasks\.algorithms: unknown algorithm 'fpc'; .*mean 'fcp'\?",
+        ),
+        ('"coord_simple"', '"coord_simpel"', r"unknown layout 'coord_simpel'; .*Did you mean 'coord_simple'\?"),
+        ('"default"', '"defualt"', r"unknown preset of utility_greedy 'defualt'; .*Did you mean 'default'\?"),
+        (
+            "presets =",
+            'algorithms = { demo_wide = ["fcp"] }\npresets =',
+            r"tasks\.algorithms\.demo_wide: expected one of tasks\.layouts",
+        ),
+        ("presets =", 'algorithms = { demo_wied = ["fcp"] }\npresets =', r"unknown layout 'demo_wied'"),
+        (
+            "presets =",
+            'algorithms = { cramped_up = ["fcp"], cramped_room_up = ["fcp"] }\npresets =',
+            r"tasks\.algorithms = \['cramped_up', 'cramped_up'\]: expected names, none twice",
+        ),
+        ("presets =", 'algorithms = "fcp"\npresets =', r"tasks\.algorithms = 'fcp': expected list"),
+        (
+            "presets =",
+            'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =',
+            r"tasks\.algorithms\.cramped_up = .*: expected names, none twice",
+        ),
+        ("keep = 8", "keep = 0", r"release\.keep = 0: expected 1\.\.8"),
+        ("keep = 8", "keep = 9", r"release\.keep = 9: expected 1\.\.8"),
+        ("minibatches = 4", "minibatches = 3", r"environments = 8: not a multiple of minibatches = 3"),
+        ("keep = 8", 'keep = "8"', r"release\.keep = '8': expected int"),
+        ("keep = 8", "keep = true", r"release\.keep = True: expected int"),
+        ('data_version = "0.2.0"', "data_version = 2", r"release\.data_version = 2: expected str"),
+        ('data_version = "0.2.0"', "", r"missing key 'data_version'"),
+        ("minibatches = 4", "minibatches = 0", r"ego\.minibatches = 0: expected a positive number"),
+        ("rollout = 40", "rollout = -40", r"ego\.rollout = -40: expected a positive number"),
+        ("total_steps = 32000", "total_steps = 3.2e4", r"ego\.total_steps = 32000\.0: expected int"),
+        ("rollout = 40", 'rollout = 40\nlearning_rate = "fast"', r"ego\.learning_rate = 'fast': expected float"),
+        ("gru = 8", "gru = 8.5", r"widths\.gru = 8\.5: expected positive whole numbers"),
+        (
+            '["coord_simple", "cramped_room_up"]',
+            "[]",
+            r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
+        ),
+        ("total_steps = 32000", "total_steps = 13500", r"ego\.total_steps gives 4 episodes .*expected at least 5"),
+        ("keep = 8", "keep 8", r"not TOML: "),
+    ],
+)
+def test_faults_are_named_with_the_file(changed, old, new, message):
+    path = changed(old, new)
+    with pytest.raises(OptionError, match=rf"^{re.escape(path)}: {message}"):
+        load_profile(path)
+
+
+@pytest.mark.parametrize("name", ["smoek", "smoek.toml"])
+def test_unknown_profile_name(name):
+    with pytest.raises(UnknownNameError, match=rf"unknown profile '{name}'; valid: .*Did you mean 'smoke'\?"):
+        load_profile(name)
+
+
+# Tasks.
+
+
+def test_an_id_depends_on_every_part_of_its_task():
+    def hashed(track="teammate", split="train", layout="demo_cook_wide", preset="default", theta_id=0, seed=0) -> str:
+        return task_id(track, split, layout, heuristic_teammate("utility_greedy", preset, theta_id), seed)[-8:]
+
+    others = [hashed("layout"), hashed(split="test"), hashed(layout="demo_cook_simple"), hashed(preset="high_inertia")]
+    others += [hashed(theta_id=1), hashed(seed=1)]
+    assert len({hashed(), *others}) == 7
+
+
+def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
+    teammate = heuristic_teammate("utility_greedy", "default", 0)
+    short, long = (make_task("teammate", "train", name, teammate, 0) for name in ("coord_ring", "grounded_coord_ring"))
+    assert short == long
+    assert (short.layout_name, short.layout.name) == ("grounded_coord_ring", "coord_ring")
+    assert (short.teammate_kind, short.teammate_family) == ("utility_greedy", "H4")
+    with pytest.raises(UnknownNameError, match=r"asymm_right.*valid: asymm_both, cramped_up"):
+        make_task("layout", "train", "asymm_right", teammate, 0)
+
+
+def test_task_files_round_trip(tmp_path):
+    tasks = load_profile("smoke").heuristic_tasks()
+    path = tmp_path / "tasks.jsonl"
+    write_tasks(path, tasks)
+    assert read_tasks(path) == tasks
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line) for line in lines] == [asdict(task) for task in tasks]
+    assert list(json.loads(lines[0])) == ["task_id", "track", "split", "layout_name", "seed", "teammate"]
+
+
+def _lines() -> list[str]:
+    return [json.dumps(asdict(task)) for task in load_profile("smoke").heuristic_tasks()]
+
+
+def _with(line: str, **fields) -> str:
+    return json.dumps(json.loads(line) | fields)
+
+
+def _without(line: str, field: str) -> str:
+    return json.dumps({name: value for name, value in json.loads(line).items() if name != field})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda first, line: _with(line, color="blue"), r"expected the fields \[.*\], found \[.*'color'.*\]"),
+        (lambda first, line: _without(line, "seed"), r"expected the fields \[.*'seed'.*\], found \["),
+        (lambda first, line: first, r"duplicate task_id 'teammate_train_grounded_coord_simple_utility_greedy_t0_s0_"),
+        (lambda first, line: _with(line, seed=9), r"task_id '.*_s1_.*' does not match .*expected '.*_s9_"),
+        (
+            lambda first, line: _with(line, task_id=line.split('"')[3][:-8] + "00000000"),
+            r"task_id '.*_00000000' does not match",
+        ),
+        (lambda first, line: _with(line, layout_name="demo_cook_wild"), r"unknown layout .*mean 'demo_cook_wide'\?"),
+        (lambda first, line: _with(line, track="teammates"), r"unknown track 'teammates'; .*mean 'teammate'\?"),
+        (lambda first, line: _with(line, split="tests"), r"unknown split 'tests'; .*mean 'test'\?"),
+        (
+            lambda first, line: _with(line, teammate={"kind": "heuristic"}),
+            r"teammate: expected kind 'heuristic' or 'rl' and a family, found",
+        ),
+        (lambda first, line: _with(line, seed="1"), r"seed: expected int, found '1'"),
+        (lambda first, line: _with(line, track=["teammate"]), r"unknown track \['teammate'\]"),
+        (lambda first, line: _with(line, layout_name="asymm_advantages_recipes_right"), r"unknown layout of the train"),
+        (lambda first, line: line[:-1], r"not JSON: "),
+        (lambda first, line: "", r"not JSON: "),
+        (lambda first, line: "[1, 2]", r"expected the fields \[.*\], found list"),
+    ],
+)
+def test_faults_of_task_files_are_named_with_the_line(tmp_path, change, message):
+    first, second = _lines()
+    path: Path = tmp_path / "tasks.jsonl"
+    path.write_text(f"{first}\n{change(first, second)}\n", encoding="utf-8")
+    with pytest.raises(TaskFormatError, match=rf"^{re.escape(str(path))}, line 2: {message}"):
+        read_tasks(path)

@@ -1,0 +1,46 @@
+"""What tests of batches share: samplers of each kind, equality, a digest."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.reading.sources import Cache
+
+CACHES: tuple[Cache, ...] = ("ram", "mmap", "stream")
+
+
+def samplers(dataset, **options):
+    """One of each kind and order."""
+    return [
+        dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
+        dataset.ad(batch_size=6, length=130, **options),  # longer than the histories
+        dataset.dpt(batch_size=6, context=17, **options),
+        dataset.dpt(batch_size=6, context=17, order="random", teammate_actions=True, **options),
+    ]
+
+
+def assert_equal(one, two) -> None:
+    """Two batches have the same arrays, and lack the same ones."""
+    assert one._fields == two._fields
+    for name, array in one._asdict().items():
+        np.testing.assert_array_equal(array, getattr(two, name), err_msg=name, strict=True)
+
+
+def digest(root: Path) -> str:
+    """Of a few batches of both samplers."""
+    dataset = load_icrl4aht(root, layout="demo_wide")
+    samplers = [
+        dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),
+        dataset.dpt(batch_size=5, context=12, seed=7),
+        dataset.dpt(batch_size=5, context=12, seed=7, order="random"),
+    ]
+    state = hashlib.sha256()
+    for sampler in samplers:
+        for i in (0, 1, 1000):
+            for name, array in sampler[i]._asdict().items():
+                state.update(name.encode() + (b"" if array is None else array.tobytes()))
+    return state.hexdigest()

@@ -1,0 +1,115 @@
+"""Histories for tests, played by the NumPy game itself: real states, rewards and episode ends, no learning."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.format.schema import Entry, Kind
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.rules import step
+from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+
+SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
+"""The first shard of `random_release`."""
+
+
+def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """The arrays of one history: random actions, rich in interactions."""
+    rooms = layout.rooms
+    positions = np.stack([rng.choice(room, episodes) for room in rooms], axis=1)
+    clash = positions[:, 0] == positions[:, 1]
+    positions[clash] = rooms[0][0], rooms[1][-1]
+    facings = rng.integers(0, 4, (episodes, 2)).astype(np.uint8)
+    state = start(layout, positions, facings, rng.choice(layout.recipe_items, episodes))
+    actions = np.where(rng.random((length, episodes, 2)) < 0.4, 5, rng.integers(0, 6, (length, episodes, 2)))
+    states, rewards = [], []
+    for row in actions:
+        outcome = step(layout, state, row, rng.choice(layout.recipe_items, episodes))
+        states.append(state)
+        rewards.append(outcome.reward)
+        state = outcome.state
+    steps = episodes * length
+    done = np.zeros((episodes, length), bool)
+    done[:, -1] = True
+    return {
+        "state": np.stack(states, axis=1).reshape(steps, -1),
+        "actions": actions[..., 0].T.reshape(-1),
+        "teammate_actions": actions[..., 1].T.reshape(-1),
+        "rewards": np.stack(rewards, axis=1).reshape(-1),
+        "dones": done.reshape(-1),
+        "expert_actions": rng.integers(0, 6, steps),
+        "episode_end_state": state,
+    }
+
+
+def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
+    """Tasks with made-up heuristic entries, of the training split where the layout has one."""
+    return [
+        make_task(
+            track_of(layout),
+            "train" if layout in TRACKS[track_of(layout)]["train"] else "test",
+            layout,
+            {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {}},
+            seed,
+        )
+        for seed, (layout, t) in enumerate((layout, t) for layout in layouts for t in range(teammates))
+    ]
+
+
+def random_release(
+    root: Path,
+    kind: Kind = "lite",
+    layouts: tuple[str, ...] = ("coord_simple", "demo_wide"),
+    *,
+    teammates: int = 2,
+    streams: int = 3,
+    episodes: int = 6,
+    length: int = 20,
+    labels: bool = True,
+    seed: int = 0,
+    shard_histories: int = 1024,
+) -> dict[int, dict[str, np.ndarray]]:
+    """Write a release of random play; history id -> the arrays that went in."""
+    rng = np.random.default_rng(seed)
+    written: dict[int, dict[str, np.ndarray]] = {}
+    tasks = []
+    for task in make_tasks(list(layouts), teammates):
+        histories = []
+        for stream in range(streams):
+            arrays = play(get_layout(task.layout_name), episodes, length, rng)
+            if not labels:
+                del arrays["expert_actions"]
+            written[len(written)] = arrays
+            histories.append(NewHistory(stream, arrays))
+        tasks.append(NewTask(task, {"seed": seed}, streams, lambda histories=histories: histories))
+    write_release(
+        root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
+    )
+    return written
+
+
+def long_index(root: Path, lines: int = 3000) -> list[Entry]:
+    """A release's meta with that many lines, more than are parsed at once; no shards."""
+    source = load_icrl4aht(MINI).entries
+    rng = np.random.default_rng(0)
+    made = []
+    for number in range(lines):
+        line = source[(5 * (number // 40)) % len(source)].to_json()
+        line |= {"history_id": number, "env_idx": int(rng.integers(1024)), "score": float(rng.normal()), "h5_row": None}
+        line["task_id"] += f"_{number // 40}"
+        line["shard"] = line["shard"].replace("00000-of-00001", f"{number // 500:05}-of-00006")
+        made.append(line | ({"h5_row": number % 500} if number % 3 else {}))
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(
+        json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
+    )
+    (root / "meta" / "histories.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))
+    return [Entry.from_json(line) for line in made]

@@ -1,0 +1,73 @@
+"""The smallest rebuilds, and how to run one in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+
+from tests.helpers.paths import ROOT
+
+TINY = """
+[ego]
+total_steps = 16_000
+environments = 8
+rollout = 80
+minibatches = 2
+shaping_horizon = 16_000
+widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
+
+[release]
+data_version = "0.0.1"
+keep = 3
+
+[tasks]
+layouts = ["demo_wide"]
+presets = ["default"]
+"""
+"""One task, 25 updates."""
+
+PAIR = TINY.replace('presets = ["default"]', 'presets = ["default", "high_inertia"]')
+"""The same task, and one with another teammate."""
+
+LEARNED = TINY.replace('presets = ["default"]', 'algorithms = ["fcp", "brdiv"]').replace(
+    "[release]",
+    """
+[teammates]
+members = 2
+train = 1
+heldout = 1
+total_steps = 4_000
+environments = 8
+rollout = 100
+minibatches = 2
+shaping_horizon = 2_000
+widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
+
+[release]""",
+)
+"""Two tasks beside learned teammates."""
+
+
+def artefact(out: Path, number: int = 0) -> Path:
+    """The folder of a finished task, in order of task ids."""
+    return sorted(path for path in (out / "artefacts").iterdir() if path.is_dir())[number]
+
+
+def start(*arguments: str, **environment: str) -> subprocess.Popen:
+    """A Python process that finds compiled what this one has compiled."""
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),  # type: ignore[attr-defined]
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+    }
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | cache | environment,
+        cwd=ROOT,
+    )

@@ -1,0 +1,358 @@
+"""`verify` finds what is wrong, wherever it is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from icrl4aht_data import verify_release
+from icrl4aht_data.benchmark.tasks import make_task
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.format.chunks import chunk_table_path
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.random_play import SHARD, make_tasks, play, random_release
+
+
+def problems(root, deep=False):
+    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, deep=deep).findings]
+
+
+def test_a_whole_release(either):
+    report = verify_release(either[0], deep=True)
+    assert report.ok
+    assert (report.histories, report.transitions) == (12, 1440)
+    assert report.files == 9
+    assert report.chunks >= 84
+
+
+def test_one_flipped_byte_names_the_chunk(damaged):
+    path = damaged / SHARD
+    table = np.load(chunk_table_path(damaged, SHARD))
+    data = bytearray(path.read_bytes())
+    data[int(table["offset"][9]) + 2] ^= 0xFF
+    path.write_bytes(data)
+    found = problems(damaged)
+    assert any("sha256: expected" in line for line in found)
+    assert any("chunk 0 of rewards in history 1 (bytes" in line and "crc32" in line for line in found), found
+
+
+def test_every_file_is_covered(damaged):
+    files = sorted(p for p in damaged.rglob("*") if p.is_file())
+    rng = np.random.default_rng(1)
+    for path in files:
+        whole = path.read_bytes()
+        for position in rng.integers(0, len(whole), 4):
+            spoiled = bytearray(whole)
+            spoiled[position] ^= 1 << rng.integers(8)
+            path.write_bytes(spoiled)
+            assert not verify_release(damaged).ok, (path, position)
+        path.write_bytes(whole)
+    assert verify_release(damaged).ok
+
+
+def test_missing_and_extra_files(damaged):
+    (damaged / "meta" / "provenance.json").unlink()
+    (damaged / "data" / "notes.txt").write_text("hello")
+    assert problems(damaged) == [
+        "meta/provenance.json: listed in the manifest, but missing",
+        "data/notes.txt: not listed in the manifest",
+    ]
+
+
+def test_no_folder(tmp_path):
+    assert "no such folder" in problems(tmp_path / "nowhere")[0]
+
+
+def rewritten(tmp_path, spoil, kind: Kind = "lite"):
+    """A release whose hashes hold but whose content is spoiled."""
+    (task,) = make_tasks(["demo_simple"])
+    arrays = play(task.layout, 6, 20, np.random.default_rng(5))
+    new = NewTask(task, {}, 1, lambda: [NewHistory(0, spoil(arrays))])
+    return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="", kept_steps=20)
+
+
+def at(name, index, value):
+    def spoil(arrays):
+        changed = arrays[name].copy()
+        changed[index] = value(changed[index]) if callable(value) else value
+        return arrays | {name: changed}
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (at("actions", 7, 6), "actions: expected 0..5, found"),
+        (at("teammate_actions", 7, -1), "teammate_actions: expected 0..5, found -1..5"),
+        (at("expert_actions", 0, 9), "expert_actions: expected 0..5"),
+        (at("state", (3, 0), 0), "state has a position that is not reachable floor"),
+        (at("state", (3, 2), 9), "state has an unknown facing"),
+        (at("state", (3, 4), 2), "state has an impossible item in hand"),
+        (at("episode_end_state", (1, 6), 5), "episode_end_state has an impossible recipe"),
+    ],
+)
+def test_values_out_of_range(tmp_path, spoil, message):
+    found = problems(rewritten(tmp_path, spoil))
+    assert any(message in line for line in found), found
+
+
+def test_an_untouched_rewrite_is_whole(tmp_path):
+    assert problems(rewritten(tmp_path, lambda arrays: arrays), deep=True) == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (at("rewards", 33, 20), "replay: 1 rewards differ, first at step 33: rules 0.0, found 20.0"),
+        (at("state", (45, 3), lambda facing: (facing + 1) % 4), "do not lead to the recorded next state"),
+        (at("state", (40, 7), 1), "1 episodes do not start as the environment starts, first episode 2"),
+        (at("episode_end_state", (2, 5), 1), "do not lead to the recorded next state, first step 59"),
+        (lambda a: a | {"actions": np.roll(a["actions"], 1)}, "do not lead to the recorded next state"),
+        (
+            lambda a: a | {"state": np.where(np.arange(a["state"].shape[1]) == 6, 0b01010100, a["state"])},
+            "a recipe is not one of the layout's",
+        ),
+    ],
+)
+def test_physics_that_cannot_have_happened_is_found_by_deep(tmp_path, spoil, message):
+    root = rewritten(tmp_path, spoil)
+    assert problems(root) == [], "only --deep looks at the physics"
+    found = problems(root, deep=True)
+    assert any(message in line for line in found), found
+
+
+def test_observations_that_the_state_does_not_show(tmp_path, monkeypatch):
+    from icrl4aht_data.writing import release
+
+    real = release.observe
+
+    def wrong(layout, record, agent):
+        seen = real(layout, record, agent).copy()
+        seen[17, 2, 2, 0] = 0
+        return seen
+
+    monkeypatch.setattr(release, "observe", wrong)
+    root = rewritten(tmp_path, lambda arrays: arrays, kind="full")
+    assert problems(root) == []
+    assert any("obs: 1 steps differ from what their state shows, first step 17" in p for p in problems(root, deep=True))
+
+
+def test_index_that_disagrees_with_the_rewards_or_the_tasks(damaged):
+    path = damaged / "meta" / "histories.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines[0]["score"] += 1
+    lines[1]["seed"] = 77
+    lines[2]["task_id"] = "unheard_of"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(damaged)
+    found = problems(damaged)
+    assert any("history 0: score: the index says" in line for line in found), found
+    assert any("history 1: index and task" in line for line in found), found
+    assert any("history 2: its task 'unheard_of' is missing" in line for line in found), found
+
+
+def test_a_chunk_table_of_another_shard(damaged):
+    other = damaged.with_name("other")
+    random_release(other, streams=2)
+    table = chunk_table_path(damaged, SHARD)
+    shutil.copy(chunk_table_path(other, SHARD), table)
+    write_manifest(damaged)
+    found = problems(damaged)
+    assert any("the index implies 42 chunks, the chunk table has 28" in line for line in found), found
+
+
+def lines_of(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def spoil_index(root, change):
+    """Change the parsed index lines in place, and make the hashes hold again."""
+    path = root / "meta" / "histories.jsonl"
+    lines = lines_of(path)
+    change(lines)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(root)
+
+
+def swap(lines):
+    lines[0], lines[1] = lines[1], lines[0]
+
+
+def twice(lines):
+    lines[1]["env_idx"] = lines[0]["env_idx"]
+
+
+def foreign(lines):
+    lines[0]["layout"] = "test_simple"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (swap, "line 1: history_id 1: ids count up from 0, expected 0"),
+        (twice, "history 1: stream 0 of its task stands twice"),
+        (foreign, "line 1: obs_shape"),
+        (lambda lines: lines[0].update(split="test"), "line 1: shard"),
+        (lambda lines: lines[0].update(split="validation"), "unknown split 'validation'"),
+        (lambda lines: lines[0].update(action_dim=99), "expected action_dim 6"),
+        (lambda lines: lines[0].update(teammate_family="H9"), "unknown teammate_family 'H9'"),
+    ],
+)
+def test_index_lines_that_lie(damaged, change, message):
+    spoil_index(damaged, change)
+    assert any(message in problem for problem in problems(damaged)), problems(damaged)
+
+
+def test_lost_shards_with_their_lines(tmp_path):
+    random_release(tmp_path / "r", layouts=("cramped_up",), teammates=1, streams=2, shard_histories=1)
+    assert problems(tmp_path / "r") == []
+    info = tmp_path / "r" / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"histories": 1}))
+    spoil_index(tmp_path / "r", lambda lines: lines.pop())
+    found = problems(tmp_path / "r")
+    assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
+
+
+def test_equal_histories_of_a_task(tmp_path):
+    (task,) = make_tasks(["demo_simple"])
+    arrays = play(task.layout, 6, 20, np.random.default_rng(5))
+    new = NewTask(task, {}, 2, lambda: [NewHistory(k, arrays) for k in range(2)])
+    write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+    assert problems(tmp_path / "r")[0].endswith("history 1: the same as history 0")
+
+
+def test_other_episode_lengths_than_stated(damaged):
+    path = damaged / "meta" / "info.json"
+    content = json.loads(path.read_text())
+    content["environment"]["kept_steps"] = 40
+    path.write_text(json.dumps(content))
+    write_manifest(damaged)
+    assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
+
+
+def test_another_attribute_and_a_group_more(damaged):
+    import h5py
+
+    path = damaged / SHARD
+    with h5py.File(path, "r+") as file:
+        file.attrs["layout"] = "demo_wide"
+    write_manifest(damaged)
+    assert any("attributes: expected" in problem for problem in problems(damaged))
+    with h5py.File(path, "r+") as file:
+        file.attrs["layout"] = "coord_simple"
+        file.create_group("extra")
+    write_manifest(damaged)
+    assert any("groups: expected ['/0'], found ['/0', '/extra']" in problem for problem in problems(damaged))
+
+
+def test_no_damage_makes_verify_raise(damaged):
+    """Bits and hostile values anywhere: verify always reports, never raises, and never calls it whole."""
+    rng = np.random.default_rng(7)
+    hostile = [b"", b"[]", b"{}", b"null", b"\xff\xfe", b"[" * 5000, b'{"format_version": ' + b"9" * 5000 + b"}"]
+    for path in sorted(p for p in damaged.rglob("*") if p.is_file()):
+        whole = path.read_bytes()
+        flips = []
+        for _ in range(25):
+            data = bytearray(whole)
+            data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+            flips.append(bytes(data))
+        for data in [*flips, *hostile, whole[: len(whole) // 2]]:
+            path.write_bytes(data)
+            assert not verify_release(damaged, deep=True).ok, path
+            if path.name != "MANIFEST.sha256":  # the hashes of a liar hold
+                write_manifest(damaged)
+                verify_release(damaged, deep=True)
+                (damaged / "MANIFEST.sha256").unlink()
+                write_manifest(damaged)
+        path.write_bytes(whole)
+        write_manifest(damaged)
+    assert verify_release(damaged, deep=True).ok
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value"),
+    [("tasks", "track", ["a"]), ("tasks", "layout_name", ["a"]), ("tasks", "teammate", 3), ("tasks", "seed", "x")],
+)
+def test_hostile_task_lines(damaged, name, field, value):
+    path = damaged / "meta" / f"{name}.jsonl"
+    lines = lines_of(path)
+    lines[1][field] = value
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(damaged)
+    assert any("line 2" in problem for problem in problems(damaged)), problems(damaged)
+
+
+def test_chunk_offsets_beyond_any_file(damaged):
+    path = chunk_table_path(damaged, SHARD)
+    table = np.load(path)
+    table["offset"][3] = 2**63 + 5
+    np.save(path, table)
+    write_manifest(damaged)
+    assert any("truncated" in problem for problem in problems(damaged))
+
+
+def test_a_group_where_a_dataset_should_be(damaged):
+    import h5py
+
+    with h5py.File(damaged / SHARD, "r+") as file:
+        del file["0/actions"]
+        file.create_group("0/actions")
+    write_manifest(damaged)
+    assert any("HDF5" in problem or "hdf5" in problem for problem in problems(damaged)), problems(damaged)
+
+
+@pytest.mark.parametrize("column", [0, 2])
+def test_impossible_states_under_deep(tmp_path, column):
+    root = rewritten(tmp_path, at("state", (7, column), 255))
+    assert problems(root, deep=True)
+
+
+class TestCommand:
+    def test_whole(self, lite):
+        result = CliRunner().invoke(cli, ["verify", "--deep", str(lite[0])])
+        assert result.exit_code == 0
+        assert "whole; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in result.output
+
+    def test_damaged(self, damaged):
+        path = damaged / SHARD
+        data = bytearray(path.read_bytes())
+        data[int(np.load(chunk_table_path(damaged, SHARD))["offset"][0])] ^= 1
+        path.write_bytes(data)
+        result = CliRunner().invoke(cli, ["verify", str(damaged)])
+        assert result.exit_code == 1
+        assert "chunk 0 of state in history 0" in result.output
+        as_json = CliRunner().invoke(cli, ["verify", "--json", str(damaged)])
+        assert as_json.exit_code == 1
+        content = json.loads(as_json.output)
+        assert not content["ok"]
+        assert {finding["file"] for finding in content["findings"]} == {SHARD}
+
+    def test_quiet(self, lite):
+        result = CliRunner().invoke(cli, ["verify", "-q", str(lite[0])])
+        assert (result.exit_code, result.output) == (0, "")
+
+
+def test_a_shard_that_neither_manifest_nor_folder_has(damaged):
+    (damaged / SHARD).unlink()
+    write_manifest(damaged)
+    assert any("the index names this shard" in problem for problem in problems(damaged))
+
+
+def test_a_teammate_of_training_and_test(tmp_path):
+    rng = np.random.default_rng(0)
+    layout = get_layout("coord_simple")
+    (train,) = make_tasks(["coord_simple"])
+    tasks = [train, make_task("teammate", "test", "coord_simple", train.teammate, 9)]
+    new = [NewTask(task, {}, 1, lambda: [NewHistory(0, play(layout, 6, 20, rng))]) for task in tasks]
+    write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
+    assert problems(tmp_path / "r") == [
+        f"meta/tasks.jsonl: task {tasks[1].task_id!r} (test) has the teammate of {train.task_id!r} (train)"
+    ]

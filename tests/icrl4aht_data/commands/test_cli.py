@@ -1,0 +1,76 @@
+"""The command line: list, show, errors, exit codes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+from click.testing import CliRunner
+
+from icrl4aht_data.commands.cli import cli
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    """The installed command, as a process of its own."""
+    return subprocess.run([sys.executable, "-m", "icrl4aht_data", *arguments], capture_output=True, text=True)
+
+
+def test_list(lite):
+    result = CliRunner().invoke(cli, ["list", "--json", str(lite[0])])
+    rows = json.loads(result.output)
+    assert [(row["layout"], row["histories"], row["transitions"]) for row in rows] == [
+        ("coord_simple", 3, 360),
+        ("coord_simple", 3, 360),
+        ("demo_wide", 3, 360),
+        ("demo_wide", 3, 360),
+    ]
+    text = CliRunner().invoke(cli, ["list", str(lite[0]), "--layout", "demo_wide"]).output
+    assert "demo_wide" in text
+    assert "coord_simple" not in text
+
+
+def test_show_release_and_history(lite):
+    release = json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)
+    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, 2)
+    history = json.loads(CliRunner().invoke(cli, ["show", "--json", "--history", "7", str(lite[0])]).output)
+    assert (history["history_id"], history["layout"], history["T"]) == (7, "demo_wide", 120)
+    assert history["teammate"]["family"] == "utility_greedy"
+    assert "12 histories" in CliRunner().invoke(cli, ["show", str(lite[0])]).output
+
+
+def test_show_plots(lite, tmp_path):
+    from matplotlib.image import imread
+
+    result = CliRunner().invoke(cli, ["show", str(lite[0]), "--plot", str(tmp_path / "curves.png")])
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["curves.png"]
+    picture = imread(tmp_path / "curves.png")
+    assert picture.shape[0] > 300
+    assert len({tuple(pixel) for pixel in picture[::7, ::7].reshape(-1, picture.shape[-1])}) > 5
+
+
+def test_errors_become_one_line_and_exit_code_1(tmp_path):
+    result = run("show", str(tmp_path / "nowhere"))
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: ")
+    assert "no release here" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_unknown_layout_on_the_command_line(lite):
+    result = run("list", str(lite[0]), "--layout", "demo_wild")
+    assert result.returncode == 2
+    assert "Did you mean 'demo_wide'?" in result.stderr
+
+
+def test_misuse_is_exit_code_2():
+    assert run("verify", "--deeep").returncode == 2
+
+
+def test_version():
+    from importlib.metadata import version
+
+    for program in ("icrl4aht_data", "generation", "baselines"):
+        result = subprocess.run([sys.executable, "-m", program, "--version"], capture_output=True, text=True)
+        assert result.stdout == f"icrl4aht-data {version('icrl4aht-data')}\n"

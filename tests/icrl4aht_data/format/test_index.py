@@ -1,0 +1,206 @@
+"""The index as columns: equal to the lines, kept by content, rebuilt when the content changes, safe to share."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
+from icrl4aht_data.format import columns
+from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.schema import Entry
+from icrl4aht_data.utils import cache
+from tests.helpers.random_play import long_index
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory) -> tuple[Path, list[Entry]]:
+    root = tmp_path_factory.mktemp("long") / "release"
+    return root, long_index(root)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty cache folder."""
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def kept(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if not path.name.startswith(".")] if folder.exists() else []
+
+
+def test_entries_are_the_lines(long, folder):
+    root, entries = long
+    for _ in range(2):  # parsed, then from the cache folder
+        index = read_index(root)
+        assert [index.entries[i] for i in range(len(entries))] == entries
+        assert index.entries[-1] == entries[-1]
+        assert index.entries[5:8] == entries[5:8]
+        assert len(kept(folder)) == 1
+
+
+def test_both_ways_of_parsing_agree(long, tmp_path):
+    root, entries = long
+    shutil.copytree(root, tmp_path / "other")
+    path = tmp_path / "other" / "meta" / "histories.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps(line, separators=(",", ":"), sort_keys=True) + "\n" for line in lines))
+    assert list(read_index(tmp_path / "other").entries) == entries
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines).rstrip("\n"))
+    assert list(read_index(tmp_path / "other").entries) == entries
+
+
+def test_queries_are_what_a_scan_finds(long, folder):
+    root, entries = long
+    index = read_index(root)
+    for wanted in (
+        {},
+        {"layout": "demo_wide"},
+        {"layout": ["demo_wide", "cramped_room_up"], "split": "train"},
+        {"teammate_family": "H4", "teammate_kind": "utility_greedy", "track": "layout"},
+        {"task_id": entries[777].task_id},
+        {"task_id": [entries[777].task_id, entries[1].task_id], "layout": entries[1].layout},
+    ):
+        found = index.query(**wanted)
+        expected = [
+            e.history_id
+            for e in entries
+            if all(
+                getattr(e, name) in ([value] if isinstance(value, str) else value)
+                or (name == "layout" and e.layout == "cramped_up" and "cramped_room_up" in value)
+                for name, value in wanted.items()
+            )
+        ]
+        assert found.tolist() == expected, wanted
+    with pytest.raises(EmptySelectionError, match="no history has split='test'"):
+        index.query(split="test")
+    with pytest.raises(UnknownNameError, match="unknown task_id"):
+        index.query(task_id=entries[0].task_id[:-1] + "x" * 99)
+
+
+def test_rows_of_a_shard(long):
+    root, entries = long
+    index = read_index(root)
+    for shard in {entry.shard for entry in entries}:
+        assert index.entries.shard_rows(shard).tolist() == [e.history_id for e in entries if e.shard == shard]
+    assert len(index.entries.shard_rows("data/none.h5")) == 0
+
+
+def test_a_changed_index_is_parsed_anew(tmp_path, folder):
+    root = tmp_path / "release"
+    entries = long_index(root)
+    path = root / "meta" / "histories.jsonl"
+    assert read_index(root).entry(9) == entries[9]
+    before = path.stat()
+    text = path.read_text()
+    changed = text.replace(f'"env_idx": {entries[9].env_idx},', f'"env_idx": {(entries[9].env_idx + 1) % 9},')
+    path.write_text(changed)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # even if the clock says that nothing happened
+    assert read_index(root).entry(9).env_idx != entries[9].env_idx
+    assert len(kept(folder)) == 2
+
+
+def test_a_file_is_hashed_once_however_new_it_is(tmp_path, folder, monkeypatch):
+    root = tmp_path / "release"
+    entries = long_index(root)
+    read_index(root)
+    monkeypatch.setattr(cache, "_hash", lambda path: pytest.fail("hashed again"))
+    monkeypatch.setattr(columns, "_parse", lambda path: pytest.fail("parsed again"))
+    assert read_index(root).entry(2999) == entries[2999]
+
+
+@pytest.mark.parametrize(
+    ("age", "fraction", "unsettled"),
+    [(50, 1, True), (150, 1, False), (150, 0, True), (1900, 0, True), (2100, 0, False)],
+)
+def test_when_a_files_times_tell_of_every_change(monkeypatch, age, fraction, unsettled):
+    """Age in milliseconds; a clock that shows no parts of a millisecond is taken to tick every two seconds."""
+    changed = 1_700_000_000 * 10**9 + fraction
+    monkeypatch.setattr(cache.time, "time_ns", lambda: changed + age * 10**6)
+    status = SimpleNamespace(st_mtime_ns=changed, st_ctime_ns=changed - 10**9)
+    assert (cache._unsettled_ns(cast(os.stat_result, status)) > 0) == unsettled
+
+
+def test_a_damaged_cache_is_rebuilt(long, folder):
+    root, entries = long
+    read_index(root)
+    (made,) = kept(folder)
+    (folder / made / "T.npy").write_bytes(b"junk")
+    assert read_index(root).entry(2999) == entries[2999]
+    shutil.rmtree(folder / made)
+    assert read_index(root).entry(2999) == entries[2999]
+
+
+def test_without_a_cache_folder(long, tmp_path, monkeypatch):
+    root, entries = long
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert read_index(root).entry(2999) == entries[2999]
+
+
+def test_processes_may_build_at_once(long, folder):
+    root, entries = long
+    code = (
+        "import sys; from pathlib import Path; from icrl4aht_data.format.index import read_index; "
+        "print(read_index(Path(sys.argv[1])).entry(7).score)"
+    )
+
+    def run(_: int) -> str:
+        return subprocess.run(
+            [sys.executable, "-c", code, str(root)], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    with ThreadPoolExecutor(3) as pool:
+        assert set(pool.map(run, range(3))) == {str(entries[7].score)}
+    assert len(kept(folder)) == 1
+
+
+@pytest.mark.parametrize("where", [0, 1500, 2999])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"T": 0}, "expected positive numbers"),
+        ({"episodes": 99999}, "99999 episodes in"),
+        ({"has_teammate_actions": False}, "has_teammate_actions true"),
+        ({"layout": "test_wide"}, "obs_shape|unknown layout of"),
+        ({"seed": 2**63}, "at most 64 bits"),
+        ({"env_idx": True}, "expected int, found True"),
+        ({"score": "high"}, "expected float"),
+        ({"history_id": 5000}, "ids count up"),
+    ],
+)
+def test_a_bad_line_of_many_is_named(tmp_path, long, where, change, message):
+    root, _ = long
+    lines = (root / "meta" / "histories.jsonl").read_text().splitlines()
+    lines[where] = json.dumps(json.loads(lines[where]) | change)
+    (tmp_path / "meta").mkdir()
+    shutil.copy(root / "meta" / "info.json", tmp_path / "meta")
+    (tmp_path / "meta" / "histories.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {where + 1}: .*({message})"):
+        read_index(tmp_path)
+
+
+def test_the_least_used_arrays_make_room(folder, monkeypatch):
+    def build(path: Path) -> None:
+        np.save(path / "a.npy", np.zeros(1000, np.uint8))
+
+    monkeypatch.setenv("ICRL4AHT_CACHE_BYTES", "3500")
+    for key in ("one", "two", "three"):
+        cache.cached_arrays(key, 1128, build)
+    held = cache.cached_arrays("one", 1128, build)["a"]
+    cache.cached_arrays("four", 1128, build)
+    assert sorted(kept(folder)) == ["four", "one", "three"]
+    assert held.sum() == 0
+    with pytest.raises(cache.OptionError, match="raise ICRL4AHT_CACHE_BYTES"):
+        cache.cached_arrays("huge", 4000, build)

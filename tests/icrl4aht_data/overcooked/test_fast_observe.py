@@ -1,0 +1,56 @@
+"""The fast painter beside `observe`, which says what an observation is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icrl4aht_data.overcooked.fast_observe import paint
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import columns
+from tests.helpers.random_play import play
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_paints_what_observe_shows(layout, dtype):
+    states = play(layout, 40, 120, np.random.default_rng(1))["state"]
+    out = np.full((len(states), *layout.obs_shape), 9, dtype)
+    assert paint(layout, states, out, threads=3) is out
+    np.testing.assert_array_equal(out, observe(layout, states, 0))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_paints_states_that_play_seldom_reaches(layout):
+    """Every item on every counter and pot, every timer, lit buttons, deliveries: drawn independently."""
+    rng = np.random.default_rng(2)
+    where = columns(layout)
+    states = rng.integers(0, 256, (3000, play(layout, 1, 1, rng)["state"].shape[1])).astype(np.uint8)
+    states[:, where.positions] = rng.choice(np.flatnonzero(layout.walkable), (3000, 2))
+    states[:, where.facings] %= 4
+    states[:, where.delivered] %= 2
+    states[:, where.pot_timers] %= 32
+    states[:, where.recipe] = rng.choice(layout.recipe_items, 3000)
+    out = np.empty((3000, *layout.obs_shape), np.uint8)
+    np.testing.assert_array_equal(paint(layout, states, out), observe(layout, states, 0))
+
+
+def test_records_that_the_rules_do_not_make_are_shown_as_observe_shows_them():
+    layout = get_layout("coord_simple")
+    states = play(layout, 4, 20, np.random.default_rng(3))["state"]
+    for column, value in (("positions", 0), ("recipe", 77), ("delivered", 2), ("pot_timers", 99)):
+        wrong = states.copy()
+        wrong[7, getattr(columns(layout), column)] = value
+        out = np.empty((len(states), *layout.obs_shape), np.float32)
+        np.testing.assert_array_equal(paint(layout, wrong, out), observe(layout, wrong, 0), err_msg=column)
+
+
+def test_shapes_and_empty_input():
+    layout = get_layout("cramped_up")
+    states = play(layout, 2, 6, np.random.default_rng(4))["state"].reshape(3, 4, -1)
+    out = paint(layout, states, np.empty((3, 4, *layout.obs_shape), np.uint8))
+    np.testing.assert_array_equal(out, observe(layout, states, 0))
+    assert paint(layout, states[:0], np.empty((0, 4, *layout.obs_shape), np.uint8)).shape[0] == 0
+    with pytest.raises(ValueError, match="C-contiguous"):
+        paint(layout, states, np.empty((4, 3, *layout.obs_shape), np.uint8).swapaxes(0, 1))

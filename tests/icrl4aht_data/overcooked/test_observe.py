@@ -1,0 +1,464 @@
+"""What agents see, in hand-drawn scenes; the layouts' table; the state record's columns and faults.
+
+Most scenes are in cramped_up:
+
+      01234
+    0 WWPWW
+    1 0A A1
+    2 W   R
+    3 WBWXW
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import INTERACT, STAY
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_data.overcooked.observe import observe, observe_both
+from icrl4aht_data.overcooked.state import columns, faults, pack, record_size, start, unpack
+from tests.helpers.scenes import random_records, scene
+
+CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_ring", "test_simple", "test_wide"))
+
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
+RECIPE_000, RECIPE_111 = 3 * ZERO, 3 * ONE
+
+TABLE = {  # name: (alias, width, height, n, C), the specification's
+    "coord_simple": ("grounded_coord_simple", 8, 5, 3, 40),
+    "coord_ring": ("grounded_coord_ring", 9, 9, 3, 40),
+    "test_simple": ("test_time_simple", 8, 5, 3, 41),
+    "test_wide": ("test_time_wide", 6, 7, 4, 46),
+    "demo_simple": ("demo_cook_simple", 11, 5, 3, 40),
+    "demo_wide": ("demo_cook_wide", 11, 6, 4, 45),
+    "asymm_both": ("asymm_advantages_recipes_both", 9, 5, 2, 35),
+    "asymm_right": ("asymm_advantages_recipes_right", 9, 5, 2, 35),
+    "cramped_up": ("cramped_room_up", 5, 4, 2, 35),
+    "cramped_down": ("cramped_room_down", 5, 4, 2, 35),
+}
+
+each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+Cells = dict[tuple[int, int], int]
+
+
+def channel_names(n: int, delivery: bool) -> list[str]:
+    """The channels in the specification's order, for n ingredient types."""
+    counts = [str(i) for i in range(n)]
+    item = ["plate", "cooked", *counts]
+    agent = ["position", "up", "down", "right", "left", *item]
+    return [
+        *(f"self {what}" for what in agent),
+        *(f"other {what}" for what in agent),
+        *("wall", "goal", "pot", "R", "L", "plates"),
+        *(f"pile {what}" for what in counts),
+        *(f"item {what}" for what in item),
+        *(f"recipe {what}" for what in item),
+        "pot timer",
+        *(["delivery"] if delivery else []),
+    ]
+
+
+def seen(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
+    """Channel -> map cell (x, y) -> value, of everything that is not 0; channels without any are left out."""
+    _, _, _, n, channels = TABLE[layout.name]
+    names = channel_names(n, layout.name in ("test_simple", "test_wide"))
+    assert len(names) == channels
+    view = observe(layout, record, agent)[0]
+    assert view.shape == (5, 5, channels)
+    position = int(unpack(layout, record).positions[0, agent])
+    left, top = position % layout.width - 2, position // layout.width - 2
+    found: dict[str, Cells] = {}
+    for row, column, channel in np.argwhere(view).tolist():
+        found.setdefault(names[channel], {})[left + column, top + row] = int(view[row, column, channel])
+    return found
+
+
+def part(found: dict[str, Cells], *prefixes: str) -> dict[str, Cells]:
+    """The channels whose names start with one of the prefixes."""
+    return {name: cells for name, cells in found.items() if name.startswith(prefixes)}
+
+
+def at(value: int, *cells: tuple[int, int]) -> Cells:
+    return dict.fromkeys(cells, value)
+
+
+# Layouts
+
+
+def test_the_layouts_are_those_of_the_table():
+    assert list(LAYOUTS) == list(TABLE)
+
+
+@each_layout
+def test_sizes_and_channels_are_those_of_the_table(layout):
+    found = (layout.alias, layout.width, layout.height, layout.ingredient_types, layout.channels)
+    assert found == TABLE[layout.name]
+    records = random_records(layout, 7, np.random.default_rng(0))
+    for observed, shape in ((observe(layout, records, 1), (7,)), (observe_both(layout, records), (7, 2))):
+        assert observed.shape == (*shape, 5, 5, TABLE[layout.name][-1])
+        assert observed.dtype == np.uint8
+
+
+@each_layout
+def test_layouts_are_found_by_name_and_by_alias(layout):
+    assert get_layout(layout.name) is layout
+    assert get_layout(TABLE[layout.name][0]) is layout
+
+
+@pytest.mark.parametrize(
+    ("wrong", "nearest"),
+    [("cramped_upp", "cramped_up"), ("test_time_wid", "test_time_wide"), ("coordring", "coord_ring")],
+)
+def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
+    with pytest.raises(UnknownNameError, match=f"unknown layout '{wrong}'.*mean '{nearest}'") as error:
+        get_layout(wrong)
+    listed = str(error.value).split("valid: ")[1].split(".")[0].split(", ")
+    assert set(listed) == {*TABLE, *(alias for alias, *_ in TABLE.values())}
+
+
+def test_an_unknown_layout_like_no_other_gets_no_hint():
+    with pytest.raises(UnknownNameError, match="unknown layout '7'") as error:
+        get_layout("7")
+    assert "mean" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "message"),
+    [
+        (("WWWWW", "0AA1", "WWWWW"), {}, "widths \\[5, 4, 5\\]"),
+        (("WWZWW", "0AAz1", "WWWWW"), {}, "letters \\['Z', 'z'\\]"),
+        (("WWWWW", "0A  1", "WWWWW"), {}, "1 agents"),
+        (("WWWWW", "0AAA1", "WWWWW"), {}, "3 agents"),
+        (("W2W3W", "0A A1", "WWWWW"), {}, "4 piled ingredient types"),
+        (("W" * 32, "0A A1" + "W" * 27, *["W" * 32] * 6), {}, "256 cells"),
+        (("WWWWW", "0A A0", "WWWWW"), {}, "ingredients \\[1\\] that have no pile"),
+        (("WWWWW", "0A A1", "WWWWW"), {"recipes": ((0, 1, 2), (0, 3, 1))}, "ingredients \\[2, 3\\]"),
+        (("WW WW", "0A A1", "WWWWW"), {}, "edge at \\(2, 0\\)"),
+        (("WWWWW", "01A A", "WWWWW"), {}, "edge at \\(4, 1\\)"),
+    ],
+)
+def test_impossible_maps_are_refused(rows, options, message):
+    with pytest.raises(ValueError, match=f"layout mine: .*{message}"):
+        Layout("mine", "mine_too", rows, **options)
+
+
+def test_a_possible_map_is_accepted():
+    layout = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),), indicates_delivery=True)
+    assert layout.obs_shape == (5, 5, 25 + 5 * 6 + 1)
+    assert [room.tolist() for room in layout.rooms] == [[6, 7, 8]] * 2
+
+
+# Observations
+
+
+@each_layout
+def test_values_are_0_to_19_in_every_state_that_a_step_leads_to(layout):
+    rng = np.random.default_rng(1)
+    records = random_records(layout, 2048, rng)
+    after = rules.step(layout, records, rng.integers(0, 6, (2048, 2)), rng.choice(layout.recipe_items, 2048))
+    observed = observe_both(layout, after.state)
+    assert observed.max() == 19
+    timer = channel_names(layout.ingredient_types, layout.indicates_delivery).index("pot timer")
+    assert np.delete(observed, timer, axis=-1).max() == 3  # of all else, the counts are the largest
+
+
+def test_a_whole_scene_seen_by_the_ego():
+    """Every channel that is not 0; from (1, 1) the window reaches x = -1..3, y = -1..3."""
+    record = scene(
+        CRAMPED,
+        (1, 1, "left"),
+        (3, 2, "down"),
+        hands=[ZERO, PLATE + COOKED + 2 * ZERO + ONE],
+        recipe=RECIPE_111,
+        pot_items=[2 * ZERO + ONE],
+        pot_timers=[13],
+        counters={(1, 0): ONE, (0, 2): PLATE, (2, 3): PLATE + COOKED + 3 * ONE},
+    )
+    assert seen(CRAMPED, record, 0) == {
+        "self position": at(1, (1, 1)),
+        "self left": at(1, (1, 1)),
+        "self 0": at(1, (1, 1)),
+        "other position": at(1, (3, 2)),
+        "other down": at(1, (3, 2)),
+        "other plate": at(1, (3, 2)),
+        "other cooked": at(1, (3, 2)),
+        "other 0": at(2, (3, 2)),
+        "other 1": at(1, (3, 2)),
+        "wall": at(1, (0, 0), (1, 0), (3, 0), (0, 2), (0, 3), (2, 3)),
+        "goal": at(1, (3, 3)),
+        "pot": at(1, (2, 0)),
+        "plates": at(1, (1, 3)),
+        "pile 0": at(1, (0, 1)),
+        "item plate": at(1, (0, 2), (2, 3)),
+        "item cooked": at(1, (2, 3)),
+        "item 0": at(2, (2, 0)),
+        "item 1": {(1, 0): 1, (2, 0): 1, (2, 3): 3},
+        "pot timer": at(13, (2, 0)),
+    }
+
+
+def test_the_same_scene_seen_by_the_teammate():
+    """From (3, 2) the window reaches x = 1..5, y = 0..4: now pile 1 and the indicator (4, 2) are in it."""
+    record = scene(
+        CRAMPED,
+        (1, 1, "left"),
+        (3, 2, "down"),
+        hands=[PLATE, 0],
+        recipe=RECIPE_111,
+        pot_items=[COOKED + 3 * ZERO],
+        counters={(0, 2): PLATE},
+    )
+    assert seen(CRAMPED, record, 1) == {
+        "self position": at(1, (3, 2)),
+        "self down": at(1, (3, 2)),
+        "other position": at(1, (1, 1)),
+        "other left": at(1, (1, 1)),
+        "other plate": at(1, (1, 1)),
+        "wall": at(1, (1, 0), (3, 0), (4, 0), (2, 3), (4, 3)),
+        "goal": at(1, (3, 3)),
+        "pot": at(1, (2, 0)),
+        "R": at(1, (4, 2)),
+        "plates": at(1, (1, 3)),
+        "pile 1": at(1, (4, 1)),
+        "item cooked": at(1, (2, 0)),
+        "item 0": at(3, (2, 0)),
+        "recipe 1": at(3, (4, 2)),
+    }
+
+
+def test_rows_come_before_columns():
+    view = observe(CRAMPED, scene(CRAMPED, (2, 1, "up"), (3, 2, "up")), 0)[0]
+    other = 9  # first of the other agent's channels, n = 2
+    assert view[2, 2, 0] == 1
+    assert np.argwhere(view[..., other]).tolist() == [[3, 3]]
+    view = observe(CRAMPED, scene(CRAMPED, (2, 1, "up"), (2, 2, "up")), 0)[0]
+    assert np.argwhere(view[..., other]).tolist() == [[3, 2]]
+
+
+@pytest.mark.parametrize(("facing", "channel"), [("up", 1), ("down", 2), ("right", 3), ("left", 4)])
+def test_facings_have_their_channels(facing, channel):
+    other = "left" if facing != "left" else "up"
+    record = scene(CRAMPED, (2, 1, facing), (2, 2, other))
+    both = observe_both(CRAMPED, record)[0]
+    assert np.flatnonzero(both[0, 2, 2, :5]).tolist() == [0, channel]
+    assert np.flatnonzero(both[1, 1, 2, 9:14]).tolist() == [0, channel]
+
+
+@each_layout
+def test_cells_outside_the_map_are_all_zero_and_all_others_are_not_cut(layout):
+    records = random_records(layout, 256, np.random.default_rng(2))
+    observed = observe_both(layout, records)
+    assert observed.shape[2:4] == (5, 5)  # also where the map has four rows
+    positions = unpack(layout, records).positions.astype(int)
+    reach = np.arange(-2, 3)
+    x, y = positions[..., None] % layout.width + reach, positions[..., None] // layout.width + reach
+    inside_x, inside_y = (x >= 0) & (x < layout.width), (y >= 0) & (y < layout.height)
+    inside = inside_y[..., :, None] & inside_x[..., None, :]
+    assert not inside.all()
+    assert not observed[~inside].any()
+    # Inside, whatever is not floor shows one of the static channels or a pile.
+    n = layout.ingredient_types
+    shows = observed[..., 2 * (7 + n) : 2 * (7 + n) + 6 + n].sum(axis=-1)
+    floor = np.array([[letter in " A" for letter in row] for row in layout.rows])
+    rows, cols = np.clip(y, 0, layout.height - 1), np.clip(x, 0, layout.width - 1)
+    expected = inside & ~floor[rows[..., :, None], cols[..., None, :]]
+    np.testing.assert_array_equal(shows, expected)
+
+
+@each_layout
+def test_the_other_agent_is_seen_only_within_the_window(layout):
+    records = random_records(layout, 1024, np.random.default_rng(3))
+    positions = unpack(layout, records).positions.astype(int)
+    far_x = abs(np.diff(positions % layout.width)[:, 0])
+    far_y = abs(np.diff(positions // layout.width)[:, 0])
+    near = np.maximum(far_x, far_y) <= 2
+    observed = observe_both(layout, records)
+    agent = 7 + layout.ingredient_types
+    others = observed[..., agent : 2 * agent]
+    np.testing.assert_array_equal(others[..., 0].sum(axis=(2, 3)), np.stack([near, near], axis=1))
+    assert not others[~near].any()
+    for me in (0, 1):  # where seen, the other looks as it does to itself
+        itself = observed[:, 1 - me, 2, 2, :agent]
+        np.testing.assert_array_equal(others[near, me].sum(axis=(1, 2)), itself[near])
+
+
+def test_the_other_agent_at_and_beyond_the_windows_corner():
+    for x, y, visible in ((3, 3, True), (4, 3, False), (3, 4, False)):
+        found = seen(RING, scene(RING, (1, 1, "up"), (x, y, "left")), 0)
+        expected = {"other position": at(1, (x, y)), "other left": at(1, (x, y))} if visible else {}
+        assert part(found, "other") == expected
+
+
+def test_the_recipe_shows_on_indicators_always_and_on_buttons_while_lit():
+    """coord_ring: indicators (0, 4) and (4, 0) among others, buttons (4, 2) and (4, 6)."""
+    for timer, shown in ((0, [(4, 0)]), (1, [(4, 0), (4, 2)]), (9, [(4, 0), (4, 2)])):
+        record = scene(RING, (4, 1, "down"), (3, 5, "up"), buttons=[timer, 0], recipe=RECIPE_111)
+        found = seen(RING, record, 0)
+        assert part(found, "recipe") == {"recipe 1": at(3, *shown)}
+        assert part(found, "R", "L") == {"R": at(1, (4, 0)), "L": at(1, (4, 2))}
+        below = seen(RING, record, 1)  # the other button is in view and not lit
+        assert part(below, "recipe", "L") == {"L": at(1, (4, 6))}
+    record = scene(RING, (1, 4, "up"), (3, 4, "up"), buttons=[0, 5], recipe=2 * ZERO + ONE)
+    assert part(seen(RING, record, 0), "recipe") == {"recipe 0": at(2, (0, 4)), "recipe 1": at(1, (0, 4))}
+    assert part(seen(RING, record, 1), "recipe") == {"recipe 0": at(2, (4, 6)), "recipe 1": at(1, (4, 6))}
+
+
+@each_layout
+def test_plate_and_cooked_of_the_recipe_stay_0(layout):
+    records = random_records(layout, 512, np.random.default_rng(4))
+    observed = observe_both(layout, records)
+    names = channel_names(layout.ingredient_types, layout.indicates_delivery)
+    assert not observed[..., [names.index("recipe plate"), names.index("recipe cooked")]].any()
+    assert observed[..., names.index("recipe 0")].max() == 3
+
+
+@pytest.mark.parametrize("timer", [1, 10, 19])
+def test_a_pots_content_and_timer(timer):
+    record = scene(CRAMPED, (2, 1, "up"), (3, 2, "up"), pot_items=[ZERO + 2 * ONE], pot_timers=[timer])
+    found = seen(CRAMPED, record, 0)
+    assert part(found, "item", "pot timer") == {
+        "item 0": at(1, (2, 0)),
+        "item 1": at(2, (2, 0)),
+        "pot timer": at(timer, (2, 0)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("layout", "goal", "places", "deliverer"),
+    [(SIMPLE, (7, 2), [(1, 1, "up"), (6, 2, "right")], 1), (WIDE, (2, 0), [(2, 1, "up"), (2, 4, "up")], 0)],
+)
+def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, places, deliverer):
+    hands, actions = [0, 0], [STAY, STAY]
+    hands[deliverer], actions[deliverer] = RECIPE_000 + PLATE + COOKED, INTERACT
+    record = scene(layout, *places, hands=hands)
+    brings = np.array([RECIPE_111], np.uint8)
+    assert "delivery" not in seen(layout, record, deliverer)
+    after = rules.step(layout, record, np.array([actions]), brings)
+    assert after.reward == 20
+    assert seen(layout, after.state, deliverer)["delivery"] == at(1, goal)
+    assert "delivery" not in seen(layout, after.state, 1 - deliverer)  # the goal is not in this window
+    later = rules.step(layout, after.state, np.array([[STAY, STAY]]), brings)
+    assert "delivery" not in seen(layout, later.state, deliverer)
+
+
+def test_other_layouts_have_no_delivery_channel():
+    record = scene(CRAMPED, (2, 2, "down"), (3, 2, "down"), hands=[0, RECIPE_000 + PLATE + COOKED])
+    after = rules.step(CRAMPED, record, np.array([[STAY, INTERACT]]), np.array([RECIPE_000], np.uint8))
+    assert (after.reward, unpack(CRAMPED, after.state).delivered) == (20, 1)
+    goal_only = {name for name, cells in seen(CRAMPED, after.state, 0).items() if (3, 3) in cells}
+    assert goal_only == {"goal"}
+
+
+@pytest.mark.parametrize("name", ["test_wide", "demo_wide"])
+def test_a_type_without_a_pile_has_empty_channels_and_the_next_keeps_its_own(name):
+    layout = LAYOUTS[name]
+    assert layout.ingredients == (0, 1, 3)
+    names = channel_names(4, layout.indicates_delivery)
+    observed = observe_both(layout, random_records(layout, 2048, np.random.default_rng(5)))
+    for kind, largest in (("self", 3), ("other", 3), ("pile", 1), ("item", 3)):
+        assert observed[..., names.index(f"{kind} 2")].max() == 0
+        assert observed[..., names.index(f"{kind} 3")].max() == largest
+    assert observed[..., names.index("recipe 2")].max() == 0
+
+
+def test_ingredient_3_of_test_wide_shows_as_3():
+    three = WIDE.ingredient_item(3)
+    record = scene(
+        WIDE, (2, 1, "up"), (2, 4, "up"), hands=[0, three], recipe=2 * three + ZERO, pot_items=[0, 2 * three]
+    )
+    found = seen(WIDE, record, 1)
+    assert part(found, "self 3", "pile") == {"self 3": at(1, (2, 4)), "pile 3": at(1, (0, 4)), "pile 1": at(1, (0, 2))}
+    assert part(found, "item", "recipe") == {
+        "item 3": at(2, (3, 3)),
+        "recipe 3": at(2, (2, 6)),
+        "recipe 0": at(1, (2, 6)),
+    }
+
+
+# The state record
+
+
+@each_layout
+def test_packing_what_was_unpacked_gives_the_same_record(layout):
+    records = np.random.default_rng(6).integers(0, 256, (2, 64, record_size(layout)), dtype=np.uint8)
+    state = unpack(layout, records)
+    again = pack(state)
+    assert again.dtype == np.uint8
+    np.testing.assert_array_equal(again, records)
+    pots, buttons = ("".join(layout.rows).count(letter) for letter in "PL")
+    assert [np.shape(field)[2:] for field in state[:8]] == [(2,), (2,), (2,), (), (), (pots,), (pots,), (buttons,)]
+
+
+def test_a_start_has_empty_hands_pots_and_counters():
+    positions, facings = np.array([[10, 13]], np.uint8), np.array([[3, 2]], np.uint8)
+    record = start(RING, positions, facings, np.array([RECIPE_111], np.uint8))
+    np.testing.assert_array_equal(record[0, :7], [10, 13, 3, 2, 0, 0, RECIPE_111])
+    assert record.shape == (1, record_size(RING))
+    assert not record[:, 7:].any()
+
+
+@each_layout
+def test_possible_states_have_no_faults(layout):
+    rng = np.random.default_rng(7)
+    records = random_records(layout, 1024, rng)
+    assert faults(layout, records) == []
+    for _ in range(20):
+        actions = np.where(rng.random((1024, 2)) < 0.5, INTERACT, rng.integers(0, 6, (1024, 2)))
+        records = rules.step(layout, records, actions, rng.choice(layout.recipe_items, 1024)).state
+    assert faults(layout, records) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("a position that is not reachable floor", {"positions": [0, 13]}),  # a wall
+        ("a position that is not reachable floor", {"positions": [11, 20]}),  # past the map's last cell
+        ("a position that is not reachable floor", {"positions": [255, 13]}),
+        ("two agents on one cell", {"positions": [11, 11]}),
+        ("an unknown facing", {"facings": [0, 4]}),
+        ("an impossible item in hand", {"hands": [2 * ZERO, 0]}),
+        ("an impossible item in hand", {"hands": [0, ZERO + ONE]}),
+        ("an impossible item in hand", {"hands": [0, PLATE + ZERO]}),
+        ("an impossible item in hand", {"hands": [COOKED + RECIPE_000, 0]}),
+        ("an impossible item in hand", {"hands": [PLATE + COOKED, 0]}),
+        ("an impossible item in hand", {"hands": [PLATE + COOKED + 2 * ZERO, 0]}),
+        ("an impossible item in hand", {"hands": [0, 64]}),  # a third type, which the layout has not
+        ("an impossible item on a counter", {"counters": {(1, 0): 2 * ONE}}),
+        ("an impossible item on a counter", {"counters": {(2, 3): COOKED + RECIPE_111}}),
+        ("an impossible item in a pot", {"pot_items": [PLATE]}),
+        ("an impossible item in a pot", {"pot_items": [PLATE + COOKED + RECIPE_000]}),
+        ("an impossible item in a pot", {"pot_items": [3 * ZERO + ONE]}),
+        ("an impossible item in a pot", {"pot_items": [COOKED + ZERO]}),
+        ("an impossible recipe", {"recipe": 0}),
+        ("an impossible recipe", {"recipe": 2 * ZERO}),
+        ("an impossible recipe", {"recipe": COOKED + RECIPE_000}),
+        ("an impossible recipe", {"recipe": 64 * 3}),
+        ("a delivery flag that is not 0 or 1", {"delivered": 2}),
+        ("a pot timer above its limit", {"pot_items": [RECIPE_000], "pot_timers": [21]}),
+        ("a pot that does not cook exactly while it holds three raw ingredients", {"pot_items": [RECIPE_000]}),
+        (
+            "a pot that does not cook exactly while it holds three raw ingredients",
+            {"pot_items": [8], "pot_timers": [5]},
+        ),
+        (
+            "a pot that does not cook exactly while it holds three raw ingredients",
+            {"pot_items": [COOKED + RECIPE_000], "pot_timers": [5]},
+        ),
+    ],
+)
+def test_each_impossible_value_is_found(kind, change):
+    record = scene(CRAMPED, (1, 1, "up"), (3, 2, "up"), **change)
+    assert faults(CRAMPED, record) == [kind]
+    good = scene(CRAMPED, (1, 1, "up"), (3, 2, "up"))
+    assert faults(CRAMPED, np.concatenate([good, record, good])) == [kind]
+
+
+def test_an_impossible_button_timer_and_several_faults_are_found():
+    record = scene(RING, (1, 1, "up"), (3, 3, "up"), buttons=[10, 11])
+    assert faults(RING, record) == ["a button timer above its limit"]
+    record[:, columns(RING).facings] = 7
+    assert faults(RING, record) == ["an unknown facing", "a button timer above its limit"]

@@ -1,0 +1,249 @@
+"""Pictures of states: each thing that a person must see changes the pixels where it stands, and nowhere else."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import COOKED, INDICATOR, LAYOUTS, PLATE, WALL
+from icrl4aht_data.overcooked.render import draw_frame, save_episode, save_frame
+from icrl4aht_data.overcooked.state import columns
+from tests.helpers.scenes import random_records, scene
+
+CELL = 32
+COORD = LAYOUTS["coord_simple"]  # it has all there is: a pot, a button, an indicator, three ingredients
+ONION, TOMATO = COORD.recipe_items.tolist()[0] // 3, COORD.recipe_items.tolist()[1] // 3
+DISH = 3 * ONION | PLATE | COOKED
+
+
+def frame_of(ego=(2, 2, "down"), teammate=(5, 3, "up"), **fields) -> np.ndarray:
+    return draw_frame(COORD, scene(COORD, ego, teammate, **fields)[0], cell=CELL, view=False)
+
+
+def cell_pixels(frame: np.ndarray, layout, cell: int) -> np.ndarray:
+    y, x = CELL * (cell // layout.width), CELL * (cell % layout.width)
+    return frame[y : y + CELL, x : x + CELL].astype(int)
+
+
+def changed_cells(before: np.ndarray, after: np.ndarray, layout=COORD) -> set[int]:
+    return {
+        cell
+        for cell in range(layout.cells)
+        if np.any(cell_pixels(before, layout, cell) != cell_pixels(after, layout, cell))
+    }
+
+
+def share(pixels: np.ndarray, strong: int, weak: tuple[int, int], least: int = 80) -> float:
+    """The share of pixels whose channel `strong` exceeds both others by `least`."""
+    return float((pixels[..., strong] > pixels[..., list(weak)].max(axis=-1) + least).mean())
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_layout_draws_with_a_blue_ego_and_a_red_teammate(layout):
+    for record in random_records(layout, 5, np.random.default_rng(0)):
+        record[columns(layout).hands] = 0
+        frame = draw_frame(layout, record, cell=CELL, caption="step 12   return 20")
+        assert frame.dtype == np.uint8
+        assert frame.shape == (round((layout.height + 0.8) * CELL), layout.width * CELL, 3)
+        ego, teammate = (cell_pixels(frame, layout, int(record[agent])) for agent in (EGO, TEAMMATE))
+        assert share(ego, 2, (0, 1)) > 0.15 > share(ego, 0, (1, 2))
+        assert share(teammate, 0, (1, 2)) > 0.15 > share(teammate, 2, (0, 1))
+
+
+def test_the_picture_grows_with_the_cell_and_keeps_its_proportions():
+    record = scene(COORD, (2, 2, "up"), (5, 2, "up"))[0]
+    assert [draw_frame(COORD, record, cell=cell).shape[1] for cell in (16, 33, 48)] == [128, 264, 384]
+
+
+def test_all_facings_and_all_things_in_hand_look_different():
+    items = (0, PLATE, ONION, TOMATO, DISH, 3 * TOMATO | PLATE | COOKED)
+    for ego in (True, False):
+        seen = set()
+        for facing in ("up", "down", "right", "left"):
+            for item in items:
+                if ego:
+                    frame = frame_of(ego=(2, 2, facing), hands=(item, 0))
+                else:
+                    frame = frame_of(teammate=(5, 3, facing), hands=(0, item))
+                seen.add(frame.tobytes())
+        assert len(seen) == 4 * len(items)
+
+
+def test_a_chef_has_hands_and_face_on_the_side_that_it_faces_and_its_hat_on_the_other():
+    for facing, axis, sign in (("up", 0, -1), ("down", 0, 1), ("right", 1, 1), ("left", 1, -1)):
+        pixels = cell_pixels(frame_of(ego=(2, 2, facing)), COORD, 2 * COORD.width + 2)
+        hat, skin = (pixels.min(axis=-1) > 250), (pixels[..., 0] > pixels[..., 2] + 40)
+        hat_at, skin_at = (sign * (part.nonzero()[axis].mean() - (CELL - 1) / 2) for part in (hat, skin))
+        assert hat_at < -1, facing
+        assert skin_at > 3, facing
+
+
+@pytest.mark.parametrize(
+    "thing, fields",
+    [
+        ("pots", [{"pot_items": (n * ONION,)} for n in range(3)]),
+        ("pots", [{"pot_items": (3 * ONION,), "pot_timers": (timer,)} for timer in range(1, 20)]),
+        ("pots", [{"pot_items": (item,)} for item in (0, 3 * ONION | COOKED, 3 * TOMATO | COOKED)]),
+        ("buttons", [{"buttons": (timer,)} for timer in range(11)]),
+    ],
+    ids=["filling", "cooking", "cooked", "lamp"],
+)
+def test_pots_and_buttons_show_their_state_on_their_own_cell(thing, fields):
+    frames = [frame_of(**options) for options in fields]
+    assert len({frame.tobytes() for frame in frames}) == len(frames)
+    assert all(changed_cells(frames[0], frame) == set(getattr(COORD, thing)) for frame in frames[1:])
+
+
+def test_a_cooked_pot_is_green_and_a_cooking_one_is_not():
+    (pot,) = COORD.pots
+    cooking = frame_of(pot_items=(3 * ONION,), pot_timers=(7,))
+    cooked = frame_of(pot_items=(3 * ONION | COOKED,))
+    assert share(cell_pixels(cooked, COORD, pot), 1, (0, 2), 50) > 0.1
+    assert share(cell_pixels(cooking, COORD, pot), 1, (0, 2), 50) == 0
+
+
+def test_the_recipe_shows_on_the_indicator_in_the_footer_and_on_a_lit_button():
+    recipes = COORD.recipe_items.tolist()
+    indicator = set((COORD.kinds == INDICATOR).nonzero()[0].tolist())
+    for lit, cells in ((0, indicator), (5, indicator | set(COORD.buttons))):
+        first, second = (frame_of(recipe=recipe, buttons=(lit,)) for recipe in recipes)
+        assert changed_cells(first, second) == cells
+        footer = COORD.height * CELL
+        assert np.any(first[footer:] != second[footer:])
+
+
+def test_items_lie_on_counters_and_each_kind_looks_different():
+    cell = COORD.counters[0]
+    place = (cell % COORD.width, cell // COORD.width)
+    frames = [frame_of(counters={place: item}) for item in (0, PLATE, ONION, TOMATO, DISH)]
+    assert len({frame.tobytes() for frame in frames}) == len(frames)
+    assert all(changed_cells(frames[0], frame) == {cell} for frame in frames[1:])
+
+
+def test_every_ingredient_has_a_colour_of_its_own():
+    colours = []
+    for ingredient in range(4):
+        layout = next(layout for layout in LAYOUTS.values() if ingredient in layout.ingredients)
+        pile = int((layout.piles == layout.ingredient_item(ingredient)).nonzero()[0][0])
+        record = random_records(layout, 1, np.random.default_rng(0))[0]
+        colours.append(cell_pixels(draw_frame(layout, record, cell=CELL, view=False), layout, pile).mean(axis=(0, 1)))
+    apart = [np.abs(a - b).max() for k, a in enumerate(colours) for b in colours[:k]]
+    assert min(apart) > 10
+
+
+def test_a_delivery_lights_the_hatch():
+    goals = {cell for cell, letter in enumerate("".join(COORD.rows)) if letter == "X"}
+    assert changed_cells(frame_of(delivered=0), frame_of(delivered=1)) == goals
+
+
+def test_walls_that_no_chef_can_face_are_plain_and_counters_are_not():
+    frame = frame_of()
+    plain = {cell for cell in range(COORD.cells) if np.ptp(cell_pixels(frame, COORD, cell), axis=(0, 1)).max() == 0}
+    walls = set((COORD.kinds == WALL).nonzero()[0].tolist())
+    assert plain & walls == walls - set(COORD.counters)
+
+
+def test_the_view_is_outlined_only_when_asked():
+    layout = LAYOUTS["coord_ring"]
+    record = scene(layout, (4, 3, "up"), (1, 1, "up"))[0]
+    with_view, without = (draw_frame(layout, record, cell=CELL, view=view).astype(int) for view in (True, False))
+    rows, columns_ = np.any(with_view != without, axis=-1).nonzero()
+    assert (rows.min(), columns_.min()) == (1 * CELL, 2 * CELL)
+    assert max(rows.max() - 6 * CELL, columns_.max() - 7 * CELL, key=abs) in (-1, 0)
+    edge = with_view[CELL + 1, 2 * CELL : 7 * CELL]
+    assert share(edge, 2, (0, 1)) == 1 > share(without[CELL + 1, 2 * CELL : 7 * CELL], 2, (0, 1))
+
+
+def test_the_caption_is_written_into_the_footer_and_fits_even_if_long():
+    record = scene(COORD, (2, 2, "up"), (5, 2, "up"))[0]
+    none, short, long = (draw_frame(COORD, record, caption=text) for text in ("", "step 1", "step 1 " * 30))
+    assert not np.array_equal(none, short)
+    rows, columns_ = np.any(none != long, axis=-1).nonzero()
+    assert rows.min() >= COORD.height * 48
+    assert columns_.min() > 2.7 * 48
+    assert columns_.max() < COORD.width * 48 - 1
+
+
+def test_save_frame_writes_what_draw_frame_gives(tmp_path):
+    record = scene(COORD, (2, 2, "up"), (5, 2, "up"))[0]
+    save_frame(tmp_path / "frame.png", COORD, record, cell=20, caption="x")
+    with Image.open(tmp_path / "frame.png") as image:
+        assert image.format == "PNG"
+        assert np.array_equal(np.array(image), draw_frame(COORD, record, cell=20, caption="x"))
+    assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]
+
+
+def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
+    records = np.repeat(scene(COORD, (2, 2, "up"), (5, 2, "up")), 6, axis=0)
+    records[3:, columns(COORD).hands] = DISH
+    path = tmp_path / "episode.gif"
+    save_episode(path, COORD, records, np.array([0, 0, 20, 0, -5, 0.0]), cell=24, fps=10)
+    with Image.open(path) as image:
+        assert (image.format, getattr(image, "n_frames", 1), image.info["loop"]) == ("GIF", 6, 0)
+        frames, durations = [], []
+        for number in range(6):
+            image.seek(number)
+            frames.append(np.array(image.convert("RGB")).astype(int))
+            durations.append(image.info["duration"])
+    assert durations == [100] * 6
+    captions = [f"step {k}   return {earned}" for k, earned in enumerate((0, 0, 0, 20, 20, 15))]
+    for record, caption, frame in zip(records, captions, frames, strict=True):
+        apart = [
+            np.abs(frame - draw_frame(COORD, record, cell=24, caption=text)).mean() for text in (caption, caption + "9")
+        ]
+        assert apart[0] < 1, caption
+        assert apart[0] < apart[1], caption
+    assert len(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)) <= 128
+    assert [entry.name for entry in tmp_path.iterdir()] == ["episode.gif"]
+
+
+def test_an_episode_without_rewards_or_of_one_step_draws_too(tmp_path):
+    save_episode(tmp_path / "one.gif", COORD, scene(COORD, (2, 2, "up"), (5, 2, "up")), cell=16)
+    with Image.open(tmp_path / "one.gif") as image:
+        assert getattr(image, "n_frames", 0) == 1
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_partial_one(tmp_path, monkeypatch):
+    path = tmp_path / "frame.png"
+    path.write_text("old")
+
+    def fail(self, target, **options):
+        target.write_text("half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Image.Image, "save", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_frame(path, COORD, scene(COORD, (2, 2, "up"), (5, 2, "up"))[0])
+    assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("frame.png", "old")]
+
+
+def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
+    records = scene(COORD, (2, 2, "up"), (5, 2, "up"))
+    size, path = records.shape[-1], tmp_path / "episode.gif"
+    off_the_floor = records[0].copy()
+    off_the_floor[0] = 0
+    for match, call in {
+        rf"uint8 \({size},\).*found uint8 \({size - 1},\)": lambda: draw_frame(COORD, records[0, 1:]),
+        rf"uint8 \({size},\).*found uint8 \(1, {size}\)": lambda: draw_frame(COORD, records),
+        rf"uint8 \({size},\).*found int64 \({size},\)": lambda: draw_frame(COORD, records[0].astype(np.int64)),
+        "not reachable floor": lambda: draw_frame(COORD, off_the_floor),
+        "at least 16 pixels, found 8": lambda: draw_frame(COORD, records[0], cell=8),
+        rf"uint8 \(T, {size}\).*found uint8 \({size},\)": lambda: save_episode(path, COORD, records[0]),
+        rf"found uint8 \(0, {size}\)": lambda: save_episode(path, COORD, records[:0]),
+        r"rewards \(1,\).*found \(2,\)": lambda: save_episode(path, COORD, records, np.zeros(2)),
+        "fps from 1 to 50, found 0": lambda: save_episode(path, COORD, records, fps=0),
+    }.items():
+        with pytest.raises(OptionError, match=match):
+            call()
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_pillow_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[plot\]'"):
+        draw_frame(COORD, scene(COORD, (2, 2, "up"), (5, 2, "up"))[0])

@@ -1,0 +1,506 @@
+"""The rules, in hand-drawn scenes.
+
+Most scenes are in cramped_up, where one room holds everything:
+
+      01234
+    0 WWPWW
+    1 0A A1
+    2 W   R
+    3 WBWXW
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked.layouts import FACING_OF, FACINGS, LAYOUTS, Layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import columns, unpack
+from tests.helpers.scenes import scene
+
+CRAMPED, ASYMM, RING, DEMO = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring", "demo_simple"))
+
+PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
+RECIPE_000, RECIPE_001, RECIPE_111 = 3 * ZERO, 2 * ZERO + ONE, 3 * ONE
+SOUP_000, SOUP_001, SOUP_111 = (recipe + COOKED for recipe in (RECIPE_000, RECIPE_001, RECIPE_111))
+DISH_000, DISH_001, DISH_111 = (soup + PLATE for soup in (SOUP_000, SOUP_001, SOUP_111))
+
+Place = tuple[int, int, str]
+ASIDE: Place = (2, 2, "down")
+AT_POT, AT_COUNTER, AT_PILE_0, AT_PILE_1 = (2, 1, "up"), (1, 1, "up"), (1, 1, "left"), (3, 1, "right")
+AT_PLATES, AT_GOAL, AT_INDICATOR = (1, 2, "down"), (3, 2, "down"), (3, 2, "right")
+COUNTER = (1, 0)
+
+DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
+
+
+class Seen(NamedTuple):
+    """One state in plain Python, and the rewards of the step that led to it."""
+
+    record: np.ndarray
+    places: list[Place]
+    hands: list[int]
+    recipe: int
+    delivered: int
+    pots: list[tuple[int, int]]  # (content, timer)
+    buttons: list[int]
+    counters: dict[tuple[int, int], int]  # only those with an item
+    reward: float
+    shaped: list[float]
+
+
+def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, brings: int = RECIPE_111) -> Seen:
+    """One step of the scene; `brings` is the recipe that a correct delivery leads to."""
+    after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([brings], np.uint8))
+    state = unpack(layout, after.state)
+    xy = [(int(cell) % layout.width, int(cell) // layout.width) for cell in state.positions[0]]
+    lying = zip(layout.counters, state.counters[0].tolist(), strict=True)
+    return Seen(
+        record=after.state,
+        places=[(x, y, FACINGS[facing]) for (x, y), facing in zip(xy, state.facings[0], strict=True)],
+        hands=state.hands[0].tolist(),
+        recipe=int(state.recipe[0]),
+        delivered=int(state.delivered[0]),
+        pots=list(zip(state.pot_items[0].tolist(), state.pot_timers[0].tolist(), strict=True)),
+        buttons=state.buttons[0].tolist(),
+        counters={(cell % layout.width, cell // layout.width): item for cell, item in lying if item},
+        reward=float(after.reward[0]),
+        shaped=after.shaped[0].tolist(),
+    )
+
+
+@pytest.fixture(params=[0, 1], ids=["ego", "teammate"])
+def seat(request: pytest.FixtureRequest) -> int:
+    return request.param
+
+
+def solo(seat: int, at: Place, hand: int = 0, layout: Layout = CRAMPED, aside: Place = ASIDE, **fields) -> np.ndarray:
+    """A scene where the agent of that seat stands `at` with `hand`, the other one aside with nothing."""
+    if seat == 0:
+        return scene(layout, at, aside, hands=[hand, 0], **fields)
+    return scene(layout, aside, at, hands=[0, hand], **fields)
+
+
+def interact(seat: int, record: np.ndarray, layout: Layout = CRAMPED, brings: int = RECIPE_111) -> Seen:
+    """The agent of that seat interacts, the other one stays."""
+    ego, teammate = (INTERACT, STAY) if seat == 0 else (STAY, INTERACT)
+    return act(layout, record, ego, teammate, brings)
+
+
+# Moving
+
+
+def test_action_ids_are_in_the_papers_order():
+    assert ACTIONS == ("up", "down", "left", "right", "stay", "interact")
+    assert (UP, DOWN, LEFT, RIGHT, STAY, INTERACT) == (0, 1, 2, 3, 4, 5)
+
+
+@pytest.mark.parametrize(("action", "x", "y"), [(UP, 2, 1), (DOWN, 2, 3), (LEFT, 1, 2), (RIGHT, 3, 2)])
+def test_a_direction_turns_and_advances(seat, action, x, y):
+    record = solo(seat, (2, 2, "up"), layout=DEMO, aside=(8, 2, "left"))
+    after = act(DEMO, record, *((action, STAY) if seat == 0 else (STAY, action)))
+    assert (after.places[seat], after.places[1 - seat]) == ((x, y, ACTIONS[action]), (8, 2, "left"))
+    assert (after.reward, after.shaped) == (0, [0, 0])
+
+
+@pytest.mark.parametrize("at", [AT_COUNTER, AT_PILE_0, AT_PILE_1, AT_POT, AT_PLATES, AT_GOAL, AT_INDICATOR])
+def test_an_agent_turns_in_place_before_anything_but_floor(seat, at):
+    x, y, facing = at
+    record = solo(seat, (x, y, "up" if facing != "up" else "down"))
+    action = ACTIONS.index(facing)
+    after = act(CRAMPED, record, *((action, STAY) if seat == 0 else (STAY, action)))
+    assert after.places[seat] == at
+
+
+@pytest.mark.parametrize("action", [STAY, INTERACT])
+def test_stay_and_interact_neither_turn_nor_move(action):
+    for facing in FACINGS:
+        after = act(CRAMPED, scene(CRAMPED, (2, 2, facing), (3, 1, "left")), action)
+        assert after.places == [(2, 2, facing), (3, 1, "left")]
+
+
+@pytest.mark.parametrize(
+    ("cells", "actions", "moved"),
+    [
+        # both want one free cell
+        ([(1, 1), (3, 1)], (RIGHT, LEFT), [(1, 1), (3, 1)]),
+        ([(2, 1), (1, 2)], (LEFT, UP), [(2, 1), (1, 2)]),
+        # one walks into the other, who stands, interacts, or walks against the wall
+        ([(2, 1), (3, 1)], (RIGHT, STAY), [(2, 1), (3, 1)]),
+        ([(3, 1), (2, 1)], (INTERACT, RIGHT), [(3, 1), (2, 1)]),
+        ([(2, 1), (3, 1)], (RIGHT, UP), [(2, 1), (3, 1)]),
+        # they would exchange cells
+        ([(1, 1), (2, 1)], (RIGHT, LEFT), [(1, 1), (2, 1)]),
+        ([(1, 2), (1, 1)], (UP, DOWN), [(1, 2), (1, 1)]),
+        # one follows into the cell that the other leaves
+        ([(1, 1), (2, 1)], (RIGHT, RIGHT), [(2, 1), (3, 1)]),
+        ([(2, 1), (1, 1)], (DOWN, RIGHT), [(2, 2), (2, 1)]),
+    ],
+)
+def test_agents_in_each_others_way(cells, actions, moved):
+    ego, teammate = ((x, y, "up") for x, y in cells)
+    after = act(CRAMPED, scene(CRAMPED, ego, teammate), *actions)
+    facings = [ACTIONS[action] if action in DELTA else "up" for action in actions]
+    assert after.places == [(x, y, facing) for (x, y), facing in zip(moved, facings, strict=True)]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
+    """Against steps 1 to 3 of the specification, written out cell by cell."""
+    cells, wanted_cells, actions = [], [], []
+    starts = [pair for pair in product(*layout.rooms) if pair[0] != pair[1]]
+    for old, pair in product(starts, product(range(6), repeat=2)):
+        before = [(int(cell) % layout.width, int(cell) // layout.width) for cell in old]
+        wanted = []
+        for (x, y), action in zip(before, pair, strict=True):
+            dx, dy = DELTA.get(action, (0, 0))
+            wanted.append((x + dx, y + dy) if layout.rows[y + dy][x + dx] in " A" else (x, y))
+        if wanted[0] == wanted[1] or wanted == before[::-1]:
+            wanted = before
+        cells.append(before)
+        wanted_cells.append([y * layout.width + x for x, y in wanted])
+        actions.append(pair)
+    records = np.repeat(scene(layout, (1, 1, "up"), (1, 1, "up")), len(cells), axis=0)
+    where = columns(layout)
+    records[:, where.positions] = [[y * layout.width + x for x, y in pair] for pair in cells]
+    records[:, where.facings] = facings = np.random.default_rng(0).integers(0, 4, (len(cells), 2))
+    after = unpack(layout, rules.step(layout, records, np.array(actions), records[:, where.recipe]).state)
+    np.testing.assert_array_equal(after.positions, wanted_cells)
+    turned = np.array([FACINGS.index(name) if name in FACINGS else -1 for name in ACTIONS])[np.array(actions)]
+    np.testing.assert_array_equal(after.facings, np.where(turned >= 0, turned, facings))
+
+
+# Piles and counters
+
+FULL_HANDS = (PLATE, ZERO, ONE, DISH_000)
+WITHOUT_EFFECT = {
+    "full hands at a pile": [(at, hand, {}) for at in (AT_PILE_0, AT_PILE_1, AT_PLATES) for hand in FULL_HANDS],
+    "full hands at a full counter": [
+        (AT_COUNTER, hand, {"counters": {COUNTER: lies}}) for hand in FULL_HANDS for lies in FULL_HANDS
+    ],
+    "empty hands at an empty counter": [(AT_COUNTER, 0, {"counters": {(3, 0): ZERO}})],
+    "no plate at cooked soup": [(AT_POT, hand, {"pot_items": [SOUP_000]}) for hand in (0, ZERO, ONE, DISH_000)],
+    "no ingredient at a raw pot": [
+        (AT_POT, hand, {"pot_items": [inside]}) for hand in (0, PLATE, DISH_000) for inside in (0, ZERO, ZERO + ONE)
+    ],
+    "no cooked dish at the goal": [(AT_GOAL, hand, {}) for hand in (0, PLATE, ZERO, ONE)],
+    "any hands at the recipe indicator": [(AT_INDICATOR, hand, {}) for hand in (0, *FULL_HANDS)],
+}
+
+
+@pytest.mark.parametrize("what", WITHOUT_EFFECT)
+def test_interactions_without_effect_leave_the_state_as_it_is(seat, what):
+    for at, hand, fields in WITHOUT_EFFECT[what]:
+        record = solo(seat, at, hand, **fields)
+        after = interact(seat, record)
+        np.testing.assert_array_equal(after.record, record, err_msg=f"{hand=}, {fields}")
+        assert (after.reward, after.shaped) == (0, [0, 0])
+
+
+@pytest.mark.parametrize(("at", "item"), [(AT_PILE_0, ZERO), (AT_PILE_1, ONE), (AT_PLATES, PLATE)])
+def test_piles_give_without_end(seat, at, item):
+    record = solo(seat, at)
+    hands = columns(CRAMPED).hands
+    for _ in range(5):
+        after = interact(seat, record)
+        assert (after.hands[seat], after.hands[1 - seat]) == (item, 0)
+        after.record[:, hands] = 0
+        np.testing.assert_array_equal(after.record, record)  # nothing else changed
+        record = after.record
+
+
+@pytest.mark.parametrize("item", [PLATE, ZERO, ONE, DISH_000, DISH_111])
+def test_a_counter_takes_one_item_and_gives_it_back(seat, item):
+    down = interact(seat, solo(seat, AT_COUNTER, item))
+    assert (down.hands, down.counters, down.reward, down.shaped) == ([0, 0], {COUNTER: item}, 0, [0, 0])
+    up = interact(seat, down.record)  # not even the recipe's dish pays when it comes off a counter
+    assert (up.hands[seat], up.counters, up.reward, up.shaped) == (item, {}, 0, [0, 0])
+
+
+# Pots
+
+
+def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(seat):
+    record = solo(seat, AT_POT, ZERO)
+    for content in (ZERO, 2 * ZERO):
+        after = interact(seat, record)
+        assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
+        assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two do not cook
+        record = after.record.copy()
+        record[:, columns(CRAMPED).hands.start + seat] = ZERO
+    after = interact(seat, record)
+    timeline = []
+    for _ in range(21):
+        timeline.append((*after.pots[0], int(observe(CRAMPED, after.record, seat)[0, 1, 2, -1])))
+        after = act(CRAMPED, after.record, STAY)
+    cooking = [(RECIPE_000, timer, timer) for timer in range(19, 0, -1)]
+    assert timeline == [*cooking, (SOUP_000, 0, 0), (SOUP_000, 0, 0)]
+
+
+@pytest.mark.parametrize("content", [RECIPE_001, ZERO + 2 * ONE])
+def test_wrong_mixes_cook_too(seat, content):
+    assert content not in CRAMPED.recipe_items
+    after = interact(seat, solo(seat, AT_POT, ONE, pot_items=[content - ONE]))
+    assert after.pots == [(content, 19)]
+    for _ in range(19):
+        assert after.pots[0][0] == content
+        after = act(CRAMPED, after.record, STAY)
+    assert after.pots == [(content + COOKED, 0)]
+
+
+def test_pots_that_cook_tick_and_others_do_not():
+    record = scene(ASYMM, (1, 1, "up"), (7, 3, "up"), pot_items=[RECIPE_000, 2 * ONE], pot_timers=[2, 0])
+    after = act(ASYMM, record, STAY)
+    assert after.pots == [(RECIPE_000, 1), (2 * ONE, 0)]
+    assert act(ASYMM, after.record, STAY).pots == [(SOUP_000, 0), (2 * ONE, 0)]
+
+
+@pytest.mark.parametrize(("content", "timer"), [(RECIPE_000, 9), (RECIPE_000, 1), (SOUP_000, 0), (SOUP_111, 0)])
+@pytest.mark.parametrize("hand", [ZERO, ONE])
+def test_a_pot_takes_no_fourth_ingredient(seat, hand, content, timer):
+    record = solo(seat, AT_POT, hand, pot_items=[content], pot_timers=[timer])
+    after = interact(seat, record)
+    assert (after.hands[seat], after.shaped) == (hand, [0, 0])
+    np.testing.assert_array_equal(after.record, act(CRAMPED, record, STAY).record)
+
+
+def test_a_plate_takes_the_soup_and_empties_the_pot(seat):
+    after = interact(seat, solo(seat, AT_POT, PLATE, pot_items=[SOUP_001]))
+    assert (after.hands[seat], after.pots) == (DISH_001, [(0, 0)])
+
+
+@pytest.mark.parametrize("hand", [0, PLATE, DISH_000])
+def test_nothing_leaves_a_cooking_pot(seat, hand):
+    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[RECIPE_000], pot_timers=[1]))
+    assert after.hands[seat] == hand  # it is cooked only at the end of this step
+    assert after.pots == [(SOUP_000, 0)]
+
+
+# Deliveries
+
+
+@pytest.mark.parametrize("brings", [RECIPE_000, RECIPE_111])
+def test_a_correct_delivery_pays_20_and_brings_the_next_recipe(seat, brings):
+    after = interact(seat, solo(seat, AT_GOAL, DISH_000, recipe=RECIPE_000), brings=brings)
+    assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
+    assert (after.recipe, after.delivered) == (brings, 1)  # it may be the same again
+    later = act(CRAMPED, after.record, STAY, brings=RECIPE_001)
+    assert (later.delivered, later.recipe, later.reward) == (0, brings, 0)
+
+
+@pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
+def test_a_wrong_delivery_costs_20_and_the_recipe_stays(seat, recipe, dish):
+    after = interact(seat, solo(seat, AT_GOAL, dish, recipe=recipe), brings=RECIPE_001)
+    assert (after.reward, after.shaped, after.hands) == (-20, [0, 0], [0, 0])
+    assert (after.recipe, after.delivered) == (recipe, 0)
+
+
+@pytest.mark.parametrize(
+    ("dishes", "reward"),
+    [
+        ([DISH_000, DISH_000], 40),
+        ([DISH_000, DISH_111], 0),  # judged by the recipe before the step, which changes only after both
+        ([DISH_111, DISH_000], 0),
+        ([DISH_111, DISH_111], -40),
+    ],
+)
+def test_two_deliveries_in_one_step_both_count(dishes, reward):
+    record = scene(ASYMM, (3, 2, "up"), (7, 1, "right"), hands=dishes, recipe=RECIPE_000)
+    after = act(ASYMM, record, INTERACT, INTERACT, brings=RECIPE_111)
+    assert (after.reward, after.hands) == (reward, [0, 0])
+    assert (after.recipe, after.delivered) == ((RECIPE_111, 1) if DISH_000 in dishes else (RECIPE_000, 0))
+
+
+# Button. In coord_ring the first button is at (4, 2), between the ego's ring and the teammate's room
+
+AT_BUTTON = ((4, 1, "down"), (4, 3, "up"))
+FAR = ((1, 4, "up"), (3, 5, "up"))
+
+
+def ring(seat: int, hand: int = 0, **fields) -> np.ndarray:
+    return solo(seat, AT_BUTTON[seat], hand, layout=RING, aside=FAR[1 - seat], **fields)
+
+
+def test_a_press_costs_5_and_lights_one_button_for_9_observations(seat):
+    record = ring(seat, recipe=RECIPE_000)
+    row = 3 if seat == 0 else 1
+    recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # count of ingredient 0 in the recipe, n = 3
+    after = interact(seat, record, RING)
+    assert (after.reward, after.shaped, after.hands) == (-5, [0, 0], [0, 0])
+    timers, visible = [], []
+    for _ in range(11):
+        timers.append(after.buttons)
+        visible.append(int(observe(RING, after.record, seat)[0, row, 2, recipe_channel]))
+        after = act(RING, after.record, STAY)
+        assert after.reward == 0
+    assert timers == [[timer, 0] for timer in (9, 8, 7, 6, 5, 4, 3, 2, 1, 0, 0)]
+    assert visible == [3] * 9 + [0, 0]
+
+
+def test_a_press_while_lit_costs_again_and_lights_anew(seat):
+    after = interact(seat, ring(seat, buttons=[4, 7]), RING)
+    assert (after.reward, after.buttons) == (-5, [9, 6])
+
+
+@pytest.mark.parametrize("hand", [PLATE, ZERO, DISH_000])
+@pytest.mark.parametrize("lit", [0, 4])
+def test_full_hands_press_no_button(seat, hand, lit):
+    after = interact(seat, ring(seat, hand, buttons=[lit, 0]), RING)
+    assert (after.reward, after.hands[seat], after.buttons) == (0, hand, [max(lit - 1, 0), 0])
+
+
+def test_what_both_agents_earn_in_one_step_adds_up():
+    after = act(RING, scene(RING, *AT_BUTTON), INTERACT, INTERACT)
+    assert (after.reward, after.buttons) == (-10, [9, 0])
+    record = scene(RING, (1, 4, "right"), AT_BUTTON[1], hands=[DISH_000, 0], recipe=RECIPE_000)
+    after = act(RING, record, INTERACT, INTERACT)
+    assert (after.reward, after.recipe, after.buttons) == (20 - 5, RECIPE_111, [9, 0])
+
+
+# Agent 0 first: the counter (3, 2) of coord_ring, and the pot (4, 2) of asymm_both, are faced from both sides
+
+
+@pytest.mark.parametrize(
+    ("hands", "lies", "hands_after", "lies_after"),
+    [
+        ([ZERO, 0], 0, [0, ZERO], 0),  # the ego puts down what the teammate takes
+        ([0, ZERO], 0, [0, 0], ZERO),  # the ego comes too early
+        ([ZERO, ONE], 0, [0, ONE], ZERO),  # the ego's item lies, the teammate keeps its own
+        ([0, 0], ONE, [ONE, 0], 0),  # the ego takes it
+        ([0, ZERO], ONE, [ONE, 0], ZERO),  # the ego makes room for the teammate's
+        ([ZERO, 0], ONE, [ZERO, ONE], 0),  # the ego cannot, the teammate takes it
+    ],
+)
+def test_agent_0_interacts_first_on_a_shared_counter(hands, lies, hands_after, lies_after):
+    record = scene(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): lies})
+    after = act(RING, record, INTERACT, INTERACT)
+    assert (after.hands, after.counters) == (hands_after, {(3, 2): lies_after} if lies_after else {})
+
+
+@pytest.mark.parametrize(
+    ("hands", "pot", "hands_after", "pot_after"),
+    [
+        ([ZERO, ONE], ZERO, [0, 0], (RECIPE_001, 19)),  # the teammate's is the third
+        ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the teammate's would be the fourth
+        ([PLATE, PLATE], SOUP_000, [DISH_000, PLATE], (0, 0)),
+        ([PLATE, ONE], SOUP_000, [DISH_000, 0], (ONE, 0)),  # the pot that the ego emptied takes an ingredient
+        ([ONE, PLATE], SOUP_000, [ONE, DISH_000], (0, 0)),
+        ([ZERO, PLATE], 2 * ZERO, [0, PLATE], (RECIPE_000, 19)),
+    ],
+)
+def test_agent_0_interacts_first_on_a_shared_pot(hands, pot, hands_after, pot_after):
+    record = scene(ASYMM, (3, 2, "right"), (5, 2, "left"), hands=hands, pot_items=[pot, 0])
+    after = act(ASYMM, record, INTERACT, INTERACT)
+    assert (after.hands, after.pots) == (hands_after, [pot_after, (0, 0)])
+
+
+# Shaped rewards: each agent's own, apart from the team's
+
+
+def own(seat: int, value: float) -> list[float]:
+    return [value, 0] if seat == 0 else [0, value]
+
+
+@pytest.mark.parametrize(
+    ("hand", "content", "recipe", "reward"),
+    [
+        (ZERO, 0, RECIPE_000, 3),
+        (ZERO, 2 * ZERO, RECIPE_000, 3),
+        (ZERO, 2 * ONE, RECIPE_000, 3),  # the recipe needs it, whatever else is inside
+        (ONE, 0, RECIPE_000, 0),
+        (ONE, ONE, RECIPE_111, 3),
+        (ZERO, ZERO, RECIPE_001, 3),
+        (ZERO, 2 * ZERO, RECIPE_001, 0),  # enough of it inside
+        (ONE, 2 * ZERO, RECIPE_001, 3),
+        (ONE, ONE, RECIPE_001, 0),
+    ],
+)
+def test_placing_an_ingredient_pays_3_if_the_recipe_still_needs_it(seat, hand, content, recipe, reward):
+    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[content], recipe=recipe))
+    assert (after.pots[0][0], after.reward) == (content + hand, 0)
+    assert after.shaped == own(seat, reward)
+
+
+@pytest.mark.parametrize("soup", [SOUP_000, SOUP_001, SOUP_111])
+@pytest.mark.parametrize("recipe", [RECIPE_000, RECIPE_001, RECIPE_111])
+def test_taking_a_dish_out_of_a_pot_pays_5_if_it_is_the_recipes(seat, soup, recipe):
+    after = interact(seat, solo(seat, AT_POT, PLATE, pot_items=[soup], recipe=recipe))
+    assert (after.hands[seat], after.reward) == (soup + PLATE, 0)
+    assert after.shaped == own(seat, 5 if soup == recipe + COOKED else 0)
+
+
+# Plates in asymm_both: two pots, (4, 2) and (4, 3); piles of plates at (3, 4) and (5, 4)
+
+AT_PLATES_ASYMM = ((3, 3, "down"), (5, 3, "down"))
+AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
+
+
+@pytest.mark.parametrize(
+    ("pots", "other_hand", "counters", "reward"),
+    [
+        ([0, 0], 0, {}, 0),  # no pot in use
+        ([ZERO, 0], 0, {}, 3),
+        ([0, SOUP_111], 0, {}, 3),
+        ([ZERO, 0], PLATE, {}, 0),  # as many plates in hands as pots in use
+        ([ZERO, ONE], PLATE, {}, 3),
+        ([ZERO, 0], DISH_000, {}, 3),  # a dish is no plate
+        ([ZERO, 0], 0, {(1, 4): PLATE}, 0),
+        ([ZERO, ONE], 0, {(6, 4): PLATE}, 0),
+        ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # neither is a plate
+    ],
+)
+def test_taking_a_plate_pays_3_if_it_is_needed(seat, pots, other_hand, counters, reward):
+    places, hands = list(AWAY), [other_hand, other_hand]
+    places[seat], hands[seat] = AT_PLATES_ASYMM[seat], 0
+    record = scene(ASYMM, places[0], places[1], hands=hands, pot_items=pots, counters=counters)
+    after = interact(seat, record, ASYMM)
+    assert (after.hands[seat], after.reward) == (PLATE, 0)
+    assert after.shaped == own(seat, reward)
+
+
+@pytest.mark.parametrize("pots", [[0, 0], [ZERO, 0], [ZERO, ONE]])
+def test_a_plate_taken_off_a_counter_was_lying_there_and_pays_nothing(seat, pots):
+    record = scene(ASYMM, *AWAY, pot_items=pots, counters={(AWAY[seat][0], 4): PLATE})
+    after = interact(seat, record, ASYMM)
+    assert (after.hands[seat], after.counters, after.shaped) == (PLATE, {}, [0, 0])
+
+
+def test_plates_in_hands_count_as_before_the_steps_interactions():
+    both = scene(ASYMM, *AT_PLATES_ASYMM, pot_items=[ZERO, 0])
+    assert act(ASYMM, both, INTERACT, INTERACT).shaped == [3, 3]  # the ego's new plate does not count yet
+
+    served = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[SOUP_001, ONE])
+    after = act(ASYMM, served, INTERACT, INTERACT)
+    # The plate that the ego used still counts, against the one pot left.
+    assert (after.hands, after.shaped) == ([DISH_001, PLATE], [0, 0])
+
+
+def test_pots_and_counters_are_as_agent_0_left_them():
+    filled = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[ONE, 0], recipe=RECIPE_000)
+    assert act(ASYMM, filled, INTERACT, INTERACT).shaped == [0, 3]  # the ego's ingredient makes the plate useful
+
+    cleared = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], pot_items=[ZERO, ONE], counters={(2, 4): PLATE})
+    assert act(ASYMM, cleared, INTERACT, INTERACT).shaped == [0, 3]  # the ego took the plate that lay about
+
+    dropped = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[ZERO, ONE])
+    assert act(ASYMM, dropped, STAY, INTERACT).shaped == [0, 3]
+    assert act(ASYMM, dropped, INTERACT, INTERACT).shaped == [0, 0]  # the ego's plate lies on a counter now
+
+
+def test_shaped_rewards_are_each_agents_own():
+    places = (3, 2, "right"), (5, 3, "left")
+    record = scene(ASYMM, *places, hands=[ZERO, PLATE], pot_items=[ZERO, SOUP_000], recipe=RECIPE_000)
+    after = act(ASYMM, record, INTERACT, INTERACT)
+    assert (after.shaped, after.reward) == ([3, 5], 0)
+
+
+def test_a_move_turns_to_the_facing_that_tables_give_it():
+    record = scene(CRAMPED, (1, 1, "up"), ASIDE)
+    turned = [FACINGS.index(act(CRAMPED, record, move).places[0][2]) for move in (UP, DOWN, LEFT, RIGHT)]
+    assert turned == FACING_OF.tolist()

@@ -1,0 +1,42 @@
+"""Differential: from the same states and actions, our step, rewards and observations equal JaxMARL's."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.peers import jaxmarl_environment
+from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.overcooked.observe import observe_both
+from icrl4aht_data.overcooked.rules import step
+from icrl4aht_data.overcooked.state import columns
+from tests.helpers.published_readers import TO_PEER_ACTION, from_peer_state, peer_step, to_peer_state
+from tests.helpers.scenes import random_records
+
+BATCH, STEPS, SCENES = 512, 20, 20  # trajectories: 10,240 steps; single steps from random states: 10,240
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_step_rewards_and_observations_equal_jaxmarl(layout):
+    rng = np.random.default_rng(0)
+    env = jaxmarl_environment(layout)
+    advance = peer_step(env)
+    events = 0
+    records = random_records(layout, BATCH, rng)
+    for number in range(STEPS + SCENES):
+        if number >= STEPS:
+            records = random_records(layout, BATCH, rng)
+        actions = np.where(rng.random((BATCH, 2)) < 0.5, 5, rng.integers(0, 6, (BATCH, 2)))
+        keys = jax.random.split(jax.random.PRNGKey(number), BATCH)
+        observed, peer, reward, shaped = advance(keys, to_peer_state(layout, env, records), TO_PEER_ACTION[actions])
+        expected = from_peer_state(layout, peer)
+        ours = step(layout, records, actions, expected[:, columns(layout).recipe])
+        np.testing.assert_array_equal(ours.state, expected)
+        np.testing.assert_array_equal(ours.reward, np.asarray(reward))
+        np.testing.assert_array_equal(ours.shaped, np.asarray(shaped))
+        np.testing.assert_array_equal(observe_both(layout, ours.state), np.asarray(observed))
+        events |= int(np.bitwise_or.reduce(ours.events.reshape(-1)))
+        records = ours.state
+    everything = 255 if layout.buttons else 255 & ~4
+    assert events == everything, f"the random states never caused event bits {everything & ~events:b}"

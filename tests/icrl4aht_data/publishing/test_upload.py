@@ -1,0 +1,265 @@
+"""Releases go to a Hub whole, go on after a cut, and are tagged only if what is there is what was sent."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from huggingface_hub import DatasetCard, ModelCard, snapshot_download
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError, ReleaseError, UploadError
+from icrl4aht_data.format.manifest import read_manifest, write_manifest
+from icrl4aht_data.publishing.build import build_release
+from icrl4aht_data.publishing.upload import upload_release
+from icrl4aht_data.utils.templates import fill
+from tests.helpers.batches import assert_equal
+from tests.helpers.paths import ROOT
+from tests.helpers.random_play import random_release
+from tests.servers.common import Hub, Request, Slow, Status, hub_server, uploads
+
+pytestmark = uploads
+REPO, ADDRESS = "us/histories", "hf://datasets/us/histories"
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory) -> Path:
+    """A release built for publication. Read only."""
+    root = tmp_path_factory.mktemp("upload")
+    random_release(root / "source", streams=2)
+    return build_release(root / "source", root / "release")
+
+
+@pytest.fixture
+def hub(tmp_path):
+    with hub_server(tmp_path / "hub") as hub:
+        yield hub
+
+
+def next_version(release: Path, target: Path) -> Path:
+    """The release under another data version, without one of its files."""
+    shutil.copytree(release, target)
+    info = target / "meta/info.json"
+    info.write_text(info.read_text().replace('"data_version": "0.0.1"', '"data_version": "0.1.0"'))
+    (target / "meta/source_card.md").unlink()
+    write_manifest(target)
+    return target
+
+
+def sent(hub: Hub) -> list[str]:
+    """The large files that were sent whole."""
+    return [request.path for request in hub.log if request.method == "PUT" and request.status == 200]
+
+
+def test_dry_run_uploads_nothing(hub, published):
+    result = CliRunner().invoke(cli, ["upload", str(published), ADDRESS, "--dry-run", "--private"])
+    assert result.exit_code == 0, result.output
+    *files, last = result.output.splitlines()
+    assert len(files) == len(read_manifest(published)) + 1
+    for line in files:
+        size, name = line.split()
+        assert int(size.replace(",", "")) == (published / name).stat().st_size
+    assert last.endswith(f"to the new private dataset repository {REPO}, and tag them v0.0.1")
+    assert not hub.repos
+    assert {request.method for request in hub.log} == {"GET"}
+
+
+def test_an_upload_is_whole_and_tagged(hub, published, tmp_path):
+    done = upload_release(published, ADDRESS, private=True)
+    assert (done.done, done.creates, done.tag, done.deletes) == ("uploaded", True, "v0.0.1", [])
+    assert hub.repo(REPO).tags == {"v0.0.1": done.commit}
+    assert hub.repo(REPO).private
+    there = hub.files(REPO, "v0.0.1")
+    del there[".gitattributes"]
+    assert there == {name: (published / name).read_bytes() for name in done.files}
+    copy = snapshot_download(
+        REPO, repo_type="dataset", revision="v0.0.1", local_dir=tmp_path / "copy", ignore_patterns=".gitattributes"
+    )
+    shutil.rmtree(tmp_path / "copy/.cache")
+    assert verify_release(copy).ok
+
+
+def test_a_second_upload_says_that_it_is_there(hub, published):
+    first = upload_release(published, ADDRESS)
+    hub.log.clear()
+    result = CliRunner().invoke(cli, ["upload", str(published), ADDRESS])
+    assert result.exit_code == 0, result.output
+    assert f"already there, {len(first.files)} files" in result.output
+    assert f"tag v0.0.1 is commit {first.commit}" in result.output
+    assert {request.method for request in hub.log} == {"GET"}
+
+
+def test_a_tag_does_not_move(hub, published, tmp_path):
+    first = upload_release(published, ADDRESS)
+    random_release(tmp_path / "source", streams=2, seed=1)
+    other = build_release(tmp_path / "source", tmp_path / "other")
+    with pytest.raises(UploadError, match=r"us/histories: tag v0\.0\.1 has other content: .*another data version"):
+        upload_release(other, ADDRESS)
+    assert hub.repo(REPO).tags == {"v0.0.1": first.commit}
+
+
+def test_the_next_version_takes_the_place_of_the_last(hub, published, tmp_path):
+    first = upload_release(published, ADDRESS)
+    new = next_version(published, tmp_path / "new")
+    looked = upload_release(new, ADDRESS, dry_run=True)
+    assert looked.deletes == ["meta/source_card.md"]
+    assert any("would delete  meta/source_card.md" in line for line in looked.in_words())
+    before = sent(hub)
+    second = upload_release(new, ADDRESS)
+    assert sent(hub) == before, "large files that were there are not sent again"
+    assert hub.repo(REPO).tags == {"v0.0.1": first.commit, "v0.1.0": second.commit}
+    assert "meta/source_card.md" not in hub.files(REPO)
+    assert "meta/source_card.md" in hub.files(REPO, "v0.0.1")
+
+
+def test_a_repository_with_other_peoples_files_is_left_alone(hub, published, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").write_text("years")
+    hub.add_repo(REPO, tmp_path / "mine")
+    for dry_run in (True, False):
+        with pytest.raises(UploadError, match=r"holds 1 files that are no release's, such as thesis\.txt"):
+            upload_release(published, ADDRESS, dry_run=dry_run)
+    assert hub.files(REPO) == {"thesis.txt": b"years"}
+
+
+def test_a_public_repository_is_not_taken_for_a_private_one(hub, published, tmp_path):
+    upload_release(published, ADDRESS)
+    with pytest.raises(UploadError, match="us/histories: is public; make it private"):
+        upload_release(next_version(published, tmp_path / "new"), ADDRESS, private=True)
+
+
+def test_what_is_not_whole_is_not_uploaded(hub, damaged):
+    (damaged / "meta/info.json").unlink()
+    with pytest.raises(ReleaseError, match=r"not whole: meta/info\.json: listed in the manifest, but missing"):
+        upload_release(damaged, ADDRESS)
+    assert not hub.log
+
+
+@pytest.mark.parametrize("address", ["us/histories", "hf://us/histories", "hf://datasets/us", f"{ADDRESS}@v1"])
+def test_addresses_that_are_none(published, address):
+    with pytest.raises(OptionError, match=r"expected hf://datasets/ORG/REPO"):
+        upload_release(published, address)
+
+
+def test_killed_half_way_it_goes_on(hub, published):
+    """What was sent whole is not sent again."""
+    puts = 0
+
+    def rule(request: Request) -> Slow | None:
+        nonlocal puts
+        puts += request.method == "PUT"
+        return Slow(60) if request.method == "PUT" and puts > 3 else None
+
+    hub.faults.add(rule)
+    command = [sys.executable, "-m", "icrl4aht_data", "upload", str(published), ADDRESS]
+    process = subprocess.Popen(command, env=hub.environment | {"PATH": ""}, cwd=ROOT)
+    deadline = time.monotonic() + 60
+    while (len(sent(hub)) < 3 or puts < 4) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    first = sent(hub)
+    assert len(first) == 3
+    assert not hub.repo(REPO).tags
+    hub.faults.clear()
+    second = subprocess.run(command, env=hub.environment | {"PATH": ""}, cwd=ROOT, capture_output=True, text=True)
+    assert (second.returncode, second.stderr) == (0, ""), "silent where output is no terminal"
+    assert ": uploaded, " in second.stdout
+    again = sent(hub)[3:]
+    assert again and not set(first) & set(again)
+    assert set(hub.repo(REPO).tags) == {"v0.0.1"}
+
+
+def test_a_burst_of_server_errors_is_survived(hub, published):
+    hub.faults.next(Status(503), times=1, path="*/lfs/*", method="PUT")
+    assert upload_release(published, ADDRESS).done == "uploaded"
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "status", "message"),
+    [
+        ("*/refs", "GET", 403, r"token that may write to us: `hf auth login`, or set HF_TOKEN"),
+        ("*/repos/create", "POST", 401, r"token that may write to us"),
+        ("*/commit/main", "POST", 500, r"what was sent stays there: go on with the same command"),
+        ("*/tag/*", "POST", 500, r"what was sent stays there"),
+    ],
+)
+def test_server_errors_become_ours_and_the_same_command_goes_on(hub, published, path, method, status, message):
+    hub.faults.next(Status(status), times=9, path=path, method=method)
+    with pytest.raises(UploadError, match=rf"^us/histories at http://127\.0\.0\.1:\d+: .*{status}.*; .*{message}"):
+        upload_release(published, ADDRESS)
+    assert not hub.repos or not hub.repo(REPO).tags
+    hub.faults.clear()
+    assert upload_release(published, ADDRESS).done == "uploaded"
+
+
+def test_a_hub_that_is_not_there(published, tmp_path):
+    with hub_server(tmp_path / "hub") as hub:
+        hub.close()
+        with pytest.raises(UploadError, match=r"us/histories at http://127\.0\.0\.1:\d+: .*go on with the same"):
+            upload_release(published, ADDRESS)
+
+
+def test_what_differs_after_the_upload_gets_no_tag(hub, published, tmp_path):
+    """Somebody else commits in between."""
+    shutil.copytree(published, tmp_path / "theirs")
+    (tmp_path / "theirs/LICENSE").write_text("all rights reserved")
+    next(tmp_path.glob("theirs/data/*/*/*.h5")).write_bytes(b"no data")
+    (tmp_path / "theirs/CITATION.cff").unlink()
+    (tmp_path / "theirs/more.txt").write_text("")
+
+    def rule(request: Request) -> None:
+        if request.method == "GET" and request.path == f"/api/datasets/{REPO}":
+            hub.add_repo(REPO, tmp_path / "theirs")
+
+    hub.faults.add(rule)
+    with pytest.raises(UploadError, match=r"is not the release: more\.txt: not in the .*CITATION\.cff: missing"):
+        upload_release(published, ADDRESS)
+    assert not hub.repo(REPO).tags
+    hub.faults.clear()
+    with pytest.raises(UploadError, match=r"no release's, such as more\.txt"):
+        upload_release(published, ADDRESS)
+
+
+def test_a_card_that_the_hub_refuses(hub, published, tmp_path):
+    root = tmp_path / "release"
+    shutil.copytree(published, root)
+    card = (root / "README.md").read_text()
+    (root / "README.md").write_text(card.replace("license: mit", "license: mine"))
+    write_manifest(root)
+    with pytest.raises(UploadError, match=r"README\.md.*license.*; correct it, then give the same command"):
+        upload_release(root, ADDRESS)
+
+
+def test_cards_are_valid_to_the_hub(hub, published):
+    DatasetCard.load(published / "README.md", ignore_metadata_errors=False).validate()
+    names = "algorithm layout member checkpoint step sha256 seats own_return teammate_return seed widths code_version"
+    teammate = fill("teammate.md", **dict.fromkeys([*names.split(), "return_of"], "fcp"))
+    ModelCard(teammate).validate()
+    names = "method dataset data_version selection code_version settings protocol results limits"
+    ModelCard(fill("baseline.md", **dict.fromkeys(names.split(), "name"))).validate()
+    assert [request.path for request in hub.log] == ["/api/validate-yaml"] * 3
+
+
+def test_json_says_it_all(hub, published):
+    result = CliRunner().invoke(cli, ["upload", str(published), ADDRESS, "--json"])
+    done = json.loads(result.output)
+    assert done["done"] == "uploaded"
+    assert done["bytes"] == sum((published / name).stat().st_size for name in done["files"])
+    assert done["url"] == f"{hub.endpoint}/datasets/{REPO}"
+
+
+def test_what_was_uploaded_loads(hub, published, tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    done = upload_release(published, ADDRESS)
+    there, here = (load_icrl4aht(root, layout="demo_wide") for root in (f"{ADDRESS}@v0.0.1", published))
+    assert str(there.origin) == f"{ADDRESS}@{done.commit}" and there.info == here.info
+    assert_equal(there.ad(batch_size=4, length=30)[0], here.ad(batch_size=4, length=30)[0])
+    assert verify_release(f"{ADDRESS}@v0.0.1", deep=True).ok

@@ -1,0 +1,398 @@
+"""Releases of observations: made of published files without state records, and usable without them."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.tasks import write_tasks
+from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
+from icrl4aht_data.format.schema import KINDS
+from icrl4aht_data.interop import hf_episodes
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to_published
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.batches import CACHES, assert_equal, samplers
+from tests.helpers.published_files import KEPT, SHARD
+from tests.helpers.random_play import long_index, make_tasks, play, random_release
+
+
+class TestConversion:
+    def test_arrays_and_index_are_those_of_the_files(self, theirs, ours):
+        folder, written = theirs
+        dataset = load_icrl4aht(ours, obs="uint8")
+        assert dataset.info["kind"] == "observations"
+        lines = [json.loads(line) for line in (folder / "histories_index.jsonl").read_text().splitlines()]
+        by_stream = {history.entry.env_idx: history for history in dataset}
+        for line, arrays in zip(lines, written, strict=True):
+            history = by_stream[line["env_idx"]]
+            entry = history.entry.to_json()
+            changed = {"history_id", "h5_group", "layout"}
+            assert {k: entry[k] for k in PUBLISHED_FIELDS if k not in changed} == {
+                k: line[k] for k in PUBLISHED_FIELDS if k not in changed
+            }
+            assert history.entry.layout == get_layout(line["layout"]).name
+            assert history.entry.episodes == arrays["dones"].sum() == line["T"] // KEPT
+            for name, array in arrays.items():
+                np.testing.assert_array_equal(history.read(name), array, err_msg=name)
+            assert len(history.returns()) == history.entry.episodes
+            np.testing.assert_array_equal(history.obs[3:7, 2], arrays["obs"][3:7, 2])
+        assert load_icrl4aht(ours)[0].obs[:5].dtype == np.float32
+        statistics = dataset.info["statistics"]["demo_wide"]
+        assert (statistics["history_length"], statistics["teammates"]) == ([50, 130], None)
+
+    def test_plain_hdf5_readers_find_the_papers_fields(self, theirs, ours):
+        entry = load_icrl4aht(ours).entries[0]
+        with h5py.File(ours / entry.shard) as file:
+            group: Any = file[entry.h5_group]
+            assert set(group) == set(theirs[1][0])
+            assert (group["rewards"].dtype, group["actions"].dtype) == ("float32", "int32")
+            np.testing.assert_array_equal(group["obs"][()], theirs[1][0]["obs"])
+
+    def test_there_and_back_again(self, ours, tmp_path):
+        to_published(load_icrl4aht(ours), tmp_path / "files")
+        assert not (tmp_path / "files" / "tasks.jsonl").exists()
+        from_published(tmp_path / "files", tmp_path / "back", kept_steps=KEPT)
+        for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/info.json", SHARD):
+            assert (tmp_path / "back" / name).read_bytes() == (ours / name).read_bytes(), name
+
+    def test_a_part(self, ours, tmp_path):
+        part = load_icrl4aht(ours, layout="demo_wide")
+        to_release(part, tmp_path / "part", "observations")
+        assert verify_release(tmp_path / "part", deep=True).ok
+        for old, new in zip(part, load_icrl4aht(tmp_path / "part"), strict=True):
+            np.testing.assert_array_equal(old.obs[:], new.obs[:])
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_states_cannot_be_made(self, theirs, ours, tmp_path, kind):
+        with pytest.raises(OptionError, match=rf"has observations only, and a {kind} release is made of state records"):
+            to_release(load_icrl4aht(ours), tmp_path / "out", kind)
+        with pytest.raises(
+            PublishedFormatError, match=r"group /0: lacks state, episode_end_state: .* `--to observations`"
+        ):
+            from_published(theirs[0], tmp_path / "out", kind, kept_steps=KEPT)
+
+    def test_states_may_be_left_out(self, lite, twin, tmp_path):
+        """From a lite release at once, and from published files that have them."""
+        to_published(load_icrl4aht(lite[0]), tmp_path / "files")
+        to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
+        assert from_published(tmp_path / "files", tmp_path / "two", "observations", kept_steps=KEPT) == "observations"
+        for root in (tmp_path / "one", tmp_path / "two"):
+            assert (root / SHARD).read_bytes() == (twin / SHARD).read_bytes()
+        assert from_published(tmp_path / "files", tmp_path / "three", kept_steps=KEPT) == "lite"
+
+    def test_some_groups_with_states(self, lite, tmp_path):
+        to_published(load_icrl4aht(lite[0]), tmp_path / "files")
+        with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+            del file["/4/state"]
+        with pytest.raises(PublishedFormatError, match="group /4: lacks state, which other groups have"):
+            from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
+
+    def test_generation_offers_the_other_kinds_only(self):
+        from generation.cli import cli as generation
+
+        (kind,) = (p for p in generation.commands["generate"].params if p.name == "kind")
+        assert tuple(kind.type.choices) == KINDS == ("full", "lite")  # type: ignore[attr-defined]
+
+
+def put(name: str, place: Any, value: Any):
+    def spoil(file: h5py.File, index: list[dict]) -> None:
+        dataset: Any = file[name]
+        array = dataset[()].astype("f4")
+        array[place] = value
+        del file[name]
+        file[name] = array
+
+    return spoil
+
+
+def drop(name: str):
+    def spoil(file: h5py.File, index: list[dict]) -> None:
+        del file[name]
+
+    return spoil
+
+
+def replace(name: str, content: Any):
+    def spoil(file: h5py.File, index: list[dict]) -> None:
+        del file[name]
+        file[name] = content
+
+    return spoil
+
+
+def say(number: int, **fields: Any):
+    return lambda file, index: index[number].update(fields)
+
+
+class TestFaults:
+    @pytest.mark.parametrize(
+        ("spoil", "message"),
+        [
+            (
+                put("/1/obs", (7, 1, 2, 3), 0.5),
+                r"group /1: obs\[7, 1, 2, 3\]: expected a whole number 0\.\.255, .* 0\.5",
+            ),
+            (put("/0/obs", (7, 1, 2, 3), -1), r"group /0: obs\[7, 1, 2, 3\]: expected .* found -1"),
+            (put("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
+            (put("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
+            (put("/0/actions", 9, 6), r"group /0: actions\[9\]: expected a whole number 0\.\.5, found 6"),
+            (put("/0/teammate_actions", 9, -1), r"teammate_actions\[9\]: expected a whole number 0\.\.5, found -1"),
+            (put("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
+            (put("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected a whole number -128\.\.127, found 0\.25"),
+            (put("/2/rewards", 5, np.inf), r"group /2: rewards\[5\]"),
+            (put("/2/dones", 5, 2), r"group /2: dones\[5\]: expected a whole number 0\.\.1, found 2"),
+            (
+                put("/2/dones", 5, 1),
+                r"group /2: dones: expected an end every 20 steps, found 4 .*\[5, 19, 39\].*--kept",
+            ),
+            (put("/2/dones", slice(None), 0), r"group /2: dones: expected an end every 20 steps, found 0 in 60 steps"),
+            (drop("/1/obs"), r"histories\.h5, group /1: lacks obs: the index promises it"),
+            (drop("/1/rewards"), r"group /1: lacks rewards"),
+            (drop("/1/expert_actions"), r"group /1: lacks expert_actions: the index promises it"),
+            (drop("/3"), r"group /3: missing, but the index names it"),
+            (replace("/3", np.zeros(4)), r"group /3: missing"),
+            (
+                replace("/0/actions", np.zeros(9, "i4")),
+                r"group /0: actions: .*expected numbers of shape \(120,\), found int32 of shape \(9,\)",
+            ),
+            (
+                replace("/0/actions", np.array([b"x"] * 120)),
+                r"group /0: actions: .*expected numbers, or small arrays of them, found \|S1",
+            ),
+            (lambda file, index: file["/0"].pop("obs") and file.create_group("/0/obs"), r"/0/obs: not a dataset"),
+            (say(1, T=100), r"group /1: dones: 100 steps on demo_wide: expected numbers of shape \(100,\), found"),
+            (say(0, layout="test_wide"), r"history 1 is of .*demo_wide.*, its task 'task_a' of .*test_wide"),
+            (say(2, layout="demo_simple"), None),  # as many channels: nothing in the files says otherwise
+            (say(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
+            (say(1, teammate_kind="other"), r"index\.jsonl: history 1 is of .*'other'.*, its task 'task_a' of"),
+            (say(1, T="many"), r"index\.jsonl, line 2: field 'T': expected int, found 'many'"),
+            (say(3, layout="kitchen"), r"index\.jsonl, line 4: unknown layout"),
+            (say(3, teammate_family="H9"), r"index\.jsonl, line 4: unknown teammate_family 'H9'"),
+        ],
+    )
+    def test_files_with_faults(self, theirs, tmp_path, spoil, message):
+        files = shutil.copytree(theirs[0], tmp_path / "files")
+        path = files / "histories_index.jsonl"
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        with h5py.File(files / "histories.h5", "r+") as file:
+            spoil(file, lines)
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        if message is None:
+            from_published(files, tmp_path / "out", kept_steps=KEPT)
+            assert verify_release(tmp_path / "out").ok
+            (finding,) = verify_release(tmp_path / "out", deep=True).findings
+            assert "obs: 60 steps do not show demo_simple from any cell" in finding.problem
+            return
+        with pytest.raises(PublishedFormatError, match=message):
+            from_published(files, tmp_path / "out", kept_steps=KEPT)
+        assert not (tmp_path / "out").exists()
+
+    def test_another_episode_length(self, theirs, tmp_path):
+        with pytest.raises(PublishedFormatError, match=r"group /0: dones: expected an end every 100 steps, found 6"):
+            from_published(theirs[0], tmp_path / "out")
+        with pytest.raises(OptionError, match="kept_steps = 0"):
+            from_published(theirs[0], tmp_path / "out", kept_steps=0)
+
+    def test_states_need_whole_episodes(self, tmp_path):
+        (task,) = make_tasks(["demo_simple"])
+        arrays = play(task.layout, 3, KEPT, np.random.default_rng(0))
+        cut = {name: array if name == "episode_end_state" else array[:50] for name, array in arrays.items()}
+        new = NewTask(task, {}, 1, lambda: [NewHistory(0, cut | {"episode_end_state": cut["episode_end_state"][:2]})])
+        with pytest.raises(OptionError, match="do not all have 20 steps"):
+            write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=KEPT)
+
+
+class TestTasks:
+    def test_without_tasks_teammates_are_known_by_name(self, ours):
+        dataset = load_icrl4aht(ours)
+        assert (ours / "meta" / "tasks.jsonl").read_text() == ""
+        assert {entry.seed for entry in dataset.entries} == {-1}
+        with pytest.raises(
+            NotStoredError, match=r"tasks\.jsonl: empty: .* family rl and kind some_variant; .* --tasks"
+        ):
+            dataset.recover_teammate(0)
+        assert dataset.recover_environment(0)["layout"] == "demo_wide"
+        assert len(load_icrl4aht(ours, teammate_family="H2", task_id="task_c")) == 1
+
+    def test_with_tasks_they_are_known(self, lite, twin):
+        one, two = load_icrl4aht(lite[0]), load_icrl4aht(twin)
+        assert (twin / "meta" / "tasks.jsonl").read_text() == (lite[0] / "meta" / "tasks.jsonl").read_text()
+        assert two.recover_teammate(8) == one.recover_teammate(8)
+        assert [entry.seed for entry in two.entries] == [entry.seed for entry in one.entries]
+
+    def test_all_are_given_or_none(self, theirs, tmp_path):
+        write_tasks(tmp_path / "tasks.jsonl", make_tasks(["demo_wide"]))
+        with pytest.raises(PublishedFormatError, match=r"tasks\.jsonl: lacks 3 tasks of the index, such as 'task_a'"):
+            from_published(theirs[0], tmp_path / "out", tasks=tmp_path / "tasks.jsonl", kept_steps=KEPT)
+        with pytest.raises(PublishedFormatError, match=r"other\.jsonl: missing; give a file"):
+            from_published(theirs[0], tmp_path / "out", tasks=tmp_path / "other.jsonl", kept_steps=KEPT)
+
+
+class TestWithoutStates:
+    def test_what_needs_states_says_so(self, ours):
+        with pytest.raises(
+            OptionError, match=r'obs = "state": .* has observations only, no state records; take float32'
+        ):
+            load_icrl4aht(ours, obs="state")
+        dataset = load_icrl4aht(ours)
+        for name in ("state", "episode_end_state"):
+            with pytest.raises(NotStoredError, match=rf"no {name}: this release has observations only"):
+                getattr(dataset[0], name)
+            with pytest.raises(NotStoredError, match="full or lite release"):
+                dataset[0].read(name)
+        with pytest.raises(NotStoredError, match="take hf_windows"):
+            hf_episodes(dataset)
+
+    def test_missing_teammate_actions(self, ours):
+        dataset = load_icrl4aht(ours, task_id="task_c")
+        with pytest.raises(LabelsMissingError, match=r"no teammate actions: .* has_teammate_actions = false"):
+            dataset[0].teammate_actions  # noqa: B018
+        with pytest.raises(LabelsMissingError, match="some histories have none"):
+            dataset.ad(batch_size=1, length=5, teammate_actions=True)
+        for cache in CACHES:
+            mixed = load_icrl4aht(ours, layout="demo_wide", cache=cache)
+            assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
+
+    def test_a_large_index_says_who_has_them(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+        long_index(tmp_path / "r")
+        info, index = tmp_path / "r" / "meta" / "info.json", tmp_path / "r" / "meta" / "histories.jsonl"
+        lines = [json.loads(line) for line in index.read_text().splitlines()]
+        for number, line in enumerate(lines):
+            line["has_teammate_actions"] = number % 3 > 0
+        index.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        with pytest.raises(
+            IndexFormatError, match=r"histories\.jsonl, line 1: expected has_teammate_actions true in a lite"
+        ):
+            load_icrl4aht(tmp_path / "r")
+        info.write_text(json.dumps(json.loads(info.read_text()) | {"kind": "observations"}))
+        dataset = load_icrl4aht(tmp_path / "r")
+        assert dataset.column("has_teammate_actions").tolist() == [n % 3 > 0 for n in range(3000)]
+
+
+class TestBatches:
+    @pytest.mark.parametrize("obs", ["float32", "uint8"])
+    @pytest.mark.parametrize("cache", CACHES)
+    def test_ad_batches_are_those_of_the_original(self, lite, full, twin, obs, cache):
+        options = {"batch_size": 6, "seed": 5, "teammate_actions": True}
+        for root in (lite[0], full[0]):
+            original = load_icrl4aht(root, layout="demo_wide", obs=obs)
+            dataset = load_icrl4aht(twin, layout="demo_wide", obs=obs, cache=cache, threads=2)
+            for length in (1, 40, 130):  # the last longer than the histories
+                for i in (0, 3, 1000):
+                    one, two = (d.ad(length=length, **options)[i] for d in (original, dataset))
+                    assert two.obs.dtype == obs
+                    assert_equal(one, two)
+        plan = Curriculum(batches=10, first=(0.0, 0.5), last=(0.5, 1.0))
+        one, two = (
+            d.ad(batch_size=6, length=50, episodes=(1, 4), curriculum=plan, weights="length")[7]
+            for d in (original, dataset)
+        )
+        assert_equal(one, two)
+
+    @pytest.mark.parametrize("obs", ["float32", "uint8"])
+    def test_the_same_batches_from_each_cache(self, twin, obs):
+        expected, *others = (
+            samplers(load_icrl4aht(twin, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
+            for cache in CACHES
+            for threads in (1, 3)
+        )
+        for sampler, *same in zip(expected, *others, strict=True):
+            for i in (0, 1, 77):
+                for other in same:
+                    assert_equal(sampler[i], other[i])
+            assert_equal(sampler.batch(3, sampler.empty()), sampler[3])
+            assert_equal(pickle.loads(pickle.dumps(sampler))[5], sampler[5])
+
+    @pytest.mark.parametrize("cache", CACHES)
+    def test_several_layouts_of_one_shape(self, tmp_path, cache):
+        random_release(tmp_path / "r", layouts=("coord_simple", "demo_simple"), teammates=1)
+        to_release(load_icrl4aht(tmp_path / "r"), tmp_path / "o", "observations")
+        for obs in ("float32", "uint8"):
+            one, two = (load_icrl4aht(tmp_path / name, obs=obs, cache=cache) for name in ("r", "o"))
+            assert_equal(one.ad(batch_size=16, length=130)[0], two.ad(batch_size=16, length=130)[0])
+            batch = two.dpt(batch_size=16, context=30)[0]
+            assert batch.layouts is None
+            assert batch.query_obs.any(axis=(1, 2, 3)).all()
+
+    @pytest.mark.parametrize("cache", CACHES)
+    @pytest.mark.parametrize("order", ["contiguous", "random"])
+    @pytest.mark.parametrize("options", [{}, {"episodes": (1, 3)}, {"episodes": (-1, None)}])
+    def test_no_context_has_an_episodes_last_step(self, ours, theirs, cache, order, options):
+        """Nor the last step of an unfinished episode; every other step turns up, with what followed it."""
+        arrays = theirs[1][1]  # 130 steps: six episodes and a half
+        dataset = load_icrl4aht(ours, obs="uint8", cache=cache).select([1])
+        sampler = dataset.dpt(batch_size=40, context=15, order=order, seed=2, teammate_actions=True, **options)
+        low, high = {(1, 3): (20, 60), (-1, None): (100, 130)}.get(options.get("episodes"), (0, 130))
+        met = set()
+        for i in range(6):
+            batch, (_, query, _, steps) = sampler[i], sampler._draw(i)
+            met |= set(steps.ravel().tolist())
+            assert (np.diff(steps) == np.where((steps[:, :-1] + 2) % KEPT, 1, 2)).all() or order == "random"
+            np.testing.assert_array_equal(batch.query_obs, arrays["obs"][query])
+            np.testing.assert_array_equal(batch.query_target, arrays["expert_actions"][query])
+            np.testing.assert_array_equal(batch.context_obs, arrays["obs"][steps])
+            np.testing.assert_array_equal(batch.context_next_obs, arrays["obs"][steps + 1])
+            np.testing.assert_array_equal(batch.context_actions, arrays["actions"][steps])
+            np.testing.assert_array_equal(batch.context_rewards, arrays["rewards"][steps])
+            np.testing.assert_array_equal(batch.context_teammate_actions, arrays["teammate_actions"][steps])
+        assert met == {t for t in range(low, high) if t % KEPT != KEPT - 1 and t != 129}
+
+    def test_what_may_be_asked_for_is_queried_at_every_step(self, ours):
+        sampler = load_icrl4aht(ours).select([0]).dpt(batch_size=2000, context=1)
+        assert set(sampler._draw(0)[1].tolist()) == set(range(120))
+
+    def test_impossible_contexts(self, ours, tmp_path):
+        dataset = load_icrl4aht(ours, task_id="task_a", obs="uint8")  # 120 and 130 steps: 114 and 123 transitions
+        assert dataset.dpt(batch_size=2, context=114)[0].context_obs.shape == (2, 114, 5, 5, 45)
+        with pytest.raises(OptionError, match="context = 115: the shortest history has 114 transitions"):
+            dataset.dpt(batch_size=2, context=115)
+        random_release(tmp_path / "r", layouts=("cramped_up",), episodes=9, length=1)
+        to_release(load_icrl4aht(tmp_path / "r"), tmp_path / "o", "observations")
+        for order in ("contiguous", "random"):
+            with pytest.raises(OptionError, match="the shortest history has 0 transitions"):
+                load_icrl4aht(tmp_path / "o").dpt(batch_size=2, context=1, order=order)
+        with pytest.raises(LabelsMissingError, match="DPT needs expert actions, but 1 of 1 histories have none"):
+            load_icrl4aht(ours, task_id="task_b").dpt(batch_size=2, context=5)
+
+    def test_positions_of_other_contexts_are_not_resumed(self, lite, twin):
+        one, two = (load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5) for root in (lite[0], twin))
+        with one.batches() as batches, pytest.raises(OptionError, match="excluded"):
+            two.batches().load_state_dict(batches.state_dict())
+
+
+class TestCombine:
+    def test_like_ones(self, ours, theirs, twin, lite, tmp_path):
+        other = shutil.copytree(theirs[0], tmp_path / "files")
+        index = other / "histories_index.jsonl"
+        index.write_text(index.read_text().replace('": "task_', '": "more_'))
+        from_published(other, tmp_path / "more", kept_steps=KEPT)
+        combine_releases(tmp_path / "out", [ours, tmp_path / "more"])
+        assert verify_release(tmp_path / "out", deep=True).ok
+        combined = load_icrl4aht(tmp_path / "out", obs="uint8")
+        assert len(combined) == 8
+        assert not combined.knows_tasks
+        before = {(h.entry.task_id, h.entry.env_idx): h for r in (ours, tmp_path / "more") for h in load_icrl4aht(r)}
+        for history in combined:
+            old = before[history.entry.task_id, history.entry.env_idx]
+            np.testing.assert_array_equal(history.obs[:], old.obs[:])
+            np.testing.assert_array_equal(history.actions[:], old.actions[:])
+        with pytest.raises(OptionError, match=r"3 of 7 tasks, such as 'task_a', are known by name only: give all"):
+            combine_releases(tmp_path / "mixed", [twin, ours])
+        with pytest.raises(OptionError, match=r"kind 'lite'.*combine releases of one kind"):
+            combine_releases(tmp_path / "mixed", [ours, lite[0]])
+
+    def test_one_with_tasks_to_the_same_bytes(self, twin, tmp_path):
+        combine_releases(tmp_path / "out", [twin])
+        for name in (SHARD, "meta/tasks.jsonl", "meta/histories.jsonl", "meta/info.json"):
+            assert (tmp_path / "out" / name).read_bytes() == (twin / name).read_bytes()

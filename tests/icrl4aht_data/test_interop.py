@@ -1,0 +1,160 @@
+"""Other libraries' loaders over our samplers, each with the library itself."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows
+from tests.helpers.batches import assert_equal
+from tests.helpers.paths import ROOT
+
+
+@pytest.fixture
+def sampler(lite):
+    return load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=4, length=25, seed=6)
+
+
+class TestPlainLoop:
+    def test_a_loop_ends_after_as_many_steps_as_the_selection_has(self, sampler):
+        batches = list(sampler)
+        assert len(batches) == len(sampler) == 6 * 120 // (4 * 25)
+        assert_equal(batches[3], sampler[3])
+
+
+class TestGrain:
+    def test_any_number_of_threads_gives_the_same_order(self, sampler):
+        import grain
+
+        source = grain.MapDataset.source(sampler)
+        for threads in (0, 1, 4):
+            options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=8 * (threads > 0))
+            found = list(source.to_iter_dataset(options))
+            assert len(found) == len(sampler)
+            for i, batch in enumerate(found):
+                assert_equal(batch, sampler[i])
+
+    def test_a_checkpointed_iterator_resumes_exactly(self, sampler):
+        import grain
+
+        def make():
+            return iter(grain.MapDataset.source(sampler).repeat(2).to_iter_dataset())
+
+        iterator = make()
+        for _ in range(3):
+            next(iterator)
+        state = iterator.get_state()
+        rest = list(iterator)
+        again = make()
+        again.set_state(state)
+        for one, two in zip(again, rest, strict=True):
+            assert_equal(one, two)
+        assert_equal(rest[0], sampler[3])
+
+
+TORCH = """
+import sys
+import numpy as np
+import torch
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.interop import torch_loader
+
+if __name__ == "__main__":
+    for cache in ("mmap", "stream"):
+        dataset = load_icrl4aht(sys.argv[1], layout="demo_wide", obs="float32", cache=cache, threads=2)
+        samplers = dataset.ad(batch_size=4, length=25, seed=6), dataset.dpt(batch_size=4, context=25, seed=6)
+        for sampler in samplers[: 1 if cache == "stream" else 2]:
+            sampler[0]  # what a forked worker inherits has been used: threads, locks, open files
+            for workers, context in ((0, "spawn"), (2, "fork"), (1, "spawn")):
+                loader = torch_loader(sampler, start=1, stop=6, workers=workers, context=context)
+                for epoch in range(2 if context == "fork" else 1):  # workers persist
+                    for i, batch in enumerate(loader, start=1):
+                        for name, array in sampler[i]._asdict().items():
+                            if array is not None:
+                                found = getattr(batch, name)
+                                assert isinstance(found, torch.Tensor)
+                                np.testing.assert_array_equal(found.numpy(), array)
+                    assert i == 5
+                print(cache, type(batch).__name__, workers, context)
+"""
+
+
+def test_pytorch_with_any_workers(lite, tmp_path):
+    """In a process of its own, since a process that has run JAX must not fork."""
+    script = tmp_path / "loader.py"
+    script.write_text(TORCH)
+    run = subprocess.run(
+        [sys.executable, "-W", "error", str(script), str(lite[0])],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert run.returncode == 0, run.stderr
+    assert len(run.stdout.splitlines()) == 9
+
+
+class TestHuggingFace:
+    def test_index(self, lite):
+        dataset = load_icrl4aht(lite[0], layout="demo_wide")
+        assert hf_index(dataset).to_list() == [entry.to_json() for entry in dataset.entries]
+
+    def test_episodes(self, lite, tmp_path, monkeypatch):
+        monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
+        root, written = lite
+        rows = hf_episodes(load_icrl4aht(root, layout="demo_wide"))
+        assert len(rows) == 36
+        row = rows[8]
+        assert (row["history_id"], row["episode"], row["layout"]) == (7, 2, "demo_wide")
+        for name in ("actions", "teammate_actions", "expert_actions", "rewards"):
+            np.testing.assert_array_equal(row[name], written[7][name][40:60])
+        np.testing.assert_array_equal(
+            np.frombuffer(b"".join(row["state"]), np.uint8), written[7]["state"][40:60].reshape(-1)
+        )
+        assert row["return"] == written[7]["rewards"][40:60].sum()
+
+    def test_windows_and_resuming(self, sampler):
+        windows = hf_windows(sampler, stop=3)
+        rows = list(windows)
+        assert len(rows) == 12
+        for number, row in enumerate(rows):
+            for name, array in row.items():
+                np.testing.assert_array_equal(array, getattr(sampler[number // 4], name)[number % 4])
+        iterator = iter(windows)
+        for _ in range(5):
+            next(iterator)
+        again = hf_windows(sampler, stop=3)
+        again.load_state_dict(windows.state_dict())
+        np.testing.assert_array_equal(next(iter(again))["obs"], rows[5]["obs"])
+
+
+@pytest.mark.parametrize(
+    ("module", "call", "extra"),
+    [
+        ("datasets", lambda s: hf_index(s.dataset), "hf"),
+        ("torch.utils.data", lambda s: _torch(s), "torch"),
+        ("pyarrow", lambda s: _parquet(s), "hf"),
+    ],
+)
+def test_a_missing_library_names_its_extra(sampler, monkeypatch, module, call, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(Exception, match=rf"pip install 'icrl4aht-data\[{extra}\]'"):
+        call(sampler)
+
+
+def _torch(sampler):
+    from icrl4aht_data.interop import torch_loader
+
+    return torch_loader(sampler)
+
+
+def _parquet(sampler):
+    from icrl4aht_data.writing.parquet import to_parquet
+
+    return to_parquet(sampler.dataset, Path("never.parquet"))

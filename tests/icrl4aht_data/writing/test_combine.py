@@ -1,0 +1,93 @@
+"""Several releases as one."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import FormatTooNewError, OptionError
+from icrl4aht_data.format.schema import INFO, Kind
+from icrl4aht_data.writing.combine import combine_releases
+from tests.helpers.random_play import random_release
+
+_FIELDS = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state")
+
+
+@pytest.fixture(scope="module", params=["lite", "full"])
+def parts(request, tmp_path_factory) -> list[Path]:
+    """Two releases, without a task in common, of the same layout and of another."""
+    folder = tmp_path_factory.mktemp(request.param)
+    random_release(folder / "a", request.param, ("coord_simple",), teammates=1, streams=2, episodes=5)
+    random_release(folder / "b", request.param, ("demo_wide", "coord_simple"), teammates=1, streams=3, episodes=6)
+    return [folder / "a", folder / "b"]
+
+
+def test_histories_are_those_of_the_parts(parts, tmp_path):
+    result = CliRunner().invoke(cli, ["combine", str(tmp_path / "out"), *map(str, parts)], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "Filtered transitions" in result.output
+    report = verify_release(tmp_path / "out", deep=True)
+    assert report.ok, report.findings
+    combined = load_icrl4aht(tmp_path / "out")
+    before = {(h.entry.task_id, h.entry.env_idx): h for part in parts for h in load_icrl4aht(part)}
+    assert [e.history_id for e in combined.entries] == list(range(8))
+    assert {(e.task_id, e.env_idx) for e in combined.entries} == before.keys()
+    for history in combined:
+        old = before[history.entry.task_id, history.entry.env_idx]
+        assert (history.entry.score, history.entry.seed) == (old.entry.score, old.entry.seed)
+        for name in _FIELDS:
+            assert np.array_equal(history.read(name), old.read(name)), name
+    assert "* 8 histories of " in (tmp_path / "out" / "README.md").read_text()
+    assert (tmp_path / "out" / "meta" / "source_card.md").read_text().count("SHA-256 of its manifest") == len(parts)
+
+
+def test_one_release_combines_to_the_same_bytes(parts, tmp_path):
+    combine_releases(tmp_path / "out", parts[:1])
+    for shard in (parts[0] / "data").rglob("*.h5"):
+        assert (tmp_path / "out" / shard.relative_to(parts[0])).read_bytes() == shard.read_bytes()
+
+
+def test_a_task_in_two_releases_is_refused(parts, tmp_path):
+    with pytest.raises(OptionError, match=r"b: task teammate_train_demo_cook_wide_.* is also in .*b"):
+        combine_releases(tmp_path / "out", [parts[1], parts[0], parts[1]])
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
+    cases: list[tuple[str, Kind, int]] = [("a", "lite", 20), ("b", "full", 20), ("c", "lite", 10), ("d", "lite", 20)]
+    for name, kind, length in cases:
+        layout = "coord_simple" if name == "a" else "demo_wide"
+        random_release(tmp_path / name, kind, (layout,), teammates=1, streams=1, length=length)
+    a, b, c, d = (tmp_path / name for name in "abcd")
+    with pytest.raises(OptionError, match=r"b: kind 'full', but .*a has 'lite'; combine releases of one kind"):
+        combine_releases(tmp_path / "out", [a, b])
+    with pytest.raises(OptionError, match=r"c: environment .*'kept_steps': 10.*a has .*'kept_steps': 20"):
+        combine_releases(tmp_path / "out", [a, c])
+    with pytest.raises(OptionError, match="is one of the releases to combine"):
+        combine_releases(a, [a, d])
+    info = json.loads((d / INFO).read_text())
+    (d / INFO).write_text(json.dumps(info | {"data_version": "0.0.2"}))
+    with pytest.raises(OptionError, match=r"data versions 0\.0\.1, 0\.0\.2: say which one"):
+        combine_releases(tmp_path / "out", [a, d])
+    combine_releases(tmp_path / "out", [a, d], "0.1.0")
+    assert json.loads((tmp_path / "out" / INFO).read_text())["data_version"] == "0.1.0"
+    (d / INFO).write_text(json.dumps(info | {"format_version": 99}))
+    with pytest.raises(FormatTooNewError, match="format version 99"):
+        combine_releases(tmp_path / "out", [a, d])
+
+
+def test_a_refusal_is_one_line_and_exit_code_1(lite, tmp_path):
+    command = [sys.executable, "-m", "icrl4aht_data", "combine", str(tmp_path / "out"), str(lite[0]), str(lite[0])]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: ")
+    assert "is also in" in result.stderr
+    assert result.stderr.count("\n") == 1

@@ -1,0 +1,132 @@
+"""Other forms of a release, and the way back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError, PublishedFormatError
+from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.parquet import to_parquet
+from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to_published
+from tests.helpers.batches import digest
+
+
+@pytest.fixture(scope="module")
+def published(lite, tmp_path_factory):
+    """`lite` as the published code's files. Read only."""
+    return to_published(load_icrl4aht(lite[0]), tmp_path_factory.mktemp("published") / "files")
+
+
+@pytest.mark.parametrize(("start", "kind"), [("lite", "full"), ("full", "lite"), ("full", "full")])
+def test_full_and_lite(request, tmp_path, start, kind):
+    root, _ = request.getfixturevalue(start)
+    to_release(load_icrl4aht(root), tmp_path / "out", kind)
+    assert verify_release(tmp_path / "out", deep=True).ok
+    assert load_icrl4aht(tmp_path / "out").info["kind"] == kind
+    assert digest(tmp_path / "out") == digest(root)
+    assert (tmp_path / "out" / "meta" / "tasks.jsonl").read_text() == (root / "meta" / "tasks.jsonl").read_text()
+
+
+def test_a_part_of_a_release(lite, tmp_path):
+    part = load_icrl4aht(lite[0]).select([7, 2])
+    to_release(part, tmp_path / "out", "lite")
+    out = load_icrl4aht(tmp_path / "out")
+    assert verify_release(tmp_path / "out", deep=True).ok
+    for old, new in zip(part, out, strict=True):
+        np.testing.assert_array_equal(new.state[:], old.state[:])
+
+
+def test_published_files_are_as_the_paper_says(lite, published):
+    root, written = lite
+    with h5py.File(published / "histories.h5") as file:
+        for line in (published / "histories_index.jsonl").read_text().splitlines():
+            entry = json.loads(line)
+            assert tuple(entry) == PUBLISHED_FIELDS
+            group: Any = file[entry["h5_group"]]
+            arrays = written[entry["history_id"]]
+            for name, dtype in (("actions", "int32"), ("teammate_actions", "int32"), ("expert_actions", "int32")):
+                assert group[name].dtype == dtype
+                theirs = [PUBLISHED_ACTIONS[a] for a in group[name][()]]
+                assert theirs == [ACTIONS[a] for a in arrays[name]]
+            assert (group["rewards"].dtype, group["dones"].dtype, group["obs"].dtype) == ("float32", "bool", "float32")
+            assert (group["obs"].compression, group["obs"].compression_opts) == ("gzip", 6)
+            assert group["obs"].chunks == (120, *entry["obs_shape"])
+            np.testing.assert_array_equal(group["obs"][()], load_icrl4aht(root).history(entry["history_id"]).obs[:])
+
+
+def test_there_and_back(lite, published, tmp_path):
+    from_published(published, tmp_path / "back", "lite", data_version="0.0.1", kept_steps=20)
+    assert verify_release(tmp_path / "back", deep=True).ok
+    assert digest(tmp_path / "back") == digest(lite[0])
+    for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/provenance.json", "meta/info.json"):
+        assert (tmp_path / "back" / name).read_text() == (lite[0] / name).read_text()
+
+
+def test_published_files_with_faults(published, tmp_path):
+    def fails(message: str) -> None:
+        with pytest.raises(PublishedFormatError, match=message):
+            from_published(tmp_path / "files", tmp_path / "out", "lite", kept_steps=20)
+        assert not (tmp_path / "out").exists()
+
+    shutil.copytree(published, tmp_path / "files")
+    with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+        group: Any = file["/3"]
+        group["obs"][5] += 1
+        del file["/1/state"]
+    fails(r"histories\.h5, group /1: lacks state: a lite release is made of state records")
+    with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+        file["/1/state"] = file["/0/state"]
+    fails(r"group /1: obs is not what state shows")
+    (tmp_path / "files" / "histories.h5").write_bytes(b"junk")
+    fails("cannot be opened as HDF5")
+    index = tmp_path / "files" / "histories_index.jsonl"
+    index.write_text(index.read_text().replace('"track"', '"trick"', 1))
+    fails(r"histories_index\.jsonl, line 1: lacks the fields \['track'\]")
+    (tmp_path / "files" / "tasks.jsonl").unlink()
+    for name in ("histories.h5", "histories_index.jsonl"):
+        shutil.copy(published / name, tmp_path / "files")
+    fails(r"tasks\.jsonl: missing")
+
+
+def test_targets_that_are_taken(lite, tmp_path):
+    dataset = load_icrl4aht(lite[0])
+    (tmp_path / "file").touch()
+    with pytest.raises(OptionError, match="exists; give a new folder"):
+        to_published(dataset, tmp_path)
+    with pytest.raises(OptionError, match="is not a release"):
+        to_release(dataset, tmp_path, "full")
+    with pytest.raises(OptionError, match="the release itself"):
+        to_release(dataset, lite[0], "full")
+
+
+def test_parquet_index(lite, tmp_path):
+    import pyarrow.parquet as pq
+
+    dataset = load_icrl4aht(lite[0], layout="demo_wide")
+    rows = pq.read_table(to_parquet(dataset, tmp_path / "index.parquet")).to_pylist()
+    assert rows == [entry.to_json() for entry in dataset.entries]
+
+
+@pytest.mark.parametrize("to", ["full", "published", "parquet"])
+def test_on_the_command_line(lite, tmp_path, to):
+    target = tmp_path / ("index.parquet" if to == "parquet" else "out")
+    done = CliRunner().invoke(cli, ["convert", str(lite[0]), str(target), "--to", to, "--layout", "demo_wide"])
+    assert done.exit_code == 0, done.output
+    assert str(target) in done.output
+    if to == "published":
+        back = CliRunner().invoke(
+            cli, ["convert", str(target), str(tmp_path / "r"), "--to", "lite", "--kept-steps", "20"]
+        )
+        assert back.exit_code == 0, back.output
+        assert verify_release(tmp_path / "r", deep=True).ok
+        assert CliRunner().invoke(cli, ["convert", str(target), str(tmp_path / "x"), "--to", "parquet"]).exit_code != 0

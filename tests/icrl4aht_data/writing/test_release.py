@@ -1,0 +1,296 @@
+"""Writing: what goes in comes out, by our reader and by plain h5py; nothing half-written is ever taken for whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.errors import OptionError, RootNotFoundError
+from icrl4aht_data.format.chunks import decode_chunk
+from icrl4aht_data.format.schema import FIELDS, episode_returns
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.shard_writer import encode_chunk
+from tests.helpers.paths import ROOT
+from tests.helpers.random_play import make_tasks, play, random_release
+
+
+def test_our_reader_gives_back_every_array(either):
+    root, written = either
+    dataset = load_icrl4aht(root)
+    assert len(dataset) == len(written) == 12
+    for history in dataset:
+        for name, array in written[history.entry.history_id].items():
+            found = history.read(name)
+            np.testing.assert_array_equal(found, array)
+            assert found.dtype == FIELDS[name].dtype
+        layout = get_layout(history.entry.layout)
+        np.testing.assert_array_equal(
+            history.read("obs"), observe(layout, written[history.entry.history_id]["state"], 0)
+        )
+
+
+def test_plain_h5py_reads_the_same(either):
+    root, written = either
+    for entry in load_icrl4aht(root).entries:
+        with h5py.File(root / entry.shard) as file:
+            for name, array in written[entry.history_id].items():
+                dataset: Any = file[f"{entry.h5_group}/{name}"]
+                found = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
+                np.testing.assert_array_equal(found, array)
+
+
+def test_full_has_the_papers_fields_and_dtypes(full):
+    root, _ = full
+    entry = load_icrl4aht(root).entries[0]
+    with h5py.File(root / entry.shard) as file:
+        group: Any = file[entry.h5_group]
+        dtypes = {name: str(group[name].dtype.base) for name in group if FIELDS[name].row != "state"}
+        assert group["obs"][:].shape == (entry.T, *entry.obs_shape)
+        assert group["state"][()].shape == (entry.T, record_size(get_layout(entry.layout)))
+        assert group["state"][()].dtype == np.uint8
+    assert dtypes == {
+        "obs": "uint8",
+        "actions": "int32",
+        "rewards": "float32",
+        "dones": "bool",
+        "teammate_actions": "int32",
+        "expert_actions": "int32",
+    }
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    layout=st.sampled_from(sorted(LAYOUTS)),
+    episodes=st.integers(1, 12),
+    length=st.sampled_from([1, 7, 100, 260]),
+    kind=st.sampled_from(["lite", "full"]),
+    shard_histories=st.sampled_from([1, 2, 1024]),
+    labels=st.booleans(),
+    seed=st.integers(0, 2**16),
+)
+def test_any_release_round_trips_and_verifies(tmp_path, layout, episodes, length, kind, shard_histories, labels, seed):
+    root = tmp_path / f"{time.monotonic_ns()}"
+    written = random_release(
+        root,
+        kind,
+        (layout,),
+        teammates=1,
+        episodes=episodes,
+        length=length,
+        labels=labels,
+        seed=seed,
+        shard_histories=shard_histories,
+    )
+    report = verify_release(root, deep=True)
+    assert report.ok, report.findings
+    assert report.transitions == 3 * episodes * length
+    dataset = load_icrl4aht(root)
+    assert len({entry.shard for entry in dataset.entries}) == -(-3 // shard_histories)
+    for history in dataset:
+        for name, array in written[history.entry.history_id].items():
+            np.testing.assert_array_equal(history.read(name), array)
+
+
+@settings(max_examples=50, deadline=None)
+@given(rows=st.integers(1, 40), extra=st.integers(0, 10), itemsize=st.integers(1, 24), seed=st.integers(0, 99))
+def test_chunks_decode_to_what_was_encoded(rows, extra, itemsize, seed):
+    array = np.random.default_rng(seed).integers(0, 256, (rows, itemsize)).astype(np.uint8)
+    raw = decode_chunk(encode_chunk(array, rows + extra, itemsize), (rows + extra) * itemsize, itemsize)
+    assert raw == array.tobytes() + bytes(extra * itemsize)
+
+
+def test_a_chunk_of_another_size_is_refused():
+    data = encode_chunk(np.zeros((4, 3), np.uint8), 4, 3)
+    for size in (9, 15):
+        with pytest.raises(ValueError, match=f"does not inflate to {size} bytes"):
+            decode_chunk(data, size, 3)
+
+
+def test_two_writes_of_one_release_are_equal_bytes(tmp_path):
+    for name in ("a", "b"):
+        random_release(tmp_path / name)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
+    assert len(files) >= 9
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_returns_of_episodes():
+    rewards = np.array([0, 20, -5, 20, 20, -20], np.float32)
+    dones = np.array([0, 0, 1, 0, 1, 1], bool)
+    assert episode_returns(rewards, dones).tolist() == [15.0, 40.0, -20.0]
+
+
+def visible(folder):
+    """What is in a folder but for lock files."""
+    return sorted(path.name for path in folder.iterdir() if path.suffix != ".lock")
+
+
+def lossy(arrays):
+    return arrays | {"rewards": arrays["rewards"] + 0.5}
+
+
+def short(arrays):
+    return arrays | {"actions": arrays["actions"][:-1]} | {"state": arrays["state"][:-1]}
+
+
+def bare(arrays):
+    return {name: array for name, array in arrays.items() if name != "episode_end_state"}
+
+
+def odd(arrays):
+    return arrays | {"dones": np.roll(arrays["dones"], 1)}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [(lossy, "values that int8 cannot hold"), (short, "rows, expected"), (bare, "lacks the arrays"), (odd, "10 steps")],
+)
+def test_arrays_that_do_not_fit_are_refused_and_nothing_remains(tmp_path, spoil, message):
+    (task,) = make_tasks(["cramped_up"])
+    arrays = spoil(play(task.layout, 5, 10, np.random.default_rng(0)))
+    new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)])
+    with pytest.raises(OptionError, match=message):
+        write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
+    assert visible(tmp_path) == []
+
+
+def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
+    root = tmp_path / "release"
+    random_release(root, seed=1)
+    before = (root / "MANIFEST.sha256").read_bytes()
+
+    def fail():
+        raise RuntimeError("no data")
+
+    with pytest.raises(RuntimeError, match="no data"):
+        write_release(
+            root, "lite", [NewTask(make_tasks(["cramped_up"])[0], {}, 1, fail)], data_version="1.0.0", card=""
+        )
+    assert (root / "MANIFEST.sha256").read_bytes() == before
+    assert verify_release(root).ok
+    random_release(root, seed=2)
+    assert (root / "MANIFEST.sha256").read_bytes() != before
+    assert visible(tmp_path) == ["release"]
+
+
+def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
+    (task,) = make_tasks(["cramped_up"])
+    arrays = play(task.layout, 5, 10, np.random.default_rng(0))
+    for announced in (1, 3):
+        new = NewTask(task, {}, announced, lambda: [NewHistory(k, arrays) for k in range(2)])
+        with pytest.raises(OptionError, match=f"2 histories, but {announced} were announced"):
+            write_release(
+                tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10, shard_histories=1
+            )
+    assert visible(tmp_path) == []
+
+
+def test_no_task_and_a_task_twice_are_refused(tmp_path):
+    (task,) = make_tasks(["cramped_up"])
+    new = NewTask(task, {}, 1, list)
+    for tasks in ([], [new, new]):
+        with pytest.raises(OptionError, match="at least one task and none twice"):
+            write_release(tmp_path / "out", "lite", tasks, data_version="0.0.1", card="")
+
+
+def test_two_writers_of_one_release(tmp_path):
+    def meanwhile():
+        with pytest.raises(OptionError, match="another process is writing it"):
+            random_release(tmp_path / "release")
+        return [NewHistory(0, play(task.layout, 5, 10, np.random.default_rng(0)))]
+
+    (task,) = make_tasks(["cramped_up"])
+    new = NewTask(task, {}, 1, meanwhile)
+    write_release(tmp_path / "release", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
+    assert verify_release(tmp_path / "release").histories == 1
+
+
+def test_a_writer_killed_between_the_two_renames(tmp_path):
+    random_release(tmp_path / "release", seed=1)
+    before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
+    (tmp_path / "release").rename(tmp_path / ".release.old")
+
+    def fail():
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        new = NewTask(make_tasks(["cramped_up"])[0], {}, 1, fail)
+        write_release(tmp_path / "release", "lite", [new], data_version="1.0.0", card="")
+    assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
+
+
+def test_a_link_to_a_release_is_followed(tmp_path):
+    random_release(tmp_path / "real", seed=1)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    random_release(tmp_path / "link", seed=2, streams=1)
+    assert (tmp_path / "link").is_symlink()
+    assert verify_release(tmp_path / "real").histories == 4
+
+
+def test_a_file_in_the_way(tmp_path):
+    (tmp_path / "release").write_text("mine")
+    with pytest.raises(OptionError, match="is not a release"):
+        random_release(tmp_path / "release")
+
+
+def test_a_folder_that_is_no_release_is_not_replaced(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years")
+    with pytest.raises(OptionError, match="is not a release"):
+        random_release(tmp_path / "mine")
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.2])
+def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, delay):
+    root = tmp_path / "release"
+    code = (
+        "import sys; from pathlib import Path; from tests.helpers.random_play import random_release;"
+        "print('go', flush=True);"
+        "random_release(Path(sys.argv[1]), streams=40, episodes=60, length=100)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    writer = subprocess.Popen(
+        [sys.executable, "-c", code, str(root)], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    assert writer.stdout is not None
+    writer.stdout.readline()
+    deadline = time.monotonic() + 60
+    while not (tmp_path / ".release.partial").exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    time.sleep(delay)
+    writer.send_signal(signal.SIGKILL)
+    writer.wait()
+    writer.stdout.close()
+    assert not root.exists()
+    with pytest.raises(RootNotFoundError):
+        load_icrl4aht(root)
+    assert (tmp_path / ".release.partial").exists(), "the writer was killed too late for this test"
+    assert not verify_release(tmp_path / ".release.partial").ok
+    random_release(root, streams=1)  # the next writer clears up and succeeds
+    assert verify_release(root).ok
+    assert visible(tmp_path) == ["release"]
+
+
+def test_info_counts(lite):
+    info = json.loads((lite[0] / "meta" / "info.json").read_text())
+    assert info["histories"] == 12
+    assert info["transitions"] == 12 * 120
+    assert info["layouts"]["demo_wide"]["obs_shape"] == [5, 5, 45]
+    assert info["environment"] == {"max_steps": 400, "kept_steps": 20}

@@ -1,0 +1,209 @@
+"""What a damaged or mistaken input says: each its own error class, none a raw error of another library."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import (
+    ChunkTableError,
+    EmptySelectionError,
+    FormatTooNewError,
+    FormatTooOldError,
+    Icrl4ahtError,
+    IndexFormatError,
+    RootNotFoundError,
+    ShardCorruptError,
+    ShardMismatchError,
+    ShardMissingError,
+    ShardTruncatedError,
+    UnknownNameError,
+)
+from icrl4aht_data.format.chunks import chunk_table_path
+from tests.helpers.random_play import SHARD
+
+
+def read_all(root):
+    """Open the damaged layout's histories and read every field."""
+    for history in load_icrl4aht(root, layout="coord_simple"):
+        for name in ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state"):
+            history.read(name)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"layout": "demo_wied"}, r"unknown layout 'demo_wied'; valid: coord_simple, .*Did you mean 'demo_wide'\?"),
+        ({"split": "validation"}, r"unknown split 'validation'; valid: train, test"),
+        ({"teammate_family": "H5"}, r"unknown teammate_family 'H5'; valid: rl, H1, H2, H3, H4"),
+        ({"track": "teammates"}, r"unknown track 'teammates'; valid: teammate, layout\. Did you mean 'teammate'\?"),
+        ({"teammate_kind": "greedy"}, r"unknown teammate_kind 'greedy'; valid: utility_greedy\. Did you mean"),
+        ({"task_id": "nothing"}, r"unknown task_id 'nothing'; valid: teammate_train_"),
+        ({"obs": "float16"}, r"unknown obs 'float16'; valid: float32, uint8, state"),
+    ],
+)
+def test_unknown_names_list_the_valid_and_the_nearest(lite, options, message):
+    with pytest.raises(UnknownNameError, match=message):
+        load_icrl4aht(lite[0], **options)
+
+
+def test_unknown_field_of_a_history(lite):
+    with pytest.raises(
+        UnknownNameError, match=r"unknown field 'action'; valid: state, actions.*Did you mean 'actions'"
+    ):
+        load_icrl4aht(lite[0])[0].read("action")
+
+
+@pytest.mark.parametrize("options", [{"split": "test"}, {"layout": "coord_ring"}, {"teammate_family": "rl"}])
+def test_a_valid_filter_without_data_says_what_exists(lite, options):
+    with pytest.raises(
+        EmptySelectionError, match=r"has train/coord_simple with H4 \(6\), train/demo_wide with H4 \(6\)"
+    ):
+        load_icrl4aht(lite[0], **options)
+
+
+def test_no_release_here(tmp_path):
+    with pytest.raises(RootNotFoundError, match=r"no release here, expected meta/info\.json"):
+        load_icrl4aht(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("version", "error", "what_to_do"),
+    [(3, FormatTooNewError, "pip install -U"), (0, FormatTooOldError, "fetch the release again")],
+)
+def test_other_format_versions(damaged, version, error, what_to_do):
+    (damaged / "meta" / "info.json").write_text(json.dumps({"format_version": version, "renamed": 1}))
+    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 2.*{what_to_do}"):
+        load_icrl4aht(damaged)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", '{"format_version": "x"}', '{"format_version": 2}', "\x00", "[" * 9999]
+)
+def test_malformed_info(damaged, content):
+    (damaged / "meta" / "info.json").write_text(content)
+    with pytest.raises(IndexFormatError, match=r"info\.json: malformed"):
+        load_icrl4aht(damaged)
+
+
+def spoil(**changes):
+    return lambda line: json.dumps(json.loads(line) | changes)
+
+
+def drop(name):
+    return lambda line: json.dumps({k: v for k, v in json.loads(line).items() if k != name})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda line: line[:40], "not JSON: "),
+        (lambda line: "[1, 2]", "expected an object, found list"),
+        (lambda line: "", "not JSON: Expecting value"),
+        (drop("layout"), r"missing fields \['layout'\]"),
+        (spoil(colour="red"), r"unknown fields \['colour'\]"),
+        (spoil(T="many"), "field 'T': expected int, found 'many'"),
+        (spoil(T=True), "field 'T': expected int, found True"),
+        (spoil(T=-5), "expected positive numbers"),
+        (spoil(history_id=0), "history_id 0: ids count up from 0, expected 2"),
+        (spoil(layout="kitchen"), "unknown layout of the train split of track teammate 'kitchen'"),
+        (spoil(obs_shape=[5, 5]), "expected three integers"),
+        (spoil(obs_shape=[5, 5, 41]), r"obs_shape \[5, 5, 41\], expected \[5, 5, 40\]"),
+        (spoil(shard="../../etc/passwd"), "expected data/teammate/coord_simple/train-NNNNN"),
+        (spoil(shard="data/teammate/demo_wide/train-00000-of-00001.h5"), "expected data/teammate/coord_simple"),
+    ],
+)
+def test_malformed_index_lines_are_named(damaged, change, message):
+    path = damaged / "meta" / "histories.jsonl"
+    lines = path.read_text().splitlines()
+    lines[2] = change(lines[2])
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line 3: .*({message})"):
+        load_icrl4aht(damaged)
+
+
+def test_a_lost_index_line(damaged):
+    path = damaged / "meta" / "histories.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(IndexFormatError, match=r"11 lines, but .* counts 12 histories"):
+        load_icrl4aht(damaged)
+
+
+def test_missing_index(damaged):
+    (damaged / "meta" / "histories.jsonl").unlink()
+    with pytest.raises(IndexFormatError, match=r"histories\.jsonl: missing"):
+        load_icrl4aht(damaged)
+
+
+def test_binary_index(damaged):
+    (damaged / "meta" / "histories.jsonl").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(IndexFormatError, match="not UTF-8"):
+        load_icrl4aht(damaged)
+
+
+def test_missing_shard(damaged):
+    (damaged / SHARD).unlink()
+    assert len(load_icrl4aht(damaged)) == 12, "opening reads the index alone"
+    with pytest.raises(ShardMissingError, match=r"train-00000-of-00001\.h5: the index names this shard"):
+        read_all(damaged)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_truncated_shard(damaged, share):
+    path = damaged / SHARD
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+    with pytest.raises(ShardTruncatedError, match=r"truncated: has \d+ bytes, but chunk \d+ of \w+ in history \d+"):
+        read_all(damaged)
+
+
+def test_every_flipped_bit_in_a_chunk_is_caught(damaged):
+    path = damaged / SHARD
+    whole = path.read_bytes()
+    table = np.load(chunk_table_path(damaged, SHARD))
+    rng = np.random.default_rng(0)
+    for row in rng.choice(np.count_nonzero(table["rows"]), 40):
+        spoiled = bytearray(whole)
+        spoiled[int(table["offset"][row] + rng.integers(table["size"][row]))] ^= 1 << rng.integers(8)
+        path.write_bytes(spoiled)
+        with pytest.raises(ShardCorruptError, match=r"chunk \d+ of \w+ in history \d+ \(bytes .*: expected crc32"):
+            read_all(damaged)
+    path.write_bytes(whole)
+    read_all(damaged)
+
+
+def test_index_and_shard_disagree(damaged):
+    path = damaged / "meta" / "histories.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for change in ({"T": 119}, {"episodes": 7}, {"has_expert_actions": False}):
+        changed = [lines[0] | change, *lines[1:]]
+        path.write_text("".join(json.dumps(line) + "\n" for line in changed))
+        with pytest.raises(ShardMismatchError, match=r"the index (says|implies)"):
+            read_all(damaged)
+
+
+def test_chunk_table_faults(damaged):
+    path = chunk_table_path(damaged, SHARD)
+    table = np.load(path)
+    np.save(path, table[1:])
+    with pytest.raises(ShardMismatchError):
+        read_all(damaged)
+    np.save(path, np.zeros(3))
+    with pytest.raises(ChunkTableError, match="expected rows of"):
+        read_all(damaged)
+    path.write_bytes(b"junk")
+    with pytest.raises(ChunkTableError, match="not a chunk table"):
+        read_all(damaged)
+    path.unlink()
+    with pytest.raises(ChunkTableError, match="is missing"):
+        read_all(damaged)
+
+
+def test_all_errors_have_one_base():
+    from icrl4aht_data import errors
+
+    classes = [c for c in vars(errors).values() if isinstance(c, type) and c.__module__ == errors.__name__]
+    assert len(classes) > 10
+    assert all(issubclass(c, Icrl4ahtError) for c in classes)

@@ -1,0 +1,253 @@
+"""A folder over HTTP on 127.0.0.1, and the server under it that other protocols build on."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+from urllib.parse import unquote, urlsplit
+
+from tests.servers.faults import (
+    Cut,
+    Etag,
+    Fault,
+    Faults,
+    Flip,
+    IgnoreRange,
+    Long,
+    Redirect,
+    Request,
+    Short,
+    Slow,
+    Status,
+)
+
+BLOCK = 1 << 16
+PACE = 0.02  # seconds between the blocks of a slow body
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a route gives back. A body with an etag is served in ranges."""
+
+    body: bytes | Path = b""
+    status: int = 200
+    headers: dict[str, str] = field(default_factory=dict)
+    etag: str | None = None
+
+
+Route = Callable[[Request, bytes], Answer]
+
+
+class Server(ThreadingHTTPServer):
+    """Answers by a route, logs every request, does wrong what the faults say; `close` leaves no thread behind."""
+
+    request_queue_size = 128
+
+    def __init__(self, route: Route, faults: Faults | None = None, log: list[Request] | None = None) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.route = route
+        self.faults = Faults() if faults is None else faults
+        self.log: list[Request] = [] if log is None else log
+        self.url = f"http://127.0.0.1:{self.server_address[1]}"
+        self.etags: dict[str, str] = {}
+        self.closing = threading.Event()
+        self._errors: list[BaseException] = []
+        self._open: dict[Any, threading.Thread] = {}
+        self._serving = threading.Thread(target=self.serve_forever, args=(0.02,), daemon=True)
+        self._serving.start()
+
+    def process_request(self, request, client_address) -> None:
+        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address), daemon=True)
+        self._open[request] = thread
+        thread.start()
+
+    def shutdown_request(self, request) -> None:
+        super().shutdown_request(request)
+        self._open.pop(request, None)
+
+    def handle_error(self, request, client_address) -> None:
+        error = sys.exception()
+        if error is not None and not isinstance(error, ConnectionError):
+            self._errors.append(error)
+
+    def close(self) -> None:
+        """Ends every connection; raises the first error that was the server's own."""
+        self.closing.set()
+        self.shutdown()
+        self._serving.join()
+        self.server_close()
+        for connection, thread in list(self._open.items()):
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+            thread.join()
+        if self._errors:
+            raise self._errors[0]
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+    @property
+    def owner(self) -> Server:
+        return cast(Server, self.server)
+
+    def log_message(self, format: str, *args) -> None:
+        pass
+
+    def answer(self) -> None:
+        body = self._read_body()
+        path = unquote(urlsplit(self.path).path)
+        request = Request(self.command, path, target=self.path, headers=self.headers, began=time.monotonic())
+        fault = self.owner.faults(request)
+        self.owner.log.append(request)
+        if isinstance(fault, Slow):
+            self.owner.closing.wait(fault.delay)
+        if isinstance(fault, Status):
+            answer = Answer(b"as the test ordered\n", fault.code, fault.headers)
+        elif isinstance(fault, Redirect):
+            answer = Answer(b"", fault.code, {"Location": fault.to})
+        else:
+            answer = self.owner.route(request, body)
+        self._send(request, answer, fault)
+
+    do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
+
+    def _read_body(self) -> bytes:
+        """What the client sends, whole; one that is killed sends less, and then there is no request."""
+        if self.headers.get("Transfer-Encoding", "").lower() != "chunked":
+            return self._read(int(self.headers.get("Content-Length") or 0))
+        chunks = []
+        while size := int(self._read_line().split(b";")[0], 16):
+            chunks.append(self._read(size))
+            self._read_line()
+        while self._read_line().strip():  # trailers
+            pass
+        return b"".join(chunks)
+
+    def _read(self, size: int) -> bytes:
+        found = self.rfile.read(size)
+        if len(found) < size:
+            raise ConnectionAbortedError(f"{self.path}: {len(found)} of {size} bytes came")
+        return found
+
+    def _read_line(self) -> bytes:
+        line = self.rfile.readline()
+        if not line.endswith(b"\n"):
+            raise ConnectionAbortedError(f"{self.path}: cut in a body of chunks")
+        return line
+
+    def _send(self, request: Request, answer: Answer, fault: Fault | None) -> None:
+        headers, etag = dict(answer.headers), answer.etag
+        if isinstance(fault, Etag):
+            self.owner.etags[request.path] = f'"{fault.value}"'
+        if request.path in self.owner.etags:
+            etag = etag and self.owner.etags[request.path]
+            headers |= {name: self.owner.etags[request.path] for name in headers if name == "X-Linked-Etag"}
+        with _opened(answer.body) as file:
+            size = os.fstat(file.fileno()).st_size if isinstance(answer.body, Path) else len(answer.body)
+            status, start, stop = answer.status, 0, size
+            if etag is not None:
+                headers |= {"ETag": etag, "Accept-Ranges": "bytes"}
+                status, start, stop = self._chosen(size, etag, isinstance(fault, IgnoreRange))
+            if status == 206:
+                request.start, request.stop = start, stop
+            if status == 416:
+                headers["Content-Range"] = f"bytes */{size}"
+            if start < stop:
+                stop += fault.by if isinstance(fault, Long) else -fault.by if isinstance(fault, Short) else 0
+                stop = max(start, stop)
+            if status == 206:
+                headers["Content-Range"] = f"bytes {start}-{stop - 1}/{max(size, stop)}"
+            request.status = status
+            self.send_response(status)
+            for name, value in (headers | {"Content-Length": str(stop - start)}).items():
+                self.send_header(name, value)
+            self.end_headers()
+            if self.command != "HEAD":
+                file.seek(start)
+                self._send_body(request, file, stop - start, fault)
+
+    def _chosen(self, size: int, etag: str, whole: bool) -> tuple[int, int, int]:
+        """Status, start, stop of what the conditions and the range of this request select."""
+        wanted, unwanted = self.headers.get("If-Match"), self.headers.get("If-None-Match")
+        if wanted not in (None, "*", etag):
+            return 412, 0, 0
+        if unwanted is not None and unwanted in ("*", etag):
+            return 304, 0, 0
+        found = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
+        if whole or found is None or self.headers.get("If-Range", etag) != etag:
+            return 200, 0, size
+        first, last = (int(number) if number else None for number in found.groups())
+        if first is None:
+            if last is None:
+                return 200, 0, size
+            start, stop = max(0, size - last), size
+        else:
+            start, stop = first, size if last is None else min(last + 1, size)
+        return (206, start, stop) if start < stop else (416, 0, 0)
+
+    def _send_body(self, request: Request, file: BinaryIO, length: int, fault: Fault | None) -> None:
+        pace = fault.bytes_per_second if isinstance(fault, Slow) else None
+        most = BLOCK if pace is None else max(1, int(pace * PACE))
+        flipped, bits = (fault.position % length, fault.bits) if isinstance(fault, Flip) and length else (None, 0)
+        end = min(length, fault.after) if isinstance(fault, Cut) else length
+        self.close_connection |= isinstance(fault, Cut)
+        while request.sent < end:
+            count = min(most, end - request.sent)
+            block = bytearray(file.read(count).ljust(count, b"\0"))
+            if flipped is not None and 0 <= flipped - request.sent < count:
+                block[flipped - request.sent] ^= bits
+            request.sent += count
+            self.wfile.write(block)
+            if pace is not None and self.owner.closing.wait(count / pace):
+                self.close_connection = True
+                return
+
+
+def _opened(body: bytes | Path) -> BinaryIO:
+    return body.open("rb") if isinstance(body, Path) else io.BytesIO(body)
+
+
+def file_answer(path: Path) -> Answer:
+    """A file, as nginx would describe it."""
+    stat = path.stat()
+    headers = {
+        "Last-Modified": formatdate(stat.st_mtime, usegmt=True),
+        "Content-Type": "application/octet-stream",
+    }
+    return Answer(path, headers=headers, etag=f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"')
+
+
+@contextmanager
+def http_server(folder: Path, faults: Faults | None = None) -> Iterator[Server]:
+    """The files of a folder at `.url`; `.log` and `.faults`. No listings, nothing outside of the folder."""
+    root = folder.resolve()
+
+    def route(request: Request, body: bytes) -> Answer:
+        if request.method not in ("GET", "HEAD"):
+            return Answer(b"GET and HEAD only\n", 405)
+        path = (root / request.path.replace("\0", "").lstrip("/")).resolve()
+        if not path.is_relative_to(root) or not path.is_file():
+            return Answer(b"not found\n", 404)
+        return file_answer(path)
+
+    server = Server(route, faults)
+    try:
+        yield server
+    finally:
+        server.close()

@@ -1,0 +1,76 @@
+"""A bucket on 127.0.0.1."""
+
+from __future__ import annotations
+
+import urllib.request
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import boto3
+from moto.server import ThreadedMotoServer
+
+from tests.servers.process import environment, forget_filesystems
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """`.url` is its root for fsspec, `.endpoint` its server, `.environment` what reaches it from another process."""
+
+    url: str
+    endpoint: str
+    environment: Mapping[str, str]
+    client: Any
+
+    @property
+    def name(self) -> str:
+        return self.url.removeprefix("s3://")
+
+    def put(self, key: str, data: bytes) -> None:
+        """A new object, or another in its place."""
+        self.client.put_object(Bucket=self.name, Key=key, Body=data)
+
+    def delete(self, key: str) -> None:
+        self.client.delete_object(Bucket=self.name, Key=key)
+
+    def keys(self) -> list[str]:
+        """What the bucket holds, in order; the first 1000."""
+        return [entry["Key"] for entry in self.client.list_objects_v2(Bucket=self.name).get("Contents", ())]
+
+
+@contextmanager
+def s3_server(folder: Path, bucket: str = "data") -> Iterator[Bucket]:
+    """A bucket with the files of a folder, where `fsspec.filesystem("s3")` finds it without an option."""
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    endpoint = f"http://127.0.0.1:{server.get_host_and_port()[1]}"
+    variables = {
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ENDPOINT_URL_S3": endpoint,
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }
+    try:
+        # A profile or a session of the user's own would be preferred to the keys above.
+        with environment({**variables, "AWS_PROFILE": None, "AWS_SESSION_TOKEN": None}):
+            client = boto3.Session().client("s3")
+            store = Bucket(f"s3://{bucket}", endpoint, variables, client)
+            client.create_bucket(Bucket=bucket)
+            for path in sorted(folder.rglob("*")):
+                if path.is_file():
+                    store.put(path.relative_to(folder).as_posix(), path.read_bytes())
+            forget_filesystems("s3")
+            try:
+                yield store
+            finally:
+                forget_filesystems("s3")
+                client.close()
+    finally:
+        # moto's buckets belong to the process, not to its server.
+        with urllib.request.urlopen(urllib.request.Request(f"{endpoint}/moto-api/reset", method="POST")):
+            pass
+        server.stop()
