@@ -27,7 +27,7 @@ from baselines.report.page import write_page_with_films
 from baselines.report.provenance import note_results
 from baselines.report.results import merge, read_run
 from baselines.report.write import write_report
-from baselines.training.histories import HistoryOptions, Job, prepare
+from baselines.training.histories import HistoryOptions, TrainingTask, prepare
 from baselines.training.trainer import TrainOptions, train
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
@@ -47,7 +47,7 @@ TESTED_ON = {layout: layout for layout in TRACKS["teammate"]["train"]} | dict(
 
 
 @dataclass(frozen=True)
-class Entry:
+class ExperimentEntry:
     """One model of an experiment: what differs from the defaults of `train`."""
 
     name: str  # of its folder, without the method
@@ -60,41 +60,43 @@ class Experiment(NamedTuple):
     """A table of entries, and where the paper runs them."""
 
     title: str
-    entries: tuple[Entry, ...]
+    entries: tuple[ExperimentEntry, ...]
     layouts: tuple[str, ...]  # training layouts
     held_out: bool = False  # whether against learned teammates held out of training, on the training layouts
 
 
-def _size(name: str) -> Entry:
+def _size(name: str) -> ExperimentEntry:
     layers, width, steps = SIZES[name]
-    return Entry(name, {"layers": layers, "width": width}, {"steps": steps}, {"size": name})
+    return ExperimentEntry(name, {"layers": layers, "width": width}, {"steps": steps}, {"size": name})
 
 
 EXPERIMENTS = {
-    "tracks": Experiment("Teammate and layout generalization", (Entry("plain"),), tuple(TESTED_ON)),
+    "tracks": Experiment("Teammate and layout generalization", (ExperimentEntry("plain"),), tuple(TESTED_ON)),
     "sweep context": Experiment(
         "Context length",
-        tuple(Entry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
+        tuple(ExperimentEntry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
         ("test_wide", "demo_wide"),
     ),
     "sweep size": Experiment("Model scale and training budget", tuple(map(_size, SIZES)), tuple(TESTED_ON)),
     "ablate ta": Experiment(
         "Teammate actions and auxiliary losses",
         (
-            Entry("none"),
-            Entry("ta", {"teammate_actions": True}),
-            Entry("next_obs", {"next_obs": True}),
-            Entry("ta-next_obs", {"teammate_actions": True, "next_obs": True}),
+            ExperimentEntry("none"),
+            ExperimentEntry("ta", {"teammate_actions": True}),
+            ExperimentEntry("next_obs", {"next_obs": True}),
+            ExperimentEntry("ta-next_obs", {"teammate_actions": True, "next_obs": True}),
         ),
         ("test_wide", "demo_wide", "cramped_up"),
     ),
-    "heldout-rl": Experiment("Held-out learned teammates", (Entry("plain"),), tuple(TESTED_ON), held_out=True),
+    "heldout-rl": Experiment(
+        "Held-out learned teammates", (ExperimentEntry("plain"),), tuple(TESTED_ON), held_out=True
+    ),
 }
 """Command -> experiment; settings and layouts are the paper's."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExperimentPlan:
     """How an experiment is run; the defaults are the paper's."""
 
     methods: tuple[str, ...] = ("ad", "dpt")
@@ -125,7 +127,9 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is, and of how much."""
 
 
-def run_experiment(name: str, plan: Plan, out: Path, progress: Progress = lambda what, done, of: None) -> Done:
+def run_experiment(
+    name: str, plan: ExperimentPlan, out: Path, progress: Progress = lambda what, done, of: None
+) -> Done:
     """Train, evaluate and report all entries of an experiment, or go on with them.
 
     Args:
@@ -169,7 +173,7 @@ def run_experiment(name: str, plan: Plan, out: Path, progress: Progress = lambda
     return Done(report, notes)
 
 
-def _layouts(experiment: Experiment, plan: Plan) -> tuple[list[str], list[str]]:
+def _layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
     """The layouts to train on, and what to say of those left out."""
     there = {layout.name for layout in load_icrl4aht(plan.root, split="train").layouts}
     if plan.layouts:
@@ -194,7 +198,7 @@ def _layouts(experiment: Experiment, plan: Plan) -> tuple[list[str], list[str]]:
     return names, [f"left out, the release has no training histories of them: {', '.join(left)}"] if left else []
 
 
-def _tasks(experiment: Experiment, plan: Plan, layout: str) -> list[Task]:
+def _tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
     """What a model trained on a layout is tested on."""
     if experiment.held_out:
         tasks = held_out_tasks(plan.suite, layout, plan.root)
@@ -256,7 +260,7 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
     return tasks
 
 
-def _prepared(method: str, entry: Entry, layout: str, plan: Plan) -> Job:
+def _prepared(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
     options = TrainOptions(**{**entry.train, **plan.train})
     model = ModelOptions(**{**entry.model, **plan.model})
     try:
@@ -266,7 +270,9 @@ def _prepared(method: str, entry: Entry, layout: str, plan: Plan) -> Job:
         raise type(error)(told) from error
 
 
-def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, progress: Progress) -> None:
+def _train(
+    method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan, folder: Path, progress: Progress
+) -> None:
     job = _prepared(method, entry, layout, plan)
     options = job.options
     what = f"{job.method.label} {entry.name} on {layout}: training"
@@ -284,7 +290,13 @@ def _train(method: str, entry: Entry, layout: str, plan: Plan, folder: Path, pro
 
 
 def _evaluate(
-    entry: Entry, tasks: Sequence[Task], plan: Plan, folder: Path, progress: Progress, *, own_tasks: bool
+    entry: ExperimentEntry,
+    tasks: Sequence[Task],
+    plan: ExperimentPlan,
+    folder: Path,
+    progress: Progress,
+    *,
+    own_tasks: bool,
 ) -> None:
     agent = find_agent(str(folder / "run"), plan.acting)
     protocol = get_protocol(plan.protocol)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from baselines.agents.egos import random
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
-from baselines.evaluate.rollout import Rollout, task_key
+from baselines.evaluate.rollout import EvaluationRollout, task_key
 from generation.env import Environment
 from generation.teammates.instances import published_tasks
 from generation.teammates.registry import build
@@ -34,7 +34,7 @@ def evaluator(layout: Layout, family: str) -> tuple[Any, int]:
     """A function that plays one episode of the family's tasks, and the number of tasks."""
     tasks = [t for t in published_tasks(track_of(layout.name)) if (t.layout, t.teammate_kind) == (layout, family)]
     mates = [build(layout, task.teammate, noise="seeded") for task in tasks]
-    rollout = Rollout(layout, random(layout), mates, replace(PROTOCOLS["seeded"], episodes=_EPISODES))
+    rollout = EvaluationRollout(layout, random(layout), mates, replace(PROTOCOLS["seeded"], episodes=_EPISODES))
     play, params = jax.jit(rollout.episode), rollout.teammate_params
     tables = rollout.start(jnp.stack([task_key(0, task.task_id) for task in tasks]))
     return lambda: play((), params, tables), len(tasks)

@@ -25,10 +25,10 @@ import jax
 import numpy as np
 
 from baselines.agents.egos import Acting, learned
-from baselines.evaluate.evaluator import Game, evaluate, play, set_up
+from baselines.evaluate.evaluator import Game, evaluate, play, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
 from baselines.methods.method import Method, ModelOptions
-from baselines.methods.registry import get_method, kitchen
+from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
 from baselines.training.trainer import Trainer, TrainOptions
 from generation.policy import Policy
@@ -81,7 +81,8 @@ def _window(group: Any, start: int, length: int) -> dict[str, np.ndarray]:
 def compare_training(dataset: Dataset, model: ModelOptions, options: TrainOptions, steps: int, rounds: int) -> None:
     """Both ways in turn: some steps of each in every round."""
     trainers = [
-        Trainer(get_method("ad")(model, kitchen(dataset.layouts, view)), options) for view in (None, plain_view)
+        Trainer(get_method("ad")(model, overcooked_world(dataset.layouts, view)), options)
+        for view in (None, plain_view)
     ]
     sampler = dataset.ad(batch_size=options.batch_size, length=options.context, seed=1)
     states: list[Any] = [trainer.init() for trainer in trainers]
@@ -118,7 +119,7 @@ def compare_training(dataset: Dataset, model: ModelOptions, options: TrainOption
 
 def untrained(layout: Layout, model: ModelOptions) -> tuple[Method, Any]:
     """AD for a layout's observations, and its parameters."""
-    method = get_method("ad")(model, kitchen([layout]))
+    method = get_method("ad")(model, overcooked_world([layout]))
     return method, method.init(jax.random.key(0))
 
 
@@ -129,7 +130,7 @@ def compare_acting(layout: Layout, model: ModelOptions, context: int, steps: int
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
     ways: dict[Acting, int] = {"cached": 10 * steps, "exact": steps}  # an episode's own cost must not weigh
     games = [
-        set_up(
+        prepare_rollout(
             _ego(method, params, context, acting), tasks, dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=n)
         )
         for acting, n in ways.items()

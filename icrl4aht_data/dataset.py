@@ -18,14 +18,14 @@ from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import OBS, History, Obs
-from icrl4aht_data.reading.selection import Holding, Names, Options
+from icrl4aht_data.reading.selection import Names, ReadOptions, Storage
 from icrl4aht_data.reading.shard import Shards
-from icrl4aht_data.reading.sources import CACHES, Cache, Choice, choose, decoded_size, open_source
-from icrl4aht_data.remote.remote_release import Root, open_root
+from icrl4aht_data.reading.sources import CACHE_MODES, CacheChoice, CacheMode, choose, decoded_size, open_source
+from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.sampling.base import SamplerOptions
 from icrl4aht_data.utils.threads import usable_cores
-from icrl4aht_data.utils.validation import whole
+from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -47,7 +47,7 @@ def load_icrl4aht(
     teammate_kind: Names = None,
     task_id: Names = None,
     obs: Obs = "float32",
-    cache: Cache = "auto",
+    cache: CacheMode = "auto",
     threads: int | None = None,
 ) -> Dataset:
     """Open a release and select histories.
@@ -75,9 +75,9 @@ def load_icrl4aht(
     """
     if obs not in OBS:
         raise unknown("obs", obs, OBS)
-    if cache not in CACHES:
-        raise unknown("cache", cache, CACHES)
-    options = Options(obs, cache, usable_cores() if threads is None else whole("threads", threads, 1))
+    if cache not in CACHE_MODES:
+        raise unknown("cache", cache, CACHE_MODES)
+    options = ReadOptions(obs, cache, usable_cores() if threads is None else check_int("threads", threads, 1))
     index = read_index(open_root(MINI if root is None else root))
     if obs == "state" and index.info["kind"] not in KINDS:
         raise OptionError(
@@ -101,7 +101,7 @@ class Dataset:
     `len(dataset)` counts histories, `dataset[i]` is the i-th, `dataset[a:b]` a part, iteration yields them in order.
     """
 
-    def __init__(self, index: Index, ids: np.ndarray, options: Options, shards: Shards) -> None:
+    def __init__(self, index: Index, ids: np.ndarray, options: ReadOptions, shards: Shards) -> None:
         self.index = index
         self.ids = ids
         self.options = options
@@ -133,7 +133,7 @@ class Dataset:
         return self.index.root
 
     @property
-    def origin(self) -> Root:
+    def origin(self) -> ReleaseLocation:
         """Where the release is: its name, and the way to its files."""
         return self.index.origin
 
@@ -201,11 +201,11 @@ class Dataset:
         return [self.index.entry(int(i)) for i in self.ids]
 
     @cached_property
-    def cache(self) -> Choice:
+    def cache(self) -> CacheChoice:
         """How samplers hold this selection, and why; see `store.CACHES`."""
         away = [name for name in self.shards if not self.origin.is_here(name)]
         if self.options.cache == "auto" and away:
-            return Choice("stream", f"{len(away)} of {len(self.shards)} shards are not downloaded")
+            return CacheChoice("stream", f"{len(away)} of {len(self.shards)} shards are not downloaded")
         size = 0
         for layout, rows in self._by_layout():
             steps, episodes = (int(self.column(name)[rows].sum()) for name in ("T", "episodes"))
@@ -224,7 +224,7 @@ class Dataset:
             yield layout, np.flatnonzero(codes == names.index(layout.name))
 
     @property
-    def holding(self) -> Holding:
+    def holding(self) -> Storage:
         """The selection's rows, as `cache` holds them; `ram` and `mmap` decode them on the first call."""
         with self._lock:
             return self._holding
@@ -234,7 +234,7 @@ class Dataset:
         self._shards.forget()
 
     @cached_property
-    def _holding(self) -> Holding:
+    def _holding(self) -> Storage:
         sources, layout_of, place = [], np.zeros(len(self), np.intp), np.zeros(len(self), np.intp)
         if self.origin.remote is not None and self.cache.cache != "stream":
             self.origin.remote.fetch(self.shards)
@@ -243,7 +243,7 @@ class Dataset:
             layout_of[rows] = number
             entries = [self.index.entry(i) for i in ids.tolist()]
             sources.append(open_source(self.cache.cache, entries, self._shards.open, self.threads))
-        return Holding(sources, layout_of, place)
+        return Storage(sources, layout_of, place)
 
     def filter(self, **wanted: Names) -> Dataset:
         """The histories of this selection whose fields have one of the wanted values; see `index.QUERY_FIELDS`."""

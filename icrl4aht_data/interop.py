@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import NotStoredError, OptionError
-from icrl4aht_data.utils.validation import whole
+from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import datasets
@@ -54,7 +54,7 @@ def torch_loader(
         from torch.utils.data import DataLoader
     except ImportError as error:
         raise OptionError("a DataLoader needs PyTorch: pip install 'icrl4aht-data[torch]'") from error
-    numbers = range(whole("start", start, 0), len(sampler) if stop is None else whole("stop", stop, 0))
+    numbers = range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0))
     if workers and sampler.dataset.cache.cache != "stream":
         _ = sampler.dataset.holding  # decoded here once: mapped by the workers, or inherited by forked ones
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
@@ -62,7 +62,7 @@ def torch_loader(
         sampler,  # type: ignore[arg-type]
         batch_size=None,
         sampler=numbers,
-        num_workers=whole("workers", workers, 0),
+        num_workers=check_int("workers", workers, 0),
         **processes,  # type: ignore[arg-type]
         **options,
     )
@@ -126,7 +126,7 @@ def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> dat
 
     Its `state_dict` resumes after the last window taken.
     """
-    numbers = list(range(whole("start", start, 0), len(sampler) if stop is None else whole("stop", stop, 0)))
+    numbers = list(range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0)))
     library = _datasets()
     return library.IterableDataset.from_generator(_windows, gen_kwargs={"sampler": sampler, "numbers": numbers})
 

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame
 from icrl4aht_data.overcooked.state import start
-from icrl4aht_data.utils.files import file_in_place_of
+from icrl4aht_data.utils.files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -161,5 +161,5 @@ def legend_below(figure: Figure) -> None:
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
     """Write a figure, in the format that the path's suffix names."""
-    with file_in_place_of(path) as partial:
+    with atomic_write(path) as partial:
         figure.savefig(partial, dpi=dpi, format=path.suffix.removeprefix("."))

@@ -199,11 +199,11 @@ def report(runs: tuple[Path, ...], out: Path | None, html: Path | None, films: b
 def watch(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
     """Play an episode and draw it as a GIF."""
     from baselines.evaluate.protocols import get_protocol
-    from baselines.report.episode_gifs import film
+    from baselines.report.episode_gifs import episode_gif
     from generation.teammates.instances import named_task
 
     task = named_task(layout, teammate)
-    earned = film(out, task, agent_of("--ego", ego).make, get_protocol(protocol), seed=seed)
+    earned = episode_gif(out, task, agent_of("--ego", ego).make, get_protocol(protocol), seed=seed)
     console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
 
 
@@ -433,14 +433,14 @@ def heldout_rl(suite: Path, **options: Any) -> None:
 
 
 def _experiment(name: str, out: Path | None, root: Any, suite: Path | None = None, **options: Any) -> None:
-    from baselines.experiments import Plan, run_experiment
+    from baselines.experiments import ExperimentPlan, run_experiment
 
     given = {key: options.pop(key) for key in ("steps", "context", "batch_size")}
     training = {key: value for key, value in given.items() if value is not None}
     training.setdefault("batch_size", _default_batch_size())
     if name == "sweep context" and "context" in training:
         raise OptionError(f"--context {training['context']}: `sweep context` varies it; choose by --only, such as K250")
-    plan = Plan(root=root and str(root), suite=suite, train=training, **options)
+    plan = ExperimentPlan(root=root and str(root), suite=suite, train=training, **options)
     with bars() as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:

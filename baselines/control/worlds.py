@@ -22,7 +22,7 @@ from baselines.methods.tokens import plain_view
 from generation.policy import Policy
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
-from icrl4aht_data.sampling.draws import below, words
+from icrl4aht_data.sampling.draws import random_uint32, scale_to_range
 
 
 class SmallWorld(NamedTuple):
@@ -114,7 +114,7 @@ class Pool:
 
     def batch(self, i: int, out: Any = None) -> Any:
         """Batch i."""
-        chosen = below(words(self.seed, i, 1, self.batch_size)[0], len(self.rows[0]))
+        chosen = scale_to_range(random_uint32(self.seed, i, 1, self.batch_size)[0], len(self.rows[0]))
         return jax.tree.map(lambda array: array[chosen], self.rows)
 
     def empty(self) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from baselines.evaluate.evaluator import set_up
+from baselines.evaluate.evaluator import prepare_rollout
 from baselines.evaluate.protocols import Protocol
 from baselines.methods.method import Method
 from baselines.methods.tokens import step_of
@@ -59,7 +59,7 @@ def measure(method: Method, params: Any, context: int, tasks: Sequence[Task], pr
         return one.argmax().astype(jnp.int32), after
 
     ego = Policy(params, init, act, "percept")
-    rollout, tables, episode = set_up(lambda layout: ego, tasks, protocol)
+    rollout, tables, episode = prepare_rollout(lambda layout: ego, tasks, protocol)
     for _ in range(protocol.episodes):
         tables, _ = episode(params, rollout.teammate_params, tables)
         yield Drift(np.asarray(tables.ego.distance), np.asarray(tables.ego.same))

@@ -23,7 +23,7 @@ import numpy as np
 from baselines.agents.host import HostPolicy
 from baselines.evaluate.protocols import Protocol
 from baselines.evaluate.results import Result, _store, _stored
-from baselines.evaluate.rollout import Played, Rollout, Tables, task_key
+from baselines.evaluate.rollout import Episode, EvaluationRollout, RolloutState, task_key
 from generation.policy import Policy
 from generation.teammates.registry import build, check_theta
 from icrl4aht_data.benchmark.tasks import Task
@@ -85,7 +85,7 @@ def evaluate(
     outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
 
     def run(group: list[Task], stopped: Event) -> list[Result]:
-        game = set_up(lambda layout: egos[layout.name], group, protocol, seeds, suite)
+        game = prepare_rollout(lambda layout: egos[layout.name], group, protocol, seeds, suite)
         return _run_group(group, game, len(seeds), settings, stopped)
 
     for found in _side_by_side(run, list(groups.values()), threads=1 if outside else min(4, usable_cores())):
@@ -141,12 +141,12 @@ def _run_group(tasks: list[Task], game: Game, seeds: int, settings: dict[str, An
 class Game(NamedTuple):
     """Tasks of one layout and family, ready to play."""
 
-    rollout: Rollout
-    tables: Tables  # before the first episode
-    episode: Callable[..., tuple[Tables, Played]]  # compiled
+    rollout: EvaluationRollout
+    tables: RolloutState  # before the first episode
+    episode: Callable[..., tuple[RolloutState, Episode]]  # compiled
 
 
-def set_up(
+def prepare_rollout(
     make_ego: Callable[[Layout], Policy | HostPolicy],
     tasks: Sequence[Task],
     protocol: Protocol,
@@ -156,7 +156,7 @@ def set_up(
     """Compile the game of tasks that share a layout and a teammate family."""
     layout = tasks[0].layout
     mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks]
-    rollout = Rollout(layout, make_ego(layout), [mate for mate in mates for _ in seeds], protocol)
+    rollout = EvaluationRollout(layout, make_ego(layout), [mate for mate in mates for _ in seeds], protocol)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)
     tables = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
@@ -173,16 +173,16 @@ def play_tasks(
     protocol: Protocol,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
-) -> Iterator[Played]:
+) -> Iterator[Episode]:
     """Episode after episode of tasks that share a layout and a teammate family.
 
     Yields:
-        `Played` with B = tasks x seeds, seeds varying fastest.
+        `Episode` with B = tasks x seeds, seeds varying fastest.
     """
-    yield from play(set_up(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
+    yield from play(prepare_rollout(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
 
 
-def play(game: Game, episodes: int) -> Iterator[Played]:
+def play(game: Game, episodes: int) -> Iterator[Episode]:
     """Episode after episode."""
     rollout, tables, episode = game
     params = rollout.teammate_params
@@ -194,7 +194,7 @@ def play(game: Game, episodes: int) -> Iterator[Played]:
         yield played
 
 
-def _check_ego(rollout: Rollout, tables: Tables) -> None:
+def _check_ego(rollout: EvaluationRollout, tables: RolloutState) -> None:
     """One traced step says whether the egos' actions have the right shape and type."""
     keys = tables.env.key
     actions, _ = jax.eval_shape(rollout._ego.act, rollout.ego.params, tables.ego, rollout.ego_view(tables), keys)

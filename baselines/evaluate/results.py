@@ -9,7 +9,7 @@ from typing import Any
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import file_in_place_of, json_hash
+from icrl4aht_data.utils.files import atomic_write, json_hash
 
 
 @dataclass(frozen=True)
@@ -62,5 +62,5 @@ def _store(out: Path | None, result: Result) -> None:
         return
     path = _path(out, result.task_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with file_in_place_of(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")

@@ -24,7 +24,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 _FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 
 
-class Tables(NamedTuple):
+class RolloutState(NamedTuple):
     """What a step carries into the next. B tasks of one layout and family."""
 
     env: EnvState
@@ -32,7 +32,7 @@ class Tables(NamedTuple):
     before: Percept  # what preceded the coming step, but for `obs`
 
 
-class Played(NamedTuple):
+class Episode(NamedTuple):
     """One episode of T steps of B tasks."""
 
     record: UInt8[Array, "B T S"]  # before each step
@@ -41,7 +41,7 @@ class Played(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
+class EvaluationRollout:
     """Episodes of B tasks that share a layout and a teammate family, compiled once."""
 
     layout: Layout
@@ -60,13 +60,13 @@ class Rollout:
         """Of all tasks, stacked on a leading axis."""
         return stacked(mate.params for mate in self.teammates)
 
-    def start(self, keys: jax.Array) -> Tables:
+    def start(self, keys: jax.Array) -> RolloutState:
         """Task keys (B,) -> tables before the first episode; nothing precedes a task's first step."""
         batch = keys.shape[0]
         egos = self._ego.init(self.ego.params, _fold_all(keys, EGO))
         zero = jnp.zeros(batch, jnp.int32)
         nothing = Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
-        return Tables(self.env.init(keys), egos, nothing)
+        return RolloutState(self.env.init(keys), egos, nothing)
 
     @cached_property
     def _ego(self) -> HostPolicy:
@@ -76,7 +76,7 @@ class Rollout:
         init, act = jax.vmap(self.ego.init, in_axes=(None, 0)), jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))
         return HostPolicy(self.ego.params, init, act, self.ego.sees)
 
-    def episode(self, ego_params: Any, mate_params: Any, tables: Tables) -> tuple[Tables, Played]:
+    def episode(self, ego_params: Any, mate_params: Any, tables: RolloutState) -> tuple[RolloutState, Episode]:
         """One episode of every task. Jit it once."""
         mate = self.teammates[0]
         keys = self.env.episode_key(tables.env)
@@ -94,13 +94,13 @@ class Rollout:
             before = tables.before._replace(
                 prev_action=mine, prev_reward=after.reward, prev_teammate_action=theirs, prev_done=after.done
             )
-            played = Played(now.record, jnp.stack([mine, theirs], axis=-1), after.reward)
-            return (Tables(after.state, egos, before), memories), played
+            played = Episode(now.record, jnp.stack([mine, theirs], axis=-1), after.reward)
+            return (RolloutState(after.state, egos, before), memories), played
 
         (tables, _), played = jax.lax.scan(step, (tables, memories), jnp.arange(self.protocol.steps))
         return tables, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), played)
 
-    def ego_view(self, tables: Tables) -> Any:
+    def ego_view(self, tables: RolloutState) -> Any:
         """What the egos are given now, batched."""
         if self.ego.sees == "percept":
             return tables.before._replace(obs=self._view("observation", tables.env, EGO))

@@ -20,7 +20,7 @@ from baselines.methods.method import (
     run_model,
     squared_error,
 )
-from baselines.methods.tokens import Log, Step, StepTokens, empty_log, steps_of
+from baselines.methods.tokens import RingBuffer, Step, StepTokens, empty_log, steps_of
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -68,7 +68,7 @@ class StepModel(nn.Module):
         """
         trunk: Any = self.trunk
         token = self.tokens(step)
-        if isinstance(memory, Log):
+        if isinstance(memory, RingBuffer):
             memory = memory.add(token)
             window, held = memory.last(len(memory.tokens), memory.written)
             return self.head(trunk(window[None])[0, held - 1]), memory

@@ -37,7 +37,7 @@ class Judgement(NamedTuple):
     values: Float[Array, "critics *B G A"]
 
 
-class ActorCritic(nn.Module):
+class ActorCriticHead(nn.Module):
     """Features -> judgement."""
 
     width: int
@@ -56,7 +56,7 @@ class ActorCritic(nn.Module):
 
 def amago_offline(options: ModelOptions, world: World) -> Method:
     """An offline actor-critic on AD's tokens and transformer."""
-    head = ActorCritic(options.width, len(options.discounts), world.actions)
+    head = ActorCriticHead(options.width, len(options.discounts), world.actions)
     model = step_model(options, world, options.transformer(), head)
     discounts = jnp.asarray(options.discounts)
 

@@ -32,7 +32,7 @@ def causal(
     return _in_parts(some, q)
 
 
-def asked(
+def query_attention(
     q: Float[Array, "B K+1 H D"],
     own_k: Float[Array, "B K+1 H D"],
     own_v: Float[Array, "B K+1 H D"],

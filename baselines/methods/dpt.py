@@ -14,7 +14,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from baselines.methods.method import Method, ModelOptions, World, cross_entropy, next_obs_head, run_model, squared_error
-from baselines.methods.tokens import Log, Step, Transition, TransitionTokens, empty_log, transitions_of, visible_slots
+from baselines.methods.tokens import (
+    RingBuffer,
+    Step,
+    Transition,
+    TransitionTokens,
+    empty_log,
+    transitions_of,
+    visible_slots,
+)
 from baselines.methods.transformer import Cache, Transformer
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.sampling.dpt import DPTBatch
@@ -30,7 +38,9 @@ class DPTOutput(NamedTuple):
 class Memory(NamedTuple):
     """An acting ego's transitions, as a ring; those of the running episode are held, but not seen before it ends."""
 
-    held: Log | tuple[Cache, ...]  # tokens, or what the transformer keeps of them and one slot more, for the query
+    held: (
+        RingBuffer | tuple[Cache, ...]
+    )  # tokens, or what the transformer keeps of them and one slot more, for the query
     written: Int[Array, ""]  # transitions so far
     complete: Int[Array, ""]  # of finished episodes
     last_obs: Array  # float32, before the step just taken
@@ -82,13 +92,13 @@ class DPT(nn.Module):
         token, query = self.tokens.context(transition), self.tokens.query(obs)
         written = memory.written + (memory.started & ~done)
         complete = jnp.where(done, written, memory.complete) if self.whole_episodes else written
-        recall = self._recompute if isinstance(memory.held, Log) else self._recall
+        recall = self._recompute if isinstance(memory.held, RingBuffer) else self._recall
         feature, held = recall(token, query, memory, written, complete)
         return self.head(feature), Memory(held, written, complete, obs, jnp.bool_(True))
 
     def _recompute(self, token: Array, query: Array, memory: Memory, written: Array, complete: Array) -> tuple:
         """The answer from all tokens of the context, anew."""
-        log = Log(memory.held.add(token).tokens, written)  # type: ignore[union-attr]
+        log = RingBuffer(memory.held.add(token).tokens, written)  # type: ignore[union-attr]
         window, seen = log.last(len(log.tokens) - KEPT_STEPS, complete)
         sequence = jnp.append(window, query[None], axis=0).at[seen].set(query)  # what is behind it does not count
         return self.trunk(sequence[None])[0, seen], log

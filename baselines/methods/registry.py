@@ -34,6 +34,6 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     return METHODS[name]
 
 
-def kitchen(layouts: Sequence[Layout], view: View | None = None) -> World:
+def overcooked_world(layouts: Sequence[Layout], view: View | None = None) -> World:
     """OvercookedV2 in layouts with observations of one shape, from batches of state records unless a view is given."""
     return World(lambda dtype: GridEncoder(dtype=dtype), layouts[0].obs_shape, view or state_view(layouts))

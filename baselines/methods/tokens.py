@@ -149,15 +149,15 @@ class TransitionTokens(Tokens):
         return self.drop(self.project(jnp.concatenate(parts, -1, dtype=self.dtype)), deterministic=deterministic)
 
 
-class Log(NamedTuple):
+class RingBuffer(NamedTuple):
     """What an ego remembers when it acts, as a ring: entry i stands in slot i % slots."""
 
     tokens: Float[Array, "slots D"]
     written: Int[Array, ""]  # entries so far
 
-    def add(self, token: Float[Array, " D"]) -> Log:
+    def add(self, token: Float[Array, " D"]) -> RingBuffer:
         """With one more entry, in place of the oldest."""
-        return Log(self.tokens.at[self.written % len(self.tokens)].set(token), self.written + 1)
+        return RingBuffer(self.tokens.at[self.written % len(self.tokens)].set(token), self.written + 1)
 
     def last(self, context: int, stop: Int[Array, ""]) -> tuple[Float[Array, "K D"], Int[Array, ""]]:
         """The entries stop - K .. stop - 1 in order, from the front, and how many there are."""
@@ -165,9 +165,9 @@ class Log(NamedTuple):
         return self.tokens[(first + jnp.arange(context)) % len(self.tokens)], stop - first
 
 
-def empty_log(slots: int, width: int) -> Log:
+def empty_log(slots: int, width: int) -> RingBuffer:
     """A log without entries."""
-    return Log(jnp.zeros((slots, width)), jnp.int32(0))
+    return RingBuffer(jnp.zeros((slots, width)), jnp.int32(0))
 
 
 def visible_slots(slots: int, written: Int[Array, ""], context: int, stop: Int[Array, ""]) -> Bool[Array, " slots"]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from baselines.methods.attention import asked, causal
+from baselines.methods.attention import causal, query_attention
 
 Positions = Literal["none", "rope"]
 POSITIONS: tuple[Positions, ...] = ("none", "rope")
@@ -70,7 +70,7 @@ class Block(nn.Module):
         )
         attended = causal(q, k, v, lengths)
         if context < x_BxNxD.shape[1]:
-            attended = jnp.concatenate([attended, asked(asked_q, asked_k, asked_v, k, v)], axis=1)
+            attended = jnp.concatenate([attended, query_attention(asked_q, asked_k, asked_v, k, v)], axis=1)
         return self._join(x_BxNxD, attended, deterministic)
 
     def step(

@@ -26,7 +26,7 @@ Ego = Callable[[Layout], Policy]
 """The maker of an ego for a layout."""
 
 
-class Film(NamedTuple):
+class EpisodeGif(NamedTuple):
     """An episode of a reported agent beside a teammate of one family."""
 
     family: str
@@ -34,7 +34,7 @@ class Film(NamedTuple):
     path: Path | None  # the GIF
 
 
-def film(
+def episode_gif(
     path: Path,
     task: Task,
     make_ego: Ego,
@@ -51,7 +51,7 @@ def film(
     return float(reward.sum())
 
 
-def film_families(runs: Sequence[Run], folder: Path, suite: Path | None = None) -> list[Film]:
+def film_families(runs: Sequence[Run], folder: Path, suite: Path | None = None) -> list[EpisodeGif]:
     """The first episode of a task that each agent was evaluated on, for every family of teammates.
 
     The task is of a layout where that family leaves headroom, if there is one among the results.
@@ -75,7 +75,7 @@ def film_families(runs: Sequence[Run], folder: Path, suite: Path | None = None) 
             scenes.append((run, source, source.tasks[cell]))
     egos = {source.folder: _again(source) for _, source, _ in scenes}
 
-    def play(number: int) -> Film:
+    def play(number: int) -> EpisodeGif:
         run, source, task = scenes[number]
         return _film_result(run, source, task, egos[source.folder], folder / f"{number}.gif", suite)
 
@@ -85,7 +85,7 @@ def film_families(runs: Sequence[Run], folder: Path, suite: Path | None = None) 
 
 def _film_result(
     run: Run, source: Source, task: Task, ego: Ego | Icrl4ahtError, path: Path, suite: Path | None
-) -> Film:
+) -> EpisodeGif:
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
     family = task.teammate_family
     told = f"{run.label} beside {family}/t{task.teammate['theta_id']} on {task.layout.name}"
@@ -93,10 +93,10 @@ def _film_result(
     try:
         if isinstance(ego, Icrl4ahtError):
             raise ego
-        earned = film(path, task, ego, protocol, seed=seed, cell=24, suite=suite)
+        earned = episode_gif(path, task, ego, protocol, seed=seed, cell=24, suite=suite)
     except Icrl4ahtError as error:
-        return Film(family, f"{told}: no picture, {error}. {which}", None)
-    return Film(family, f"{told}: team return {earned:g} in episode 1 of {protocol.episodes}. {which}", path)
+        return EpisodeGif(family, f"{told}: no picture, {error}. {which}", None)
+    return EpisodeGif(family, f"{told}: team return {earned:g} in episode 1 of {protocol.episodes}. {which}", path)
 
 
 def _again(source: Source) -> Ego | Icrl4ahtError:

@@ -10,13 +10,13 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from baselines.report.episode_gifs import Film, film_families
+from baselines.report.episode_gifs import EpisodeGif, film_families
 from baselines.report.figures import plot_gain, plot_sweep
 from baselines.report.results import TEST_LAYOUTS, Run, plot_curves, read_published
 from baselines.report.tables import AVERAGE, PAPER_TABLES, PaperTable, Point, Row, Score, fill, score, sweep
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import file_in_place_of, json_hash
+from icrl4aht_data.utils.files import atomic_write, json_hash
 
 _FILMED = 3  # runs; a GIF takes up to 110 kB of the page
 _BEHIND = {"oracle": 1, "random": 2, "stay": 3}
@@ -35,7 +35,7 @@ img { max-width: 100%; height: auto } figcaption { font-size: 13px; color: #444 
 """
 
 
-def write_page(runs: Sequence[Run], path: Path, films: Sequence[Film] = (), notes: Sequence[str] = ()) -> Path:
+def write_page(runs: Sequence[Run], path: Path, films: Sequence[EpisodeGif] = (), notes: Sequence[str] = ()) -> Path:
     """Write the page.
 
     Args:
@@ -62,7 +62,7 @@ def write_page(runs: Sequence[Run], path: Path, films: Sequence[Film] = (), note
     parts += [_settings(runs), _sources()]
     head = f'<meta charset="utf-8"><title>ICRL4AHT report</title><style>{_STYLE}</style>'
     path.parent.mkdir(parents=True, exist_ok=True)
-    with file_in_place_of(path) as partial:
+    with atomic_write(path) as partial:
         text = (
             f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(parts) + "\n</body></html>\n"
         )
@@ -227,7 +227,7 @@ def _headroom_table(protocol: str) -> str:
     return told + _table(["family", *TEST_LAYOUTS], body)
 
 
-def _films(films: Sequence[Film]) -> list[str]:
+def _films(films: Sequence[EpisodeGif]) -> list[str]:
     told = (
         "<p>The first episode of an evaluated task, when the ego remembers nothing yet. Ego blue, teammate red; the "
         "frame is what the ego sees.</p>"

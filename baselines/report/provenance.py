@@ -10,7 +10,7 @@ from baselines.report.results import ABOUT, OWN_TASKS
 from baselines.training.run_folder import read_config
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import file_in_place_of, json_hash, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
 
 
 def note_results(results: Path, run: str | Path | None = None, tasks: Sequence[Task] = ()) -> None:
@@ -27,7 +27,7 @@ def note_results(results: Path, run: str | Path | None = None, tasks: Sequence[T
     if tasks:
         path = results / OWN_TASKS
         known = {task.task_id: task for task in read_tasks(path)} if path.exists() else {}
-        with file_in_place_of(path) as partial:
+        with atomic_write(path) as partial:
             write_tasks(partial, (known | {task.task_id: task for task in tasks}).values())
 
 
@@ -46,5 +46,5 @@ def note_run(run: Path, results: Path) -> None:
         "manifest_sha256": config["histories"]["manifest_sha256"],
         "config": config,
     }
-    with file_in_place_of(results / ABOUT) as partial:
+    with atomic_write(results / ABOUT) as partial:
         write_json(partial, content)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.evaluate.results import Result, read_result
-from icrl4aht_data.benchmark.facts import FAMILIES, LAYOUTS, TRACKS
+from icrl4aht_data.benchmark.facts import FAMILIES, LAYOUT_NAMES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import Cell, has_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError
@@ -114,7 +114,7 @@ def as_run(
 
 def place_of(cell: Cell) -> tuple[int, int]:
     """Where a cell stands in the paper's order."""
-    return LAYOUTS.index(cell[0]), FAMILIES.index(cell[1])
+    return LAYOUT_NAMES.index(cell[0]), FAMILIES.index(cell[1])
 
 
 def merge(runs: Sequence[Run]) -> list[Run]:
@@ -167,7 +167,7 @@ def plot_curves(runs: list[Run], path: Path) -> None:
     from matplotlib.figure import Figure
 
     every = [cell for run in runs for cell in run.cells]
-    layouts = [layout for layout in LAYOUTS if any(cell[0] == layout for cell in every)]
+    layouts = [layout for layout in LAYOUT_NAMES if any(cell[0] == layout for cell in every)]
     families = families_of(every)
     figure = Figure(figsize=(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6), layout="constrained")
     axes = figure.subplots(len(families), len(layouts), squeeze=False, sharex=True)

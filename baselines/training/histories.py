@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from baselines.methods.method import Method, ModelOptions
-from baselines.methods.registry import get_method, kitchen
+from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
 from baselines.training.run_folder import Checkpoints, read_config
 from baselines.training.trainer import Data, TrainOptions
@@ -37,7 +37,7 @@ class HistoryOptions:
     obs: Obs | None = None  # how batches hold what the ego sees; state records where there are any
 
 
-class Job(NamedTuple):
+class TrainingTask(NamedTuple):
     """All that `trainer.train` needs but a folder."""
 
     method: Method
@@ -46,7 +46,7 @@ class Job(NamedTuple):
     about: dict[str, Any]
 
 
-def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> Job:
+def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
     """A method on histories; every process of a group gets its share of the batches.
 
     Raises:
@@ -56,7 +56,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     dataset = _load(histories)
     split = hold_out(dataset, histories.held_out)
     shown = dataset.obs != "state"
-    method = get_method(name)(model, kitchen(dataset.layouts, plain_view if shown else None))
+    method = get_method(name)(model, overcooked_world(dataset.layouts, plain_view if shown else None))
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: _sampler(method, selection, options, model.teammate_actions, histories.order)
@@ -77,7 +77,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
         },
     }
-    return Job(method, Data(samplers.pop("train"), samplers), options, about)
+    return TrainingTask(method, Data(samplers.pop("train"), samplers), options, about)
 
 
 def _load(histories: HistoryOptions) -> Dataset:
@@ -178,7 +178,7 @@ def read_trained(folder: Path) -> Trained:
         options: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in table.items()}
         model = ModelOptions(**options)
         layouts = [get_layout(name) for name in histories["layouts"]]
-        method, context = get_method(config["method"])(model, kitchen(layouts)), config["train"]["context"]
+        method, context = get_method(config["method"])(model, overcooked_world(layouts)), config["train"]["context"]
     except (KeyError, TypeError) as error:
         raise OptionError(f"{folder}: its config.json is not of a run on learning histories: {error!r}") from error
     if list(layouts[0].obs_shape) != histories["obs_shape"]:

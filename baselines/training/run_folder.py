@@ -13,7 +13,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.utils.files import file_in_place_of, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 
 RUN_FORMAT = 1
 CONFIG, METRICS, TIMING, CURVES, CHECKPOINTS, TENSORBOARD = (
@@ -73,7 +73,7 @@ def open_run(folder: Path, config: dict[str, Any]) -> bool:
         check_same(folder, read_config(folder), json.loads(json.dumps(config)))
         return True
     if jax.process_index() == 0:
-        with file_in_place_of(folder / CONFIG) as partial:
+        with atomic_write(folder / CONFIG) as partial:
             write_json(partial, config)
     return False
 
@@ -170,7 +170,7 @@ def forget_after(path: Path, step: int) -> None:
     """Drop a log's lines of later steps, which a run that was killed wrote behind its last checkpoint."""
     if path.exists():
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= step]
-        with file_in_place_of(path) as partial:
+        with atomic_write(path) as partial:
             partial.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
 
 

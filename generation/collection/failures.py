@@ -9,7 +9,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from generation.collection.job import Outcome
-from icrl4aht_data.utils.files import file_in_place_of, read_text
+from icrl4aht_data.utils.files import atomic_write, read_text
 
 FAILED = "failed.jsonl"
 
@@ -43,5 +43,5 @@ class FailureLog:
             if not after:
                 self.path.unlink(missing_ok=True)
             elif after != before:
-                with file_in_place_of(self.path) as partial:
+                with atomic_write(self.path) as partial:
                     partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")

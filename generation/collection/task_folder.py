@@ -30,7 +30,7 @@ from generation.learners.state_file import keep_lines
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
-from icrl4aht_data.utils.files import file_in_place_of, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
 METADATA, METRICS, TIMING, LEARNER = "metadata.json", "metrics.jsonl", "timing.jsonl", "learner.safetensors"
@@ -80,7 +80,7 @@ def finish(partial: Path, task: Task, profile: Profile) -> None:
         "platform": jax.default_backend(),
         "files": {name: file_hash(partial / name) for name in sorted(_HASHED)},
     }
-    with file_in_place_of(partial / METADATA) as unnamed:
+    with atomic_write(partial / METADATA) as unnamed:
         write_json(unnamed, metadata)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Int, Key
 from generation.env import Environment
 from generation.learners.network import ActorCritic
 from generation.learners.ppo import PPO, PPOConfig, episode_metrics, sequences
-from generation.learners.rollout import Player, Rollout, Seats, network_player, policy_player, roll_out, take_seats
+from generation.learners.rollout import Player, Rollout, Seats, init_rollout, network_player, policy_player, roll_out
 from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
@@ -58,7 +58,7 @@ class Learner:
         weights, tables, running = jax.random.split(key, 3)
         n = self.config.environments
         params = self.network.untrained(weights, self.env.layout.channels)
-        seats = take_seats(self.env, self.players(params, self.teammate.params), jax.random.split(tables, n))
+        seats = init_rollout(self.env, self.players(params, self.teammate.params), jax.random.split(tables, n))
         return LearnerState(
             params, self.config.optimizer.init(params), seats, self.teammate.params, running, jnp.int32(0)
         )

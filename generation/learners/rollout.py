@@ -59,7 +59,7 @@ class Rollout(NamedTuple):
     choices: tuple[Choice, ...]  # the players', leaves (T, M)
 
 
-def take_seats(env: Environment, players: Sequence[Player], keys: Key[Array, " N"]) -> Seats:
+def init_rollout(env: Environment, players: Sequence[Player], keys: Key[Array, " N"]) -> Seats:
     """The tables before the first step; one key a table."""
     state = env.init(keys)
     n = state.clock.shape[0]

@@ -12,13 +12,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import file_in_place_of
+from icrl4aht_data.utils.files import atomic_write
 
 
 def save_state(path: Path, state: Any, card: dict[str, str]) -> None:
     """Write a pytree of arrays and typed keys (of JAX's default kind); a reader sees the old file or the new one."""
     arrays = {name: np.require(_plain(leaf), requirements="C") for name, leaf in _leaves(state).items()}
-    with file_in_place_of(path) as partial:
+    with atomic_write(path) as partial:
         save_file(arrays, partial, metadata=card)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from generation.learners.ego import Learner
-from generation.learners.rollout import random_player, roll_out, take_seats
+from generation.learners.rollout import init_rollout, random_player, roll_out
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
 _ROUNDS = 3
@@ -25,7 +25,7 @@ def learner_speed(learner: Learner, seed: int = 0) -> dict[str, float]:
     key = jax.random.key(seed + 1)
     players = learner.players(state.params, state.teammate)
     by_chance = [random_player(EGO, config.environments), players[TEAMMATE]]
-    tables = take_seats(learner.env, by_chance, jax.random.split(key, config.environments))
+    tables = init_rollout(learner.env, by_chance, jax.random.split(key, config.environments))
     bare = _seconds(jax.jit(lambda seats: roll_out(learner.env, by_chance, seats, config.rollout, key)[0]), tables)
     forward = _seconds(jax.jit(lambda seats: roll_out(learner.env, players, seats, config.rollout, key)), state.seats)
     whole = _seconds(jax.jit(learner.update), state)

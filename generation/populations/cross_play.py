@@ -12,7 +12,7 @@ import numpy as np
 
 from generation.env import Environment
 from generation.learners.network import ActorCritic, Widths
-from generation.learners.rollout import Player, network_player, roll_out, take_seats
+from generation.learners.rollout import Player, init_rollout, network_player, roll_out
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
@@ -75,7 +75,7 @@ def _play(
     @jax.jit
     def play(left, right, key):
         players = [player(left, EGO, False), player(right, TEAMMATE, greedy)]
-        seats = take_seats(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
+        seats = init_rollout(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
         _, rollout = roll_out(env, players, seats, EPISODE_STEPS, jax.random.fold_in(key, 1))
         return rollout.reward.sum(axis=0).reshape(len(first), episodes).mean(axis=1)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from generation.env import Environment
-from generation.learners.rollout import policy_player, random_player, roll_out, take_seats
+from generation.learners.rollout import init_rollout, policy_player, random_player, roll_out
 from generation.policy import Policy, stacked
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -70,7 +70,7 @@ def _play(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax
     def play(params, key):
         own = jax.tree.map(lambda leaf: jnp.repeat(leaf, _EPISODES, axis=0), params)
         players = [random_player(EGO, n), policy_player(env, family, own, TEAMMATE, n, own_params=True)]
-        seats = take_seats(env, players, jax.random.split(key, n))
+        seats = init_rollout(env, players, jax.random.split(key, n))
         return roll_out(env, players, seats, env.max_steps, key)[1].record
 
     return play(family.params, jax.random.fold_in(key, numbers[0]))

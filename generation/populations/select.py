@@ -12,10 +12,10 @@ from filelock import FileLock
 
 from generation.learners.checkpoint import WEIGHTS
 from generation.populations.train import Checkpoint, checkpoints
-from icrl4aht_data.benchmark.facts import ALGORITHMS, LAYOUTS, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import ALGORITHMS, LAYOUT_NAMES, TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import file_in_place_of
+from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.hashes import file_hash
 
 THRESHOLD = 20.0
@@ -76,7 +76,7 @@ def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list
 
 def layout_number(layout: str) -> int:
     """A layout's place among all, for seeds."""
-    return LAYOUTS.index(layout)
+    return LAYOUT_NAMES.index(layout)
 
 
 def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def write_manifests(suite: Path, selections: Sequence[Selection]) -> list[Path]:
                 if not tasks:
                     path.unlink(missing_ok=True)
                     continue
-                with file_in_place_of(path) as partial:
+                with atomic_write(path) as partial:
                     write_tasks(partial, tasks)
                 written.append(path)
     return written

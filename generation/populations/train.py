@@ -40,7 +40,7 @@ from generation.populations.figures import plot_training
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import file_in_place_of, json_hash, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
 CHECKPOINTS = 5
@@ -315,7 +315,7 @@ class _Training:
             for path in sorted(self.folder.rglob(name))
         }
         content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
-        with file_in_place_of(self.folder / _POPULATION) as partial:
+        with atomic_write(self.folder / _POPULATION) as partial:
             write_json(partial, content)
         (self.folder / _RESUME).unlink(missing_ok=True)
 

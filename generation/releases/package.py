@@ -23,7 +23,7 @@ from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.schema import Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import folder_in_place_of
+from icrl4aht_data.writing.release_folder import atomic_folder
 from icrl4aht_data.writing.statistics import STREAMS_RECORDED
 
 
@@ -43,7 +43,7 @@ def package(
 
 def bundle_release(release: Path) -> Path:
     """Put a copy of a release in the place of the one that the package bundles."""
-    with folder_in_place_of(MINI) as copy:
+    with atomic_folder(MINI) as copy:
         shutil.copytree(release, copy, dirs_exist_ok=True)
     return MINI
 

@@ -13,7 +13,7 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """track -> split -> layouts (paper, App. A)."""
 
-LAYOUTS = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
+LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
 """Every layout of the benchmark, in the paper's order; its place here goes into seeds."""
 
 SPLITS = ("train", "test", "heldout")
@@ -54,7 +54,7 @@ def track_of(layout: str) -> str:
     for track, splits in TRACKS.items():
         if any(layout in layouts for layouts in splits.values()):
             return track
-    raise unknown("layout", layout, LAYOUTS)
+    raise unknown("layout", layout, LAYOUT_NAMES)
 
 
 def check_place(track: object, split: object, layout: object) -> None:

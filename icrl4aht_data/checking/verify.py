@@ -37,10 +37,10 @@ from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import Names
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.remote.download import ORIGIN, chosen_files
-from icrl4aht_data.remote.remote_release import Remote, Root, open_root
+from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import LARGEST, files_below, inside
+from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
 from icrl4aht_data.writing.statistics import layout_statistics
 
 _OF_THE_HUB = (".gitattributes", ".cache/huggingface/")
@@ -98,7 +98,7 @@ def verify_release(
     return report
 
 
-def _verify(origin: Root, report: Report, advance: NamedProgress, wanted: dict[str, Names]) -> None:
+def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, Names]) -> None:
     listed = _manifest(origin, report)
     chosen, unreadable = set(listed), None
     try:
@@ -116,7 +116,7 @@ def _verify(origin: Root, report: Report, advance: NamedProgress, wanted: dict[s
         report.add("meta", str(unreadable))
         return
     index = read_index(origin)
-    tasks = read_tasks(inside(origin.folder, TASKS))
+    tasks = read_tasks(resolve_inside(origin.folder, TASKS))
     report.replayed = report.deep and index.info["kind"] in KINDS
     if report.deep and not report.replayed:
         report.notes.append(
@@ -205,7 +205,7 @@ def _check_sizes(index: Index, shards: list[str], report: Report) -> None:
     """Whether every shard is as long as the release says, where it is."""
     for name in shards:
         expected, found = index.info["shards"].get(name), None
-        remote, path = index.origin.remote, inside(index.root, name)
+        remote, path = index.origin.remote, resolve_inside(index.root, name)
         if path.exists():
             found = path.stat().st_size
         elif remote is not None:
@@ -239,14 +239,14 @@ def _check_teammates(root: Path, tasks: list[Task], report: Report) -> None:
 
 def _statistics(index: Index, tasks: list[Task]) -> Any:
     try:
-        provenance = read_provenance(inside(index.root, PROVENANCE))
+        provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
         kept_steps = index.info["environment"]["kept_steps"]
         return layout_statistics(index.root, index.entries, tasks, provenance, kept_steps)
     except (Icrl4ahtError, OSError) as error:
         return f"what {PROVENANCE} and the shards give: {error}"
 
 
-def _manifest(origin: Root, report: Report) -> dict[str, str]:
+def _manifest(origin: ReleaseLocation, report: Report) -> dict[str, str]:
     try:
         return read_manifest(origin.folder)
     except Icrl4ahtError as error:
@@ -255,7 +255,7 @@ def _manifest(origin: Root, report: Report) -> dict[str, str]:
 
 
 def _check_files(
-    origin: Root, expected: dict[str, str], listed: Collection[str], report: Report, advance: NamedProgress
+    origin: ReleaseLocation, expected: dict[str, str], listed: Collection[str], report: Report, advance: NamedProgress
 ) -> None:
     """Whether the files that are expected are here as the manifest has them, and no others.
 
@@ -274,7 +274,7 @@ def _check_files(
     both = sorted(expected.keys() & present)
     for number, name in enumerate(both, start=1):
         try:
-            path = inside(root, name)
+            path = resolve_inside(root, name)
             if path.stat().st_size > LARGEST and not _is_covered(root, name):
                 report.add(name, f"expected at most {LARGEST:,} bytes, found {path.stat().st_size:,}")
                 continue
@@ -292,12 +292,12 @@ def _is_covered(root: Path, name: str) -> bool:
     """Whether a file is a shard of which the chunk table accounts for every byte: a hole is not worth hashing."""
     if not name.startswith("data/"):
         return False
-    table = read_table(inside(root, chunk_table_name(name)))
+    table = read_table(resolve_inside(root, chunk_table_name(name)))
     return int(table["size"].sum(dtype=np.int64)) == (root / name).stat().st_size
 
 
 def _check_shards(index: Index, shards: list[str], report: Report, advance: NamedProgress) -> None:
-    local = Root(index.root)  # what could not be fetched has been reported
+    local = ReleaseLocation(index.root)  # what could not be fetched has been reported
     members = {name: [index.entries[row] for row in index.entries.shard_rows(name).tolist()] for name in shards}
     total = sum(map(len, members.values()))
     for name, entries in members.items():

@@ -11,7 +11,7 @@ from icrl4aht_data.format.schema import (
     TEAMMATES,
 )
 from icrl4aht_data.utils.files import plain_size
-from icrl4aht_data.utils.paths import inside
+from icrl4aht_data.utils.paths import resolve_inside
 
 CHECKPOINT_BYTES = 64 * 2**20
 """Of each file of a learned teammate: sixty times what the paper's network takes."""
@@ -43,6 +43,6 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
     found = sorted(checkpoint_folder(folder, task.teammate).glob("policy.*"))
     for path in found:
         if root is not None:
-            inside(root, path.relative_to(root).as_posix())
+            resolve_inside(root, path.relative_to(root).as_posix())
         plain_size(path, CHECKPOINT_BYTES)
     return {f"{TEAMMATES}/{task.teammate['theta']['sha256']}/{path.name}": path for path in found}

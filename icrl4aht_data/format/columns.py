@@ -18,7 +18,7 @@ from icrl4aht_data.format.schema import FINITE, JSON_TYPES, LONGEST, Entry, is_n
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.utils.cache import cached_arrays, content_hash
-from icrl4aht_data.utils.files import LINE_BYTES, errors_of, parse_json, plain_size
+from icrl4aht_data.utils.files import LINE_BYTES, parse_json, plain_size, wrap_read_errors
 from icrl4aht_data.utils.paths import LARGEST
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id")
@@ -115,7 +115,7 @@ def read_columns(path: Path) -> Columns:
     Raises:
         IndexFormatError: names the file and the line.
     """
-    with errors_of(path):
+    with wrap_read_errors(path):
         size = plain_size(path, LARGEST)
         if size < _UNCACHED:
             return Columns(_parse(path))
@@ -154,7 +154,7 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
 
 def _blocks(path: Path) -> Iterator[bytes]:
     """The file in blocks of whole lines, without the last line's end."""
-    with errors_of(path), path.open("rb") as stream:
+    with wrap_read_errors(path), path.open("rb") as stream:
         while text := stream.read(_BLOCK):
             text += stream.readline(LINE_BYTES)
             if len(text) - text.rfind(b"\n", 0, -1) > LINE_BYTES:

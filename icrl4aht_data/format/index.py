@@ -20,15 +20,15 @@ from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.remote.remote_release import Root
-from icrl4aht_data.utils.paths import inside
+from icrl4aht_data.remote.remote_release import ReleaseLocation
+from icrl4aht_data.utils.paths import resolve_inside
 
 
 @dataclass(frozen=True, eq=False)
 class Index:
     """A release's index. A history's id is its place in `entries`, which makes an entry when it is asked for."""
 
-    origin: Root
+    origin: ReleaseLocation
     info: dict[str, Any]
     entries: Columns
 
@@ -100,7 +100,7 @@ class Index:
         return ", ".join(parts) or "no histories"
 
 
-def read_index(origin: Root | Path) -> Index:
+def read_index(origin: ReleaseLocation | Path) -> Index:
     """Read and check a release's index.
 
     A large one is parsed once; what was parsed is kept in the cache folder, by content (`utils.cache`).
@@ -108,10 +108,10 @@ def read_index(origin: Root | Path) -> Index:
     Raises:
         RootNotFoundError, FormatTooNewError, FormatTooOldError, IndexFormatError: each names the file, and the line.
     """
-    origin = Root(origin) if isinstance(origin, Path) else origin
+    origin = ReleaseLocation(origin) if isinstance(origin, Path) else origin
     root = origin.folder
     info = read_info(root)
-    path = inside(root, HISTORIES)
+    path = resolve_inside(root, HISTORIES)
     entries = read_columns(path)
     if len(entries) != info["histories"]:
         raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info['histories']} histories")

@@ -28,7 +28,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
-from icrl4aht_data.utils.paths import inside
+from icrl4aht_data.utils.paths import resolve_inside
 
 _SEMVER = re.compile(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?")
 
@@ -44,7 +44,7 @@ _INFO_TYPES: dict[str, type | tuple[type, ...]] = {
 
 def read_info(root: Path) -> dict[str, Any]:
     """meta/info.json of a release whose format this package reads."""
-    path = inside(root, INFO)
+    path = resolve_inside(root, INFO)
     if not path.is_file():
         raise RootNotFoundError(f"{root}: no release here, expected {INFO} in it; {_instead(root)}")
     try:

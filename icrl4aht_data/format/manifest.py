@@ -8,9 +8,9 @@ from pathlib import Path
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.utils.files import file_in_place_of, read_text
+from icrl4aht_data.utils.files import atomic_write, read_text
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import inside, is_inside
+from icrl4aht_data.utils.paths import is_inside, resolve_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -50,7 +50,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
 
 def read_manifest(folder: Path) -> dict[str, str]:
     """The same of a release folder."""
-    path = inside(folder, MANIFEST)
+    path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
 
 
@@ -58,5 +58,5 @@ def write_manifest(root: Path) -> None:
     """MANIFEST.sha256 over every other file of the folder."""
     files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != MANIFEST)
     lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
-    with file_in_place_of(root / MANIFEST) as partial:
+    with atomic_write(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")

@@ -22,7 +22,7 @@ _IMPOSSIBLE = -(2**40)
 _TIMERS = 32  # what a timer's five bits hold
 
 
-def paint(layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1) -> np.ndarray:
+def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1) -> np.ndarray:
     """Write the ego's observations into `out`.
 
     Args:
@@ -38,18 +38,18 @@ def paint(layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1)
         raise ValueError("expected out to be C-contiguous")
     records = record.reshape(-1, record.shape[-1])
     flat = out.reshape(len(records), VISIBLE, layout.channels)
-    painter = _painter(layout, out.dtype.str)
+    renderer = _renderer(layout, out.dtype.str)
 
     def part(start: int, stop: int) -> None:
         for first in range(start, stop, _SLAB):
             last = min(first + _SLAB, stop)
-            painter.paint(records[first:last], flat[first:last])
+            renderer.render(records[first:last], flat[first:last])
 
     in_slices(part, len(records), threads, least=_SLAB)
     return out
 
 
-class _Painter:
+class _Renderer:
     """The tables of one layout and dtype."""
 
     def __init__(self, layout: Layout, dtype: str) -> None:
@@ -66,7 +66,7 @@ class _Painter:
         self._patches = _as_items(self._make_patches())
         self._make_lookups()
 
-    def paint(self, record: np.ndarray, out: np.ndarray) -> None:
+    def render(self, record: np.ndarray, out: np.ndarray) -> None:
         """uint8 (n, S) -> (n, 25, C), in place."""
         # The first eight columns as pairs of bytes: positions, facings, hands, recipe and delivery.
         pairs = record[:, :8].copy().view("<u2").T.astype(np.intp)
@@ -176,5 +176,5 @@ def _lookup(values: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _painter(layout: Layout, dtype: str) -> _Painter:
-    return _Painter(layout, dtype)
+def _renderer(layout: Layout, dtype: str) -> _Renderer:
+    return _Renderer(layout, dtype)

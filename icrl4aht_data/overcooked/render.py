@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked import layouts
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, PLATE, WINDOW, Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, record_size, unpack
-from icrl4aht_data.utils.files import file_in_place_of
+from icrl4aht_data.utils.files import atomic_write
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -146,7 +146,7 @@ def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) ->
 
 
 def _write(path: Path, image: Image.Image, **options: Any) -> None:
-    with file_in_place_of(path) as partial:
+    with atomic_write(path) as partial:
         image.save(partial, **options)
 
 

@@ -34,7 +34,7 @@ CORRECT, WRONG, PRESSED, PLACED, USEFUL_PLACEMENT, TOOK_DISH, USEFUL_DISH, USEFU
 pot (one the recipe still needs), took a dish out of a pot (the current recipe's), took a plate that is needed."""
 
 
-class Step(NamedTuple):
+class StepResult(NamedTuple):
     """What a step gives. `B` denotes the batch dimensions."""
 
     state: Array  # uint8 (B, S)
@@ -43,7 +43,7 @@ class Step(NamedTuple):
     events: Array  # uint8 (B, 2), event bits of each agent
 
 
-def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> Step:
+def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> StepResult:
     """One step of the game.
 
     Args:
@@ -53,7 +53,7 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
         next_recipe: uint8 (B,), item byte of the recipe that a correct delivery in this step brings.
 
     Returns:
-        A `Step`. Equal bytes from NumPy and JAX.
+        A `StepResult`. Equal bytes from NumPy and JAX.
     """
     xp = record.__array_namespace__()
     state = unpack(layout, record)
@@ -79,7 +79,7 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
         recipe=xp.where(correct, next_recipe, recipe),
         delivered=xp.astype(correct, xp.uint8),
     )
-    return Step(pack(state), team_reward(happened), shaped_rewards(happened), happened)
+    return StepResult(pack(state), team_reward(happened), shaped_rewards(happened), happened)
 
 
 def team_reward(events: Array) -> Array:

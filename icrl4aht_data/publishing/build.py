@@ -35,7 +35,7 @@ from icrl4aht_data.writing.dataset_card import (
 )
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.release import CARD
-from icrl4aht_data.writing.release_folder import folder_in_place_of
+from icrl4aht_data.writing.release_folder import atomic_folder
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
 _POLICY = "policy.json"
@@ -71,7 +71,7 @@ def build_release(
         raise OptionError(f"building a release needs {', '.join(missing)}: pip install 'icrl4aht-data[plot,hf]'")
     check_whole(source, advance)
     kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
-    with folder_in_place_of(target) as root:
+    with atomic_folder(target) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             _take(source / name, root / name, link)

@@ -9,10 +9,10 @@ from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import LabelsMissingError, NotStoredError, unknown
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
-from icrl4aht_data.overcooked.fast_observe import paint
+from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.shard import Shard
-from icrl4aht_data.remote.partial_file import bring
+from icrl4aht_data.remote.partial_file import fetch_chunks
 from icrl4aht_data.utils.memory import new_array
 
 Obs = Literal["float32", "uint8", "state"]
@@ -62,13 +62,13 @@ class History:
         if self.kind in field.absent:
             return self._painted(start, stop, np.uint8)
         if self._shard.is_remote:
-            bring(self._shard.lacking(self._shard.needed(self.entry.history_id, field, start, stop)))
+            fetch_chunks(self._shard.lacking(self._shard.needed(self.entry.history_id, field, start, stop)))
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def _painted(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
         what = f"{self._shard.path}: history {self.entry.history_id}: obs"
         out = new_array((stop - start, *self.entry.obs_shape), dtype, what)
-        return paint(self._shard.layout, self.read("state", start, stop), out)
+        return fast_observe(self._shard.layout, self.read("state", start, stop), out)
 
     def _field(self, name: str) -> Field:
         if name not in FIELDS:

@@ -8,22 +8,22 @@ from typing import NamedTuple
 import numpy as np
 
 from icrl4aht_data.reading.history import Obs
-from icrl4aht_data.reading.sources import Cache, Source
+from icrl4aht_data.reading.sources import CacheMode, HistorySource
 
 Names = str | Sequence[str] | None
 
 
-class Options(NamedTuple):
+class ReadOptions(NamedTuple):
     """How a dataset gives its data; see `load_icrl4aht`."""
 
     obs: Obs
-    cache: Cache
+    cache: CacheMode
     threads: int
 
 
-class Holding(NamedTuple):
+class Storage(NamedTuple):
     """Where a selection's rows come from: one source a layout, and each history's place."""
 
-    sources: list[Source]
+    sources: list[HistorySource]
     layout: np.ndarray  # intp (H,), which source
     place: np.ndarray  # intp (H,), position in it

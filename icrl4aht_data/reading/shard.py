@@ -24,14 +24,14 @@ from icrl4aht_data.format.schema import FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
 from icrl4aht_data.utils.memory import new_array
-from icrl4aht_data.utils.paths import inside
+from icrl4aht_data.utils.paths import resolve_inside
 
 if TYPE_CHECKING:
     import h5py  # libhdf5 is needed to check, not to read
 
     from icrl4aht_data.format.index import Index
     from icrl4aht_data.remote.partial_file import PartialFile
-    from icrl4aht_data.remote.remote_release import Root
+    from icrl4aht_data.remote.remote_release import ReleaseLocation
 
 
 class Shard:
@@ -50,9 +50,9 @@ class Shard:
     """
 
     def __init__(
-        self, root: Root, name: str, kind: Kind, entries: Sequence[Entry], cache: ChunkCache | None = None
+        self, root: ReleaseLocation, name: str, kind: Kind, entries: Sequence[Entry], cache: ChunkCache | None = None
     ) -> None:
-        self.path, self.name = inside(root.folder, name), name
+        self.path, self.name = resolve_inside(root.folder, name), name
         self._remote = root.remote
         self.kind: Kind = kind
         self.layout = get_layout(entries[0].layout)
@@ -66,7 +66,7 @@ class Shard:
         self._check_rows(entries)
         self._check_size()
 
-    def _read_table(self, root: Root, expected: int) -> np.ndarray:
+    def _read_table(self, root: ReleaseLocation, expected: int) -> np.ndarray:
         table = read_table(root.file(chunk_table_name(self.name)))
         found = int(np.count_nonzero(table["rows"]))
         if found != expected or not table["rows"][:expected].all():

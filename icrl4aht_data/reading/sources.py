@@ -25,22 +25,22 @@ from icrl4aht_data.utils.cache import cache_room, cached_arrays
 from icrl4aht_data.utils.memory import free_memory
 from icrl4aht_data.utils.threads import in_slices
 
-Cache = Literal["auto", "ram", "mmap", "stream"]
-CACHES: tuple[Cache, ...] = ("auto", "ram", "mmap", "stream")
+CacheMode = Literal["auto", "ram", "mmap", "stream"]
+CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
 
 _VERSION = 1  # of the memory-mapped arrays
 _COPIED = 2**20  # bytes at a time: the copies in between stay small, and the calls few
 
 
-class Choice(NamedTuple):
+class CacheChoice(NamedTuple):
     """How a selection is held, and why."""
 
-    cache: Cache
+    cache: CacheMode
     reason: str
 
 
-class Source(Protocol):
+class HistorySource(Protocol):
     """Rows of the histories of one layout, named by their position in the source. Values are in `Field.compact`."""
 
     def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
@@ -67,17 +67,19 @@ class Source(Protocol):
         ...
 
 
-def choose(cache: Cache, size: int) -> Choice:
+def choose(cache: CacheMode, size: int) -> CacheChoice:
     """How to hold arrays of that many bytes."""
     if cache != "auto":
-        return Choice(cache, "as asked")
+        return CacheChoice(cache, "as asked")
     memory = free_memory()
     if size <= memory // 2:
-        return Choice("ram", f"{_gigabytes(size)} decoded, {_gigabytes(memory)} of memory free")
+        return CacheChoice("ram", f"{_gigabytes(size)} decoded, {_gigabytes(memory)} of memory free")
     room = cache_room()
     if size <= room:
-        return Choice("mmap", f"{_gigabytes(size)} decoded, more than half of the {_gigabytes(memory)} of memory free")
-    return Choice("stream", f"{_gigabytes(size)} decoded, room for {_gigabytes(room)} in the cache folder")
+        return CacheChoice(
+            "mmap", f"{_gigabytes(size)} decoded, more than half of the {_gigabytes(memory)} of memory free"
+        )
+    return CacheChoice("stream", f"{_gigabytes(size)} decoded, room for {_gigabytes(room)} in the cache folder")
 
 
 def _gigabytes(size: int) -> str:
@@ -90,7 +92,9 @@ def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episode
     return sum(rows[field.axis] * field.held(layout).itemsize for field in held_fields(kind))
 
 
-def open_source(cache: Cache, entries: Sequence[Entry], open_shard: Callable[[str], Shard], threads: int) -> Source:
+def open_source(
+    cache: CacheMode, entries: Sequence[Entry], open_shard: Callable[[str], Shard], threads: int
+) -> HistorySource:
     """The source of histories of one layout.
 
     Args:

@@ -16,11 +16,19 @@ from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.remote.remote_release import Advance, HubRemote, Remote, Root, alone, is_address, open_root
-from icrl4aht_data.remote.store import Patience, Traffic
-from icrl4aht_data.utils.files import file_in_place_of, holds, parse_json, read_text, write_json
+from icrl4aht_data.remote.remote_release import (
+    Advance,
+    HubRemote,
+    ReleaseLocation,
+    Remote,
+    folder_lock,
+    is_address,
+    open_root,
+)
+from icrl4aht_data.remote.store import RetryPolicy, Traffic
+from icrl4aht_data.utils.files import atomic_write, has_content, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import inside
+from icrl4aht_data.utils.paths import resolve_inside
 
 ORIGIN = ".origin.json"
 """In a folder that `download` filled: where from, and which files it asked for. The one file that no manifest lists."""
@@ -30,7 +38,7 @@ _PLAIN = re.compile(r"(hf|s3|https?)://[^:\s]+(:\d+)?(/[^:\s]*)?")
 
 
 @dataclass(frozen=True)
-class Plan:
+class DownloadPlan:
     """What a download brings.
 
     Args:
@@ -39,7 +47,7 @@ class Plan:
         absent: those of them that are not here.
     """
 
-    root: Root
+    root: ReleaseLocation
     files: dict[str, int]
     absent: list[str]
 
@@ -64,8 +72,8 @@ def default_remote() -> str | None:
 
 
 def plan_download(
-    url: str, *, to: Path | None = None, patience: Patience | None = None, **wanted: str | Iterable[str] | None
-) -> Plan:
+    url: str, *, to: Path | None = None, patience: RetryPolicy | None = None, **wanted: str | Iterable[str] | None
+) -> DownloadPlan:
     """What `fetch_planned` would bring; only the index comes here.
 
     Args:
@@ -85,10 +93,10 @@ def plan_download(
     assert root.remote is not None
     names = sorted(chosen_files(root, **wanted))
     absent = [name for name in names if not root.is_here(name)]
-    return Plan(root, root.remote.sizes(names), absent)
+    return DownloadPlan(root, root.remote.sizes(names), absent)
 
 
-def fetch_planned(plan: Plan, advance: Advance = lambda size: None) -> Traffic:
+def fetch_planned(plan: DownloadPlan, advance: Advance = lambda size: None) -> Traffic:
     """Bring the files of a plan here, each checked on arrival; what the remote was asked for.
 
     Raises:
@@ -100,14 +108,14 @@ def fetch_planned(plan: Plan, advance: Advance = lambda size: None) -> Traffic:
     before = remote.store.traffic
     remote.fetch(plan.absent, advance)
     if not isinstance(remote, HubRemote):  # the Hub's cache is not ours to write notes into
-        with alone(remote.partial):
+        with folder_lock(remote.partial):
             files = {*plan.files, *_noted(remote.folder).get("files", [])}
-            with file_in_place_of(remote.folder / ORIGIN) as partial:
+            with atomic_write(remote.folder / ORIGIN) as partial:
                 write_json(partial, {"url": remote.url, "files": sorted(files)})
     return remote.store.traffic - before
 
 
-def chosen_files(root: Root, **wanted: str | Iterable[str] | None) -> set[str]:
+def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
     """The files of a release that go with a selection: its shards, their chunk tables, and all that is no shard.
 
     Without a selection those that a folder was filled with, see `ORIGIN`.
@@ -126,7 +134,7 @@ def chosen_files(root: Root, **wanted: str | Iterable[str] | None) -> set[str]:
 
 def _noted(folder: Path) -> dict[str, Any]:
     """What `ORIGIN` says; empty if there is none."""
-    path = inside(folder, ORIGIN)
+    path = resolve_inside(folder, ORIGIN)
     if not path.exists():
         return {}
     noted = parse_json(read_text(path))
@@ -146,7 +154,7 @@ def _selected(index: Index, **wanted: Any) -> set[str]:
 
 
 def repair(
-    root: str | Path, damaged: Iterable[str], *, source: str | None = None, patience: Patience | None = None
+    root: str | Path, damaged: Iterable[str], *, source: str | None = None, patience: RetryPolicy | None = None
 ) -> tuple[dict[str, str | None], Traffic]:
     """Make files of a release whole again: of a shard only the ranges that are wrong are fetched.
 
@@ -170,14 +178,14 @@ def repair(
     before = remote.store.traffic
     names = set(damaged) & remote.manifest.keys()
     text = (there.folder / MANIFEST).read_bytes()
-    if folder != there.folder and not holds(folder / MANIFEST, text):
+    if folder != there.folder and not has_content(folder / MANIFEST, text):
         bad = [name for name in remote.manifest if not _holds(remote, name)]
         if 2 * len(bad) > len(remote.manifest):
             raise OptionError(
                 f"{remote.url}: {len(bad)} of its {len(remote.manifest)} files are not those of {folder}: it has "
                 f"another release or version; give the address that this one came from"
             )
-        with file_in_place_of(folder / MANIFEST) as partial:
+        with atomic_write(folder / MANIFEST) as partial:
             partial.write_bytes(text)
         names.update(bad)
     done: dict[str, str | None] = {}

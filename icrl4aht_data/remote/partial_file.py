@@ -21,7 +21,7 @@ from icrl4aht_data.errors import ChunkTableError, RemoteError
 from icrl4aht_data.format.schema import CHUNK_DTYPE
 from icrl4aht_data.remote.store import Store
 from icrl4aht_data.utils.cache import cache_limit, data_folder
-from icrl4aht_data.utils.files import naming
+from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.hashes import file_hash
 
 _GAP = 4096  # bytes between two chunks that cost less than another request
@@ -83,7 +83,7 @@ class PartialFile:
         if not self.path.exists():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self.path.touch()
-        with naming(self.path), self.path.open("r+b") as stream:
+        with add_filename(self.path), self.path.open("r+b") as stream:
             stream.seek(start)
             stream.write(data)
 
@@ -119,7 +119,7 @@ class PartialFile:
         return np.sort(chunks[absent], order="offset")
 
 
-def bring(wanted: Iterable[tuple[PartialFile, np.ndarray]]) -> None:
+def fetch_chunks(wanted: Iterable[tuple[PartialFile, np.ndarray]]) -> None:
     """Make sure that chunks of several files are here: what is missing comes in few requests, many at once.
 
     Args:
@@ -233,7 +233,7 @@ def _by_chunks(file: PartialFile, size: int, table: np.ndarray, advance: Callabl
         advance(int(piece.chunks["size"].sum()))
 
     _at_once([lambda piece=piece: copy(piece) for piece in _pieces(missing, gap=0)])
-    with naming(file.path), file.path.open("r+b") as stream:
+    with add_filename(file.path), file.path.open("r+b") as stream:
         stream.truncate(size)
 
 

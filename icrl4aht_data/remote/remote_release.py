@@ -33,11 +33,11 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.partial_file import PartialFile, whole_file
-from icrl4aht_data.remote.store import HubStore, Patience, Store, offline
+from icrl4aht_data.remote.store import HubStore, RetryPolicy, Store, offline
 from icrl4aht_data.utils.cache import data_folder
-from icrl4aht_data.utils.files import TEXT_BYTES, file_in_place_of, holds, plain_size
+from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size
 from icrl4aht_data.utils.hashes import file_hash, git_hash
-from icrl4aht_data.utils.paths import LARGEST, inside
+from icrl4aht_data.utils.paths import LARGEST, resolve_inside
 
 _OPENED = (INFO, HISTORIES, TASKS, PROVENANCE)
 """What opening a release reads."""
@@ -50,7 +50,7 @@ Advance = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class Root:
+class ReleaseLocation:
     """An opened release: its folder here, and where what is not in it comes from."""
 
     folder: Path
@@ -66,7 +66,7 @@ class Root:
             UnsafePathError: if it leads out of the release.
             RemoteError, OfflineError: if it cannot be had.
         """
-        path = inside(self.folder, name)
+        path = resolve_inside(self.folder, name)
         if self.remote is not None and not path.exists():
             self.remote.fetch([name])
         return path
@@ -78,7 +78,7 @@ class Root:
             UnsafePathError: if it leads out of the release.
             RemoteError, OfflineError: if a file cannot be had.
         """
-        path = inside(self.folder, name)
+        path = resolve_inside(self.folder, name)
         if self.remote is not None:
             self.remote.fetch(known for known in self.remote.manifest if known.startswith(f"{name}/"))
         return path
@@ -88,7 +88,7 @@ class Root:
         return self.remote is None or (self.folder / name).exists()
 
 
-def open_root(root: str | Path, to: Path | None = None, patience: Patience | None = None) -> Root:
+def open_root(root: str | Path, to: Path | None = None, patience: RetryPolicy | None = None) -> ReleaseLocation:
     """A release folder, or a remote release with all that its index needs.
 
     Args:
@@ -101,12 +101,12 @@ def open_root(root: str | Path, to: Path | None = None, patience: Patience | Non
         OfflineError: if there may be one, but nothing may be asked.
     """
     if isinstance(root, Path) or "://" not in root:
-        return Root(Path(root).expanduser())
+        return ReleaseLocation(Path(root).expanduser())
     if root.startswith("file://"):
-        return Root(Path(root.removeprefix("file://")))
+        return ReleaseLocation(Path(root.removeprefix("file://")))
     remote = (_open_hub if root.startswith("hf://") else _open_address)(root, to, patience)
     remote.fetch([name for name in _OPENED if name in remote.manifest])
-    return Root(remote.folder, remote)
+    return ReleaseLocation(remote.folder, remote)
 
 
 def is_address(root: str | Path | None) -> bool:
@@ -157,7 +157,7 @@ class Remote:
 
     def path(self, name: str) -> Path:
         """Where a file is, or will be."""
-        return inside(self.folder, name)
+        return resolve_inside(self.folder, name)
 
     def part(self, name: str) -> PartialFile:
         """A file of which parts are here."""
@@ -220,7 +220,7 @@ class Remote:
         part.path.unlink(missing_ok=True)
         whole_file(part, self._size_there(name), self.manifest[name], chunks, lambda size: None)
         target.parent.mkdir(parents=True, exist_ok=True)
-        with file_in_place_of(target) as new:
+        with atomic_write(target) as new:
             shutil.move(part.path, new)
 
     def _chunks(self, name: str) -> np.ndarray | None:
@@ -264,7 +264,7 @@ class HubRemote(Remote):
         )
 
 
-def _open_hub(url: str, to: Path | None, patience: Patience | None) -> Remote:
+def _open_hub(url: str, to: Path | None, patience: RetryPolicy | None) -> Remote:
     match = _HUB.fullmatch(url)
     if match is None:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
@@ -327,7 +327,7 @@ def _from_hub(url: str, name: str, revision: str | None, most: int, advance: Adv
         raise ConnectionError(str(error)) from error
 
 
-def _open_address(url: str, to: Path | None, patience: Patience | None) -> Remote:
+def _open_address(url: str, to: Path | None, patience: RetryPolicy | None) -> Remote:
     url = url.rstrip("/")
     store, base = Store(url, patience), data_folder() / _slug(url)
     text = _kept_manifest(url, to or base / _text(base / "latest")) if offline() else _asked_manifest(url, store)
@@ -336,7 +336,7 @@ def _open_address(url: str, to: Path | None, patience: Patience | None) -> Remot
     folder = to or base / revision
     _write_once(folder, text, manifest, url)
     if to is None and _text(base / "latest") != revision:
-        with alone(base), file_in_place_of(base / "latest") as partial:
+        with folder_lock(base), atomic_write(base / "latest") as partial:
             partial.write_text(revision, encoding="utf-8")
     return Remote(url, revision, folder, _beside(folder), manifest, store)
 
@@ -375,17 +375,17 @@ def _checked_manifest(text: bytes, url: str) -> dict[str, str]:
 def _write_once(folder: Path, text: bytes, manifest: dict[str, str], url: str) -> None:
     """The manifest into the mirror, which holds files of this manifest alone."""
     path = folder / MANIFEST
-    if holds(path, text):
+    if has_content(path, text):
         return
-    with alone(_beside(folder)):
-        if path.exists() and not holds(path, text) and not _fits(folder, manifest):
+    with folder_lock(_beside(folder)):
+        if path.exists() and not has_content(path, text) and not _fits(folder, manifest):
             raise OptionError(f"{folder}: holds another release or version than {url} now; give another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        with file_in_place_of(path) as partial:
+        with atomic_write(path) as partial:
             partial.write_bytes(text)
 
 
-def alone(folder: Path) -> FileLock:
+def folder_lock(folder: Path) -> FileLock:
     """Held while notes are written, which no two processes may do at once.
 
     Args:

@@ -30,7 +30,7 @@ _WHOLE = 64 * 2**20  # bytes taken from a server that gives all of a file instea
 
 
 @dataclass(frozen=True)
-class Patience:
+class RetryPolicy:
     """How often a request is tried, and how long to wait in between, in seconds: doubled each time, or what the
     server asks for if that is more."""
 
@@ -73,16 +73,16 @@ class Store:
         patience: see there.
     """
 
-    def __init__(self, url: str, patience: Patience | None = None) -> None:
+    def __init__(self, url: str, patience: RetryPolicy | None = None) -> None:
         self.url = url.rstrip("/")
-        self.patience = patience or Patience()
+        self.patience = patience or RetryPolicy()
         self._traffic = Traffic()
         self._lock = threading.Lock()
 
-    def __getstate__(self) -> tuple[str, Patience]:
+    def __getstate__(self) -> tuple[str, RetryPolicy]:
         return self.url, self.patience
 
-    def __setstate__(self, state: tuple[str, Patience]) -> None:
+    def __setstate__(self, state: tuple[str, RetryPolicy]) -> None:
         self.__init__(*state)
 
     @property
@@ -159,7 +159,7 @@ class Store:
             timeout = aiohttp.ClientTimeout(total=_TOTAL, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
             options["client_kwargs"] = {"timeout": timeout, "response_class": _bounded_response()}
         elif scheme == "s3":
-            once = {"total_max_attempts": 1}  # `Patience` is enough
+            once = {"total_max_attempts": 1}  # `RetryPolicy` is enough
             options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT, "retries": once}
         try:
             files = fsspec.url_to_fs(url, **options)[0]
@@ -225,10 +225,10 @@ class HubStore(Store):
     Args:
         repo: <org>/<repo>.
         commit: all 40 digits.
-        patience: see `Patience`.
+        patience: see `RetryPolicy`.
     """
 
-    def __init__(self, repo: str, commit: str, patience: Patience | None = None) -> None:
+    def __init__(self, repo: str, commit: str, patience: RetryPolicy | None = None) -> None:
         super().__init__(f"hf://datasets/{repo}@{commit}", patience)
         self._repo, self._commit = repo, commit
         self._places: dict[str, Any] = {}

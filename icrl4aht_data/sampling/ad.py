@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.sampling.base import Group, Needed, Sampler, _describe
-from icrl4aht_data.sampling.draws import below, pick, words
+from icrl4aht_data.sampling.base import ChunkRequest, Group, Sampler, _describe
+from icrl4aht_data.sampling.draws import random_uint32, scale_to_range, weighted_choice
 
 
 class ADBatch(NamedTuple):
@@ -55,12 +55,12 @@ class ADSampler(Sampler[ADBatch]):
 
     def _windows(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions in the selection, starts, and how many steps of each window are in its range."""
-        which, where = self._local(words(self.seed, i, 2, self.batch_size))
+        which, where = self._local(random_uint32(self.seed, i, 2, self.batch_size))
         low, high = self._steps(i)
         weights = self._history_weights(low, high)
-        position = below(which, len(self.dataset)) if weights is None else pick(which, weights)
+        position = scale_to_range(which, len(self.dataset)) if weights is None else weighted_choice(which, weights)
         low, high = low[position], high[position]
-        starts = low + below(where, np.maximum(high - low - self.length, 0) + 1)
+        starts = low + scale_to_range(where, np.maximum(high - low - self.length, 0) + 1)
         return position, starts, np.minimum(high - starts, self.length)
 
     def empty(self) -> ADBatch:
@@ -89,7 +89,7 @@ class ADSampler(Sampler[ADBatch]):
         place = self.dataset.holding.place
         groups = [(group, place[group.select(which)], group.select(starts)) for group in self._groups(which)]
         fields = list(dict.fromkeys([self._record, *(name for name, _, array in scalars if array is not None)]))
-        self._bring(Needed(g.source, fields, where, low - 1, low + self.length) for g, where, low in groups)
+        self._bring(ChunkRequest(g.source, fields, where, low - 1, low + self.length) for g, where, low in groups)
         for group, place, start in groups:
 
             def fill(first: int, last: int, group=group, place=place, start=start) -> None:

@@ -14,11 +14,11 @@ from icrl4aht_data.errors import (
     OptionError,
 )
 from icrl4aht_data.format.schema import FIELDS, record_field
-from icrl4aht_data.overcooked.fast_observe import paint
+from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.reading.sources import Source
-from icrl4aht_data.remote.partial_file import bring
+from icrl4aht_data.reading.sources import HistorySource
+from icrl4aht_data.remote.partial_file import fetch_chunks
 from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import (
     Curriculum,
@@ -29,7 +29,7 @@ from icrl4aht_data.sampling.draws import (
     part_of,
 )
 from icrl4aht_data.utils.threads import in_slices
-from icrl4aht_data.utils.validation import whole
+from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     from icrl4aht_data.dataset import Dataset
@@ -40,10 +40,10 @@ B = TypeVar("B", bound=tuple)
 _SLAB = 8192  # steps gathered and painted at a time: the records in between stay few
 
 
-class Needed(NamedTuple):
+class ChunkRequest(NamedTuple):
     """Rows that a batch needs."""
 
-    source: Source
+    source: HistorySource
     fields: Sequence[str]
     which: np.ndarray  # int (n,): histories, positions in the source
     low: np.ndarray  # int (n,): the first row of each
@@ -54,7 +54,7 @@ class Group(NamedTuple):
     """The rows of a batch whose histories are of one layout."""
 
     layout: Layout
-    source: Source
+    source: HistorySource
     rows: slice | np.ndarray
     select: Callable[[np.ndarray], np.ndarray]  # of an array (B, ...): the group's
 
@@ -83,10 +83,10 @@ class Sampler(Generic[B]):
         process_index: int = 0,
         process_count: int = 1,
     ) -> None:
-        self.batch_size, self.length = whole("batch_size", batch_size, 1), whole("length", length, 1)
-        self.seed = whole("seed", seed, 0)
-        self.process_index, self.process_count = whole("process_index", process_index, 0), process_count
-        if process_index >= whole("process_count", process_count, 1) or batch_size % process_count:
+        self.batch_size, self.length = check_int("batch_size", batch_size, 1), check_int("length", length, 1)
+        self.seed = check_int("seed", seed, 0)
+        self.process_index, self.process_count = check_int("process_index", process_index, 0), process_count
+        if process_index >= check_int("process_count", process_count, 1) or batch_size % process_count:
             raise OptionError(
                 f"process_index = {process_index}, process_count = {process_count}, batch_size = {batch_size}: "
                 f"expected an index below the count, and a batch that divides evenly among the processes"
@@ -163,7 +163,7 @@ class Sampler(Generic[B]):
         """First step and the one behind the last of each history's range at batch i, int64 (H,) each."""
         first, stop = self._range
         if self.curriculum is not None:
-            first, stop = part_of(self.curriculum.part(whole("batch", i, 0)), first, stop)
+            first, stop = part_of(self.curriculum.part(check_int("batch", i, 0)), first, stop)
         whole_history = stop == self.dataset.column("episodes")
         return first * self._kept, np.where(whole_history, self._lengths, stop * self._kept)
 
@@ -188,9 +188,9 @@ class Sampler(Generic[B]):
             rows = np.flatnonzero(number == k)
             yield Group(self.layouts[k], holding.sources[k], rows, lambda array, rows=rows: array[rows])
 
-    def _bring(self, needed: Iterable[Needed]) -> None:
+    def _bring(self, needed: Iterable[ChunkRequest]) -> None:
         """Fetch what a batch needs of a remote release, all at once."""
-        bring(part for n in needed for part in n.source.lacking(n.fields, n.which, n.low, n.high))
+        fetch_chunks(part for n in needed for part in n.source.lacking(n.fields, n.which, n.low, n.high))
 
     @property
     def _paints(self) -> bool:
@@ -242,9 +242,9 @@ class Sampler(Generic[B]):
             out[rows, ..., : records.shape[-1]] = records
             out[rows, ..., records.shape[-1] :] = 0
         elif isinstance(rows, slice):
-            paint(group.layout, records, out[rows])
+            fast_observe(group.layout, records, out[rows])
         else:
-            out[rows] = paint(group.layout, records, np.empty((len(rows), *out.shape[1:]), out.dtype))
+            out[rows] = fast_observe(group.layout, records, np.empty((len(rows), *out.shape[1:]), out.dtype))
 
     def _checked(self, out: B | None) -> B:
         """`out`, if batches fit in it, or a new one."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.validation import whole
+from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     from icrl4aht_data.sampling.base import Sampler
@@ -46,11 +46,11 @@ class Batches(Iterator[B], Generic[B]):
         reuse: bool = False,
     ) -> None:
         self._sampler = sampler
-        self._stop = None if stop is None else whole("stop", stop, 0)
-        self._prefetch = whole("prefetch", prefetch, 0)
+        self._stop = None if stop is None else check_int("stop", stop, 0)
+        self._prefetch = check_int("prefetch", prefetch, 0)
         self._put = _device_put(device) if device is not None else None
         self._reuse = reuse
-        self.next, self.served, self.waited = whole("start", start, 0), 0, 0.0
+        self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
         self._worker: _Worker | None = None
         self._held: Any = None
         self._closed = False
@@ -115,7 +115,7 @@ class Batches(Iterator[B], Generic[B]):
             raise OptionError(f"the state is of other batches: it has {told or 'no `next`'}")
         self._stop_worker()
         self._closed = False
-        self.next = whole("next", state["next"], 0)
+        self.next = check_int("next", state["next"], 0)
 
 
 class _Worker:

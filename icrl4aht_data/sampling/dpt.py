@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, OptionError, unknown
-from icrl4aht_data.reading.sources import Source
-from icrl4aht_data.sampling.base import Group, Needed, Sampler, _describe
-from icrl4aht_data.sampling.draws import below, pick, words
+from icrl4aht_data.reading.sources import HistorySource
+from icrl4aht_data.sampling.base import ChunkRequest, Group, Sampler, _describe
+from icrl4aht_data.sampling.draws import random_uint32, scale_to_range, weighted_choice
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -119,26 +119,28 @@ class DPTSampler(Sampler[DPTBatch]):
 
     def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Query histories and steps (B,), context histories (B,) and steps (B, K)."""
-        drawn = self._local(words(self.seed, i, 4 + (self.length if self.order == "random" else 1), self.batch_size))
+        drawn = self._local(
+            random_uint32(self.seed, i, 4 + (self.length if self.order == "random" else 1), self.batch_size)
+        )
         low, high = self._steps(i)
         weights = self._history_weights(low, high)
         _, begins, ends = self._tasks
-        task = below(drawn[0], len(begins))
+        task = scale_to_range(drawn[0], len(begins))
         asking, showing = (self._member(word, begins[task], ends[task], weights) for word in drawn[1:3])
-        step = low[asking] + below(drawn[3], (high - low)[asking])
+        step = low[asking] + scale_to_range(drawn[3], (high - low)[asking])
         low, high = self._transitions(low), self._transitions(high)
         if self.order == "random":
-            shown = low[showing][:, None] + below(drawn[4:].T, (high - low)[showing][:, None])
+            shown = low[showing][:, None] + scale_to_range(drawn[4:].T, (high - low)[showing][:, None])
         else:
-            first = low[showing] + below(drawn[4], (high - low)[showing] - self.length + 1)
+            first = low[showing] + scale_to_range(drawn[4], (high - low)[showing] - self.length + 1)
             shown = first[:, None] + np.arange(self.length)
         return asking, step, showing, self._step_of(shown)
 
     def _member(self, word: np.ndarray, begin: np.ndarray, end: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
         positions = self._tasks[0]
         if weights is None:
-            return positions[begin + below(word, end - begin)]
-        return positions[pick(word, weights[positions], begin, end)]
+            return positions[begin + scale_to_range(word, end - begin)]
+        return positions[weighted_choice(word, weights[positions], begin, end)]
 
     def empty(self) -> DPTBatch:
         rows, shape = self.local_size, (self.local_size, self.length)
@@ -170,15 +172,15 @@ class DPTSampler(Sampler[DPTBatch]):
 
     def _needed(
         self, group: Group, asking: np.ndarray, step: np.ndarray, showing: np.ndarray, steps: np.ndarray
-    ) -> Iterator[Needed]:
+    ) -> Iterator[ChunkRequest]:
         place = self.dataset.holding.place
         query, when = place[group.select(asking)], group.select(step)
-        yield Needed(group.source, [self._record, "expert_actions"], query, when, when + 1)
+        yield ChunkRequest(group.source, [self._record, "expert_actions"], query, when, when + 1)
         shown, low, high = (group.select(array) for array in (place[showing], steps.min(axis=1), steps.max(axis=1) + 1))
         labels = ["teammate_actions"] if self.teammate_actions else []
-        yield Needed(group.source, [self._record, "actions", "rewards", "dones", *labels], shown, low, high + 1)
+        yield ChunkRequest(group.source, [self._record, "actions", "rewards", "dones", *labels], shown, low, high + 1)
         if self.dataset.has_states:
-            yield Needed(group.source, ["episode_end_state"], shown, low // self._kept, high // self._kept + 1)
+            yield ChunkRequest(group.source, ["episode_end_state"], shown, low // self._kept, high // self._kept + 1)
 
     def _fill_context(self, group: Group, showing: np.ndarray, steps: np.ndarray, batch: DPTBatch) -> None:
         scalars = [
@@ -199,7 +201,7 @@ class DPTSampler(Sampler[DPTBatch]):
 
         self._in_slabs(len(showing), slab)
 
-    def _read(self, source: Source, field: str, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    def _read(self, source: HistorySource, field: str, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
         if self._scattered:
             return source.steps(field, place, steps)
         out = np.empty(steps.shape, np.int8)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from icrl4aht_data.errors import OptionError, unknown
-from icrl4aht_data.utils.validation import whole
+from icrl4aht_data.utils.validation import check_int
 
 Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
 WEIGHTS = ("uniform", "length")
@@ -37,7 +37,7 @@ class Curriculum:
     last: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
-        whole("curriculum batches", self.batches, 1)
+        check_int("curriculum batches", self.batches, 1)
         for name, part in (("first", self.first), ("last", self.last)):
             if len(part) != 2 or not 0 <= part[0] < part[1] <= 1:
                 raise OptionError(f"curriculum {name} = {part}: expected fractions 0 <= low < high <= 1")
@@ -49,22 +49,22 @@ class Curriculum:
         return low, high
 
 
-def words(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
+def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
     """uint64 (count, batch_size): random words below 2**32, from (seed, i) alone.
 
     Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
     """
-    i = whole("batch", i, 0)
+    i = check_int("batch", i, 0)
     raw = np.random.Philox(key=np.array([seed, i], np.uint64)).random_raw(count * batch_size)
     return (raw >> np.uint64(32)).reshape(count, batch_size)
 
 
-def below(random: np.ndarray, n: Any) -> np.ndarray:
+def scale_to_range(random: np.ndarray, n: Any) -> np.ndarray:
     """int64: words below 2**32 scaled to 0..n - 1."""
     return (random * np.asarray(n).astype(np.uint64) >> np.uint64(32)).astype(np.int64)
 
 
-def pick(random: np.ndarray, weights: np.ndarray, first: Any = 0, stop: Any = None) -> np.ndarray:
+def weighted_choice(random: np.ndarray, weights: np.ndarray, first: Any = 0, stop: Any = None) -> np.ndarray:
     """int64: positions first..stop - 1 of `weights`, drawn in proportion to them. `first` and `stop` may be arrays.
 
     A position of weight zero is never drawn.

@@ -30,7 +30,7 @@ def plain_size(path: Path, most: int) -> int:
     Raises:
         IndexFormatError: if it is missing, no plain file, or longer than `most`.
     """
-    with errors_of(path):
+    with wrap_read_errors(path):
         status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise IndexFormatError(f"{path}: not a plain file")
@@ -46,7 +46,7 @@ def read_text(path: Path) -> str:
         IndexFormatError: if it is missing, unreadable, too long or not UTF-8.
     """
     plain_size(path, TEXT_BYTES)
-    with errors_of(path):
+    with wrap_read_errors(path):
         return path.read_text(encoding="utf-8")
 
 
@@ -57,7 +57,7 @@ def read_lines(path: Path) -> Iterator[str]:
         IndexFormatError: the same.
     """
     plain_size(path, 2**62)
-    with errors_of(path), path.open("rb") as stream:
+    with wrap_read_errors(path), path.open("rb") as stream:
         number = 0
         while line := stream.readline(LINE_BYTES):
             number += 1
@@ -67,7 +67,7 @@ def read_lines(path: Path) -> Iterator[str]:
 
 
 @contextmanager
-def errors_of(path: Path) -> Iterator[None]:
+def wrap_read_errors(path: Path) -> Iterator[None]:
     """What reading a file raises becomes an error that names it.
 
     Raises:
@@ -112,13 +112,13 @@ def json_hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def holds(path: Path, content: bytes) -> bool:
+def has_content(path: Path, content: bytes) -> bool:
     """Whether a file has that content."""
     return path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
+def add_filename(path: Path) -> Iterator[None]:
     """Errors of the disk name the file: those of writing to an open one do not."""
     try:
         yield
@@ -129,13 +129,13 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def file_in_place_of(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A name beside `path` to write to. At the end the file, by then on the disk, takes its place at once; after an
     error nothing changes."""
     partial = path.with_name(f".{path.name}.partial")
     partial.unlink(missing_ok=True)  # not to write through a link that somebody laid there
     try:
-        with naming(path):
+        with add_filename(path):
             yield partial
             with partial.open("rb+") as stream:
                 os.fsync(stream.fileno())

@@ -58,7 +58,7 @@ def _is_part(part: str) -> bool:
     return 0 < len(part.encode()) <= _PART and part[-1] not in ". " and not _DEVICE.fullmatch(part)
 
 
-def inside(folder: Path, name: str) -> Path:
+def resolve_inside(folder: Path, name: str) -> Path:
     """The path of a release's file, if it is in the release, symbolic links followed, and a file or a folder if it is.
 
     A folder of the Hub's cache holds links to the blobs beside its snapshots; these are followed as well.

@@ -8,7 +8,7 @@ from typing import Any
 from icrl4aht_data.errors import OptionError
 
 
-def whole(name: str, value: Any, least: int) -> int:
+def check_int(name: str, value: Any, least: int) -> int:
     """The value as an int, if it is one from `least` to 2**63.
 
     Raises:

@@ -9,7 +9,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import (
     JSON_TYPES,
 )
-from icrl4aht_data.utils.files import file_in_place_of
+from icrl4aht_data.utils.files import atomic_write
 
 
 def to_parquet(dataset: Dataset, path: Path) -> Path:
@@ -26,6 +26,6 @@ def to_parquet(dataset: Dataset, path: Path) -> Path:
     types = {float: pa.float64(), int: pa.int64(), str: pa.string(), bool: pa.bool_(), list: pa.list_(pa.int64())}
     columns = {name: next(types[kind] for kind in types if kind in kinds) for name, kinds in JSON_TYPES.items()}
     rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], pa.schema(list(columns.items())))
-    with file_in_place_of(path) as partial:
+    with atomic_write(path) as partial:
         pq.write_table(rows, partial)
     return path

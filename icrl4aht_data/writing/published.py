@@ -28,11 +28,11 @@ from icrl4aht_data.format.schema import (
     held_fields,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
-from icrl4aht_data.overcooked.fast_observe import paint
+from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_lines, write_json
-from icrl4aht_data.utils.paths import inside
-from icrl4aht_data.utils.validation import whole
+from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.validation import check_int
 from icrl4aht_data.writing.combine import Deferred
 from icrl4aht_data.writing.convert import HistoriesDone, _quiet
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -177,12 +177,12 @@ def from_published(
     """
     import h5py
 
-    kept_steps = whole("kept_steps", kept_steps, 1)
-    lines = _read_index(inside(source, HISTORIES_INDEX))
-    noted = inside(source, "provenance.json")
+    kept_steps = check_int("kept_steps", kept_steps, 1)
+    lines = _read_index(resolve_inside(source, HISTORIES_INDEX))
+    noted = resolve_inside(source, "provenance.json")
     provenance = read_provenance(noted) if noted.is_file() else {}
     done = iter(range(1, len(lines) + 1))
-    path = inside(source, HISTORIES_H5)
+    path = resolve_inside(source, HISTORIES_H5)
     with _errors_as(f"{path}: cannot be opened as HDF5"):
         file = h5py.File(path, "r")
 
@@ -222,7 +222,7 @@ def _tasks_of(groups: list[_Group], source: Path, path: Path | None, kind: Kind)
     by_task: dict[str, list[_Group]] = {}
     for group in groups:
         by_task.setdefault(group.line["task_id"], []).append(group)
-    found = path or inside(source, "tasks.jsonl")
+    found = path or resolve_inside(source, "tasks.jsonl")
     if found.is_file():
         known = {task.task_id: task for task in read_tasks(found)}
     elif kind == OBSERVATIONS and path is None:
@@ -315,7 +315,7 @@ class _Group:
             )
         if name == "state":
             obs = self.read("obs")
-            if not np.array_equal(obs, paint(self._layout, array, np.empty_like(obs))):
+            if not np.array_equal(obs, fast_observe(self._layout, array, np.empty_like(obs))):
                 raise PublishedFormatError(f"{self._where}: obs is not what state shows")
         return array
 

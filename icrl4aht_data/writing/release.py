@@ -37,7 +37,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.dataset_card import SOURCE_CARD, dataset_card
-from icrl4aht_data.writing.release_folder import folder_in_place_of
+from icrl4aht_data.writing.release_folder import atomic_folder
 from icrl4aht_data.writing.shard_writer import stored_bytes, write_shard
 from icrl4aht_data.writing.statistics import layout_statistics
 
@@ -132,7 +132,7 @@ def write_release(
             f"{len(named)} of {len(ids)} tasks, such as {named[0]!r}, are known by name only: give all tasks or, in a "
             f"release of {OBSERVATIONS}, none"
         )
-    with folder_in_place_of(target) as partial:
+    with atomic_folder(target) as partial:
         _fill(partial, kind, new, data_version, (card, source_card), kept_steps, (shard_histories, shard_bytes), done)
     return target
 

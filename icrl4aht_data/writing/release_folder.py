@@ -16,7 +16,7 @@ from icrl4aht_data.format.schema import (
 
 
 @contextmanager
-def folder_in_place_of(target: Path) -> Iterator[Path]:
+def atomic_folder(target: Path) -> Iterator[Path]:
     """A new folder to fill, which takes the place of the release at `target` when the block ends without an error.
 
     Raises:

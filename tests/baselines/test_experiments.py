@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from baselines import experiments
 from baselines.commands.cli import cli
 from baselines.evaluate.results import read_result
-from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, Plan, held_out_tasks, run_experiment
+from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, ExperimentPlan, held_out_tasks, run_experiment
 from baselines.methods.method import ModelOptions
 from baselines.report.episode_gifs import film_families
 from baselines.report.results import TEST_LAYOUTS, read_run
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 MODEL: dict[str, Any] = {"layers": 1, "width": 8, "heads": 2}
 TRAIN: dict[str, Any] = {"steps": 2, "batch_size": 2, "validation_batches": 1}
-SMALL = Plan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, films=False)
+SMALL = ExperimentPlan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, films=False)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def killed(what: str):
 
 
 @pytest.fixture(scope="module")
-def swept(release, tmp_path_factory) -> tuple[Path, Plan]:
+def swept(release, tmp_path_factory) -> tuple[Path, ExperimentPlan]:
     """Killed twice, then run to its end."""
     out = tmp_path_factory.mktemp("swept")
     plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
@@ -185,7 +185,7 @@ def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
         "episodes": 3,
     }
     rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
-    assert plan == Plan(**options, **rest)
+    assert plan == ExperimentPlan(**options, **rest)
     assert CliRunner().invoke(cli, ["tracks", *small], catch_exceptions=False).exit_code == 0
     assert (asked[1][0], asked[1][2]) == ("tracks", Path("runs/tracks"))
 

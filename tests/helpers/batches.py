@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.reading.sources import Cache
+from icrl4aht_data.reading.sources import CacheMode
 
-CACHES: tuple[Cache, ...] = ("ram", "mmap", "stream")
+CACHES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
 
 
 def samplers(dataset, **options):

@@ -15,7 +15,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import parse_manifest
 from icrl4aht_data.utils.cache import cached_arrays
-from icrl4aht_data.utils.files import file_in_place_of
+from icrl4aht_data.utils.files import atomic_write
 from tests.robustness.faults.here import small_files
 from tests.robustness.faults.scene import LostError, Scene
 from tests.robustness.faults.series import FAMILIES, main, run
@@ -95,7 +95,7 @@ def test_what_killed_builds_left_is_swept(tmp_path, monkeypatch):
 
 def test_an_error_of_the_disk_names_the_file(tmp_path):
     path = tmp_path / "notes.json"
-    with pytest.raises(OSError, match=r"notes\.json") as caught, small_files(100), file_in_place_of(path) as partial:
+    with pytest.raises(OSError, match=r"notes\.json") as caught, small_files(100), atomic_write(path) as partial:
         partial.write_bytes(bytes(200))
     assert caught.value.errno == errno.EFBIG
     assert not list(tmp_path.iterdir())

@@ -24,7 +24,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import parse_manifest
 from icrl4aht_data.remote.download import ORIGIN, repair
-from icrl4aht_data.utils.files import file_in_place_of, parse_json
+from icrl4aht_data.utils.files import atomic_write, parse_json
 from tests.helpers.paths import ROOT
 from tests.robustness.hostile_folders import CASES, TERABYTE
 from tests.robustness.hostile_published import PUBLISHED_CASES
@@ -147,7 +147,7 @@ def test_a_note_does_not_choose_a_protocol(damaged, url):
 def test_a_link_is_not_written_through(tmp_path):
     (tmp_path / "mine").write_text("mine")
     (tmp_path / ".file.partial").symlink_to(tmp_path / "mine")
-    with file_in_place_of(tmp_path / "file") as partial:
+    with atomic_write(tmp_path / "file") as partial:
         partial.write_text("new")
     assert ((tmp_path / "mine").read_text(), (tmp_path / "file").read_text()) == ("mine", "new")
 

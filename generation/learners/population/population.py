@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 from generation.env import Environment, EnvState
 from generation.learners.network import ActorCritic
 from generation.learners.ppo import PPO, PPOConfig, sequences
-from generation.learners.rollout import Player, Rollout, Seats, network_player, roll_out, take_seats
+from generation.learners.rollout import Player, Rollout, Seats, init_rollout, network_player, roll_out
 
 
 class Seating(NamedTuple):
@@ -165,7 +165,7 @@ class Population:
         channels = self.env.layout.channels
         seeds = jax.random.split(weights, self.seating.policies)
         params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
-        seats = take_seats(self.env, self._players(params), jax.random.split(tables, self.seating.tables))
+        seats = init_rollout(self.env, self._players(params), jax.random.split(tables, self.seating.tables))
         learning = jax.tree.map(lambda leaf: leaf[: self.seating.learning], params)
         return PopulationState(
             params=params,

@@ -17,7 +17,7 @@ from baselines.evaluate.drift import measure
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.methods.method import SIZES, ModelOptions
-from baselines.methods.registry import get_method, kitchen
+from baselines.methods.registry import get_method, overcooked_world
 from baselines.training.histories import HistoryOptions, prepare, read_trained
 from baselines.training.run_folder import Checkpoints, open_run, versions
 from baselines.training.trainer import TrainOptions
@@ -64,7 +64,7 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
 
 def test_drift_is_nothing_before_the_window_is_full_and_something_after(runs, monkeypatch):
     """With one layer there is none at all: what is kept of a step was computed of that step alone."""
-    kitchen_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), kitchen([WIDE[0].layout]))
+    kitchen_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
     params, found, protocol = drawn(kitchen_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
 
     def two_layers(method, params_of_run, context, tasks, asked):

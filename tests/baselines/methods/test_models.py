@@ -16,7 +16,7 @@ import pytest
 from baselines.agents.host import Percept
 from baselines.methods import attention
 from baselines.methods.method import Method, ModelOptions
-from baselines.methods.registry import get_method, kitchen
+from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import (
     Transition,
     plain_view,
@@ -59,11 +59,11 @@ def batch_for(method: Method, **options):
 class TestSizes:
     @pytest.mark.parametrize(("name", "parameters"), [("ad", 3_283_870), ("dpt", 3_285_022), ("hybrid_ad", 913_310)])
     def test_published_parameter_counts(self, name, parameters):
-        world = kitchen([get_layout("coord_simple")])
+        world = overcooked_world([get_layout("coord_simple")])
         assert sizes(get_method(name)(ModelOptions(), world)) == parameters
 
     def test_teammate_actions_add_one_table_or_one_hot(self):
-        world = kitchen([get_layout("coord_simple")])
+        world = overcooked_world([get_layout("coord_simple")])
         option = ModelOptions(teammate_actions=True)
         assert sizes(get_method("ad")(option, world)) == 3_283_870 + 6 * 64 + 64 * 256
         assert sizes(get_method("dpt")(option, world)) == 3_285_022 + 6 * 256
@@ -165,7 +165,7 @@ def test_attention_is_that_of_the_mask(monkeypatch):
 
     def ours(q, k, v):
         context = attention.causal(q[:, :7], k[:, :7], v[:, :7])
-        queries = attention.asked(q[:, 7:], k[:, 7:], v[:, 7:], k[:, :7], v[:, :7])
+        queries = attention.query_attention(q[:, 7:], k[:, 7:], v[:, 7:], k[:, :7], v[:, :7])
         return jnp.concatenate([context, queries], axis=1)
 
     def results(attend):
@@ -276,7 +276,7 @@ class TestKitchen:
     """On real batches."""
 
     def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite):
-        world = kitchen([get_layout("demo_wide")])
+        world = overcooked_world([get_layout("demo_wide")])
         options = dataclasses.replace(TINY, teammate_actions=False, next_obs=True, layers=1)
         data = {obs: load_icrl4aht(lite[0], layout="demo_wide", obs=obs) for obs in ("state", "float32")}
         for name in ("ad", "dpt"):

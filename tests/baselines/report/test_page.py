@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from baselines.commands.cli import cli
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from baselines.report import episode_gifs as watching
-from baselines.report.episode_gifs import Film, ego_of
+from baselines.report.episode_gifs import EpisodeGif, ego_of
 from baselines.report.model_card import write_model_cards
 from baselines.report.page import write_page, write_page_with_films
 from baselines.report.results import TEST_LAYOUTS, Run, Source, merge, read_published
@@ -72,7 +72,10 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
     (tmp_path / "a.gif").write_bytes(GIF)
     path = tmp_path / "r" / "report.html"
     runs = [run("AD", TEST_LAYOUTS), run("random", TEST_LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
-    films = [Film("H1", "H1 & an ego", tmp_path / "a.gif"), Film("rl", "no picture: <its run> is gone", None)]
+    films = [
+        EpisodeGif("H1", "H1 & an ego", tmp_path / "a.gif"),
+        EpisodeGif("rl", "no picture: <its run> is gone", None),
+    ]
     write_page(runs, path, films, ["left out: <nothing>"])
     text = path.read_text()
     page = Outside(text)

@@ -20,12 +20,12 @@ from generation.learners.rollout import (
     Player,
     Rollout,
     Seats,
+    init_rollout,
     network_player,
     policy_player,
     random_player,
     roll_out,
     seen_from,
-    take_seats,
 )
 from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
@@ -93,7 +93,7 @@ def play(players: list[Player], restart: Any = None) -> Played:
         seats, other = roll_out(ENV, players, middle, STEPS, jax.random.key(2), *more)
         return seats, jax.tree.map(lambda *parts: jnp.concatenate(parts), one, other)
 
-    start = take_seats(ENV, players, jax.random.split(jax.random.key(0), TABLES))
+    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), TABLES))
     seats, rollout = compiled(run)(start)
     return Played(start, seats, jax.tree.map(np.asarray, rollout))
 
@@ -202,7 +202,7 @@ def test_memories_restart_with_each_episode(played):
 def test_only_the_players_at_a_table_that_ended_begin_anew():
     """A table whose episode is two steps older than the others'."""
     players = [scripted(places) for places in PLACES]
-    start = take_seats(ENV, players, jax.random.split(jax.random.key(0), TABLES))
+    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), TABLES))
     start = start._replace(env=start.env._replace(clock=jnp.array([0, 0, 2, 0])))
     run = compiled(lambda seats: roll_out(ENV, players, seats, 4, jax.random.key(1)))
     seats, rollout = run(start)

@@ -68,7 +68,7 @@ def records(compiled_fast) -> jax.Array:
     """(T, episodes, S) of random agents."""
     env = diversity.Environment(LAYOUT, STEPS)
     players = [diversity.random_player(seat, 3) for seat in (0, 1)]
-    seats = diversity.take_seats(env, players, jax.random.split(jax.random.key(0), 3))
+    seats = diversity.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
     play = jax.jit(lambda seats: diversity.roll_out(env, players, seats, STEPS, jax.random.key(1))[1].record)
     return play(seats)
 

@@ -22,7 +22,7 @@ import pytest
 from generation.env import Environment
 from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
 from generation.learners.network import ActorCritic, Widths
-from generation.learners.rollout import network_player, policy_player, random_player, roll_out, take_seats
+from generation.learners.rollout import init_rollout, network_player, policy_player, random_player, roll_out
 from generation.policy import stacked
 from generation.populations import cross_play
 from generation.populations import train as suite
@@ -206,7 +206,7 @@ def test_every_result_plays_as_a_teammate_in_both_seats(trained):
 
         def play(params, seat=seat, policy=first):
             players = [policy_player(env, policy, params, seat, tables), random_player(1 - seat, tables)]
-            seats = take_seats(env, players, jax.random.split(jax.random.key(0), tables))
+            seats = init_rollout(env, players, jax.random.split(jax.random.key(0), tables))
             return roll_out(env, players, seats, 30, jax.random.key(1))[1].actions[..., seat]
 
         play, seen = jax.jit(play), set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icrl4aht_data.overcooked.fast_observe import paint
+from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns
@@ -17,7 +17,7 @@ from tests.helpers.random_play import play
 def test_paints_what_observe_shows(layout, dtype):
     states = play(layout, 40, 120, np.random.default_rng(1))["state"]
     out = np.full((len(states), *layout.obs_shape), 9, dtype)
-    assert paint(layout, states, out, threads=3) is out
+    assert fast_observe(layout, states, out, threads=3) is out
     np.testing.assert_array_equal(out, observe(layout, states, 0))
 
 
@@ -33,7 +33,7 @@ def test_paints_states_that_play_seldom_reaches(layout):
     states[:, where.pot_timers] %= 32
     states[:, where.recipe] = rng.choice(layout.recipe_items, 3000)
     out = np.empty((3000, *layout.obs_shape), np.uint8)
-    np.testing.assert_array_equal(paint(layout, states, out), observe(layout, states, 0))
+    np.testing.assert_array_equal(fast_observe(layout, states, out), observe(layout, states, 0))
 
 
 def test_records_that_the_rules_do_not_make_are_shown_as_observe_shows_them():
@@ -43,14 +43,14 @@ def test_records_that_the_rules_do_not_make_are_shown_as_observe_shows_them():
         wrong = states.copy()
         wrong[7, getattr(columns(layout), column)] = value
         out = np.empty((len(states), *layout.obs_shape), np.float32)
-        np.testing.assert_array_equal(paint(layout, wrong, out), observe(layout, wrong, 0), err_msg=column)
+        np.testing.assert_array_equal(fast_observe(layout, wrong, out), observe(layout, wrong, 0), err_msg=column)
 
 
 def test_shapes_and_empty_input():
     layout = get_layout("cramped_up")
     states = play(layout, 2, 6, np.random.default_rng(4))["state"].reshape(3, 4, -1)
-    out = paint(layout, states, np.empty((3, 4, *layout.obs_shape), np.uint8))
+    out = fast_observe(layout, states, np.empty((3, 4, *layout.obs_shape), np.uint8))
     np.testing.assert_array_equal(out, observe(layout, states, 0))
-    assert paint(layout, states[:0], np.empty((0, 4, *layout.obs_shape), np.uint8)).shape[0] == 0
+    assert fast_observe(layout, states[:0], np.empty((0, 4, *layout.obs_shape), np.uint8)).shape[0] == 0
     with pytest.raises(ValueError, match="C-contiguous"):
-        paint(layout, states, np.empty((4, 3, *layout.obs_shape), np.uint8).swapaxes(0, 1))
+        fast_observe(layout, states, np.empty((4, 3, *layout.obs_shape), np.uint8).swapaxes(0, 1))

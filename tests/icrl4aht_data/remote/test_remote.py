@@ -19,12 +19,12 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OfflineError, OptionError, RemoteError, RootNotFoundError, UnknownNameError
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download, repair
-from icrl4aht_data.remote.store import Patience, Store
+from icrl4aht_data.remote.store import RetryPolicy, Store
 from tests.helpers.batches import assert_equal
 from tests.robustness import bench_remote
 from tests.servers.common import Cut, http_server, hub_server
 
-HASTY = Patience(attempts=2, first=0.01)
+HASTY = RetryPolicy(attempts=2, first=0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +54,7 @@ def in_part(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize(("first", "told"), [(0.001, []), (2.0, ["2 s", "4 s"])])
 def test_a_long_wait_is_told(first, told, monkeypatch, caplog):
     monkeypatch.setattr("tenacity.nap.time.sleep", lambda seconds: None)
-    store = Store("https://nowhere.test/release", Patience(attempts=3, first=first))
+    store = Store("https://nowhere.test/release", RetryPolicy(attempts=3, first=first))
 
     def refuse():
         raise ConnectionError("no such host")
@@ -348,7 +348,7 @@ def test_command(lite, tmp_path, monkeypatch):
     ],
 )
 def test_bad_addresses(lite, url, error, message, monkeypatch):
-    monkeypatch.setattr("icrl4aht_data.remote.store.Patience", lambda: HASTY)
+    monkeypatch.setattr("icrl4aht_data.remote.store.RetryPolicy", lambda: HASTY)
     with http_server(lite[0]) as server, pytest.raises(error, match=message):
         load_icrl4aht(url.format(server=server.url))
 

@@ -30,7 +30,7 @@ from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.reading.selection import Options
+from icrl4aht_data.reading.selection import ReadOptions
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.partial_file import PartialFile
@@ -121,7 +121,7 @@ def full_cache(scene: Scene, n: int) -> Iterator[Try]:
         with scene.met() as to:
             disk = small_disk(to.parent, 64 * 2**20) if mounted else small_files(size)
             index = read_index(open_root(target.url, None, PATIENCE))
-            dataset = Dataset(index, np.arange(len(index.entries)), Options("uint8", "stream", 1), Shards(index))
+            dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
             for history in dataset:
                 history.read("dones", 0, 1)  # brings the chunk table
             began = len(target.log)

@@ -20,12 +20,12 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.schema import MANIFEST, held_fields
-from icrl4aht_data.reading.selection import Options
+from icrl4aht_data.reading.selection import ReadOptions
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.remote import partial_file as blocks
 from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
-from icrl4aht_data.remote.store import Patience
+from icrl4aht_data.remote.store import RetryPolicy
 from tests.helpers.random_play import random_release
 from tests.servers.common import Fault, Faults, Flip, Long, Request, Short
 from tests.servers.process import environment
@@ -33,7 +33,7 @@ from tests.servers.process import environment
 PIECE = 2**14
 """Bytes asked for at once, so that the files of a small release come in many parts."""
 
-PATIENCE = Patience(attempts=4, first=0.01, longest=5)
+PATIENCE = RetryPolicy(attempts=4, first=0.01, longest=5)
 
 Try = Callable[[], str | None]
 """Meets one fault. Raises if something is lost; may say what was odd, which is counted."""
@@ -138,7 +138,7 @@ class Scene:
     def stream(self, url: str, to: Path | None) -> None:
         """A few batches, the right ones; what comes goes to the default folder."""
         index = read_index(open_root(url, None, PATIENCE))
-        dataset = Dataset(index, np.arange(len(index.entries)), Options("uint8", "stream", 1), Shards(index))
+        dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
         check(batches(dataset) == self.batches, "other batches than those of the release")
 
     def check_arrived(self, folder: Path, everything: bool = False) -> None:
