@@ -15,15 +15,18 @@ from click.testing import CliRunner
 from generation.cli import cli
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.published import from_published, to_published
+from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_play import random_release
 from tests.helpers.tiny import PAIR, TINY
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled_once(tmp_path_factory) -> None:
-    """What one test compiles, the next takes from a cache of this run."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+def compilation_cache() -> None:
+    """Keep compiled programs on disk for other workers and later runs; a size limit makes JAX lock the folder."""
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_compilation_cache_max_size", 2 * 2**30)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
