@@ -29,7 +29,7 @@ from icrl4aht_data.writing.dataset_card import (
     LAYOUTS,
     PROTOCOL,
     SOURCE_CARD,
-    TWIN,
+    PARQUET_INDEX,
     dataset_card,
     evaluated_on,
 )
@@ -145,7 +145,7 @@ def _is_made_here(name: str) -> bool:
     """Whether a file is one that building makes anew."""
     top, _, rest = name.partition("/")
     is_teammates_card = top == TEAMMATES and rest.endswith(f"/{CARD}")
-    return name in (CARD, CROISSANT, *_COPIED_TEXTS) or top in ("figures", TWIN) or is_teammates_card
+    return name in (CARD, CROISSANT, *_COPIED_TEXTS) or top in ("figures", PARQUET_INDEX) or is_teammates_card
 
 
 def _take(source: Path, target: Path, link: bool) -> None:
@@ -173,9 +173,9 @@ def _add_pictures_and_twin(dataset: Dataset, root: Path) -> None:
     plot_headroom(read_headroom(PROTOCOL), tested, root / HEADROOM)
     for layout in dataset.layouts:
         of_layout = dataset.filter(layout=layout.name)
-        (root / TWIN / layout.name).mkdir(parents=True)
+        (root / PARQUET_INDEX / layout.name).mkdir(parents=True)
         for split in {entry.split for entry in of_layout.entries}:
-            to_parquet(of_layout.filter(split=split), root / TWIN / layout.name / f"{split}.parquet")
+            to_parquet(of_layout.filter(split=split), root / PARQUET_INDEX / layout.name / f"{split}.parquet")
 
 
 def _check_same(source: Path, root: Path, kept: dict[str, str]) -> None:

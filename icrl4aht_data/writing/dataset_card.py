@@ -38,7 +38,7 @@ PROTOCOL = "published"
 CURVES, LAYOUTS, HEADROOM = (f"figures/{name}.png" for name in ("learning_curves", "layouts", "headroom"))
 """Pictures, which a published release has."""
 
-TWIN = "index"
+PARQUET_INDEX = "index"
 """The folder of the index as Parquet files, `index/<layout>/<split>.parquet`, which a published release has."""
 
 SOURCE_CARD = "meta/source_card.md"
@@ -106,7 +106,7 @@ def _card(release: _Release) -> str:
         facts=_bullets(_facts(release)),
         layout=release.layouts[0].name,
         length=str(min(500, *(entry.T for entry in release.entries))),
-        viewer=" The dataset viewer shows the index, a row a history." if release.has(TWIN) else "",
+        viewer=" The dataset viewer shows the index, a row a history." if release.has(PARQUET_INDEX) else "",
         limits=_bullets(_limits(release)),
         statistics=markdown_table(["property", *statistics], statistics_rows(statistics), right=len(statistics)),
         curves=_picture(release, CURVES, "Learning curves") + _curves(release),
@@ -117,7 +117,7 @@ def _card(release: _Release) -> str:
         + headroom_table(read_headroom(PROTOCOL), evaluated_on(info["layouts"])),
         splits=_splits(release),
         fields=_fields(release),
-        twin=f" and `{TWIN}/<layout>/<split>.parquet`" if release.has(TWIN) else "",
+        twin=f" and `{PARQUET_INDEX}/<layout>/<split>.parquet`" if release.has(PARQUET_INDEX) else "",
         columns=markdown_table(["field", "what"], [[f"`{name}`", text] for name, text in ENTRY_TEXTS.items()]),
         provenance=_bullets(_provenance(release)),
         citation=card_file("citation.bib").read_text(encoding="utf-8").strip(),
@@ -144,7 +144,7 @@ def evaluated_on(layouts: Iterable[str]) -> list[str]:
 
 def _configs(release: _Release) -> str:
     """YAML: what the Hub's viewer shows, all histories by default or those of one layout."""
-    if not release.has(TWIN):
+    if not release.has(PARQUET_INDEX):
         return ""
     lines = ["configs:", *_config("default", "*", _in_order(e.split for e in release.entries)), "  default: true"]
     for layout in release.info["layouts"]:
@@ -154,7 +154,7 @@ def _configs(release: _Release) -> str:
 
 
 def _config(name: str, folder: str, splits: list[str]) -> list[str]:
-    files = [(f"  - split: {split}", f"    path: {TWIN}/{folder}/{split}.parquet") for split in splits]
+    files = [(f"  - split: {split}", f"    path: {PARQUET_INDEX}/{folder}/{split}.parquet") for split in splits]
     return [f"- config_name: {name}", "  data_files:", *(line for pair in files for line in pair)]
 
 
