@@ -61,7 +61,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     except ImportError as error:
         raise OptionError("croissant.json needs mlcroissant: pip install 'icrl4aht-data[hf]'") from error
     info = read_info(root)
-    arrays = "; ".join(f"{name}: {ARRAY_TEXTS[name]}" for name, f in FIELDS.items() if info["kind"] not in f.absent)
+    arrays = "; ".join(f"{name}: {ARRAY_TEXTS[name]}" for name, f in FIELDS.items() if info.kind not in f.absent)
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
     with warnings.catch_warnings():
@@ -100,11 +100,11 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             name="icrl4aht_learning_histories",
             description=(
                 "Learning histories of ego agents that learn to cook in OvercookedV2 with one fixed teammate each, "
-                f"for in-context reinforcement learning in ad-hoc teamwork: {info['histories']:,} histories, "
-                f"{info['transitions']:,} transitions, layouts {', '.join(info['layouts'])}. "
+                f"for in-context reinforcement learning in ad-hoc teamwork: {info.histories:,} histories, "
+                f"{info.transitions:,} transitions, layouts {', '.join(info.layouts)}. "
                 f"The shards are HDF5: {arrays}."
             ),
-            version=info["data_version"],
+            version=info.data_version,
             date_published=datetime.datetime.combine(published, datetime.time.min),
             license=[_LICENCE],
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
