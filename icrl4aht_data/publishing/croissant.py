@@ -16,8 +16,8 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
 from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.dataset_card import PARQUET_INDEX
-from icrl4aht_data.writing.field_descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 
 if TYPE_CHECKING:
     import mlcroissant
@@ -61,7 +61,8 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     except ImportError as error:
         raise OptionError("croissant.json needs mlcroissant: pip install 'icrl4aht-data[hf]'") from error
     info = read_info(root)
-    arrays = "; ".join(f"{name}: {ARRAY_TEXTS[name]}" for name, f in FIELDS.items() if info.kind not in f.absent)
+    texts = card_texts("arrays")
+    arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
     with warnings.catch_warnings():
@@ -124,7 +125,7 @@ def _field(context: mlcroissant.Context, name: str, types: set[type]) -> mlcrois
         ctx=context,
         id=f"histories/{name}",
         name=name,
-        description=ENTRY_TEXTS[name],
+        description=card_texts("index")[name],
         data_types=[getattr(mlc.DataType, _TYPES[kind])],
         is_array=True if kind is list else None,
         array_shape="3" if kind is list else None,

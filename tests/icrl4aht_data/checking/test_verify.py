@@ -21,12 +21,12 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_play import SHARD, make_tasks, play, random_release
 
 
-def problems(root, deep=False):
-    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, deep=deep).findings]
+def problems(root, level="full"):
+    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
 def test_a_whole_release(either):
-    report = verify_release(either[0], deep=True)
+    report = verify_release(either[0], level="deep")
     assert report.ok
     assert (report.histories, report.transitions) == (12, 1440)
     assert report.files == 9
@@ -106,7 +106,7 @@ def test_values_out_of_range(tmp_path, spoil, message):
 
 
 def test_an_untouched_rewrite_is_whole(tmp_path):
-    assert problems(rewritten(tmp_path, lambda arrays: arrays), deep=True) == []
+    assert problems(rewritten(tmp_path, lambda arrays: arrays), level="deep") == []
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_an_untouched_rewrite_is_whole(tmp_path):
 def test_physics_that_cannot_have_happened_is_found_by_deep(tmp_path, spoil, message):
     root = rewritten(tmp_path, spoil)
     assert problems(root) == [], "only --deep looks at the physics"
-    found = problems(root, deep=True)
+    found = problems(root, level="deep")
     assert any(message in line for line in found), found
 
 
@@ -143,7 +143,7 @@ def test_observations_that_the_state_does_not_show(tmp_path, monkeypatch):
     monkeypatch.setattr(release, "observe", wrong)
     root = rewritten(tmp_path, lambda arrays: arrays, kind="full")
     assert problems(root) == []
-    assert any("obs: 1 steps differ from what their state shows, first step 17" in p for p in problems(root, deep=True))
+    assert any("obs: 1 steps differ from what their state shows, first step 17" in p for p in problems(root, level="deep"))
 
 
 def test_index_that_disagrees_with_the_rewards_or_the_tasks(damaged):
@@ -199,7 +199,7 @@ def foreign(lines):
     ("change", "message"),
     [
         (swap, "line 1: history_id 1: ids count up from 0, expected 0"),
-        (twice, "history 1: stream 0 of its task stands twice"),
+        (twice, "history 1: stream 0 of its task appears twice"),
         (foreign, "line 1: obs_shape"),
         (lambda lines: lines[0].update(split="test"), "line 1: shard"),
         (lambda lines: lines[0].update(split="validation"), "unknown split 'validation'"),
@@ -227,7 +227,7 @@ def test_equal_histories_of_a_task(tmp_path):
     arrays = play(task.layout, 6, 20, np.random.default_rng(5))
     new = NewTask(task, Provenance(), 2, lambda: [NewHistory(k, arrays) for k in range(2)])
     write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
-    assert problems(tmp_path / "r")[0].endswith("history 1: the same as history 0")
+    assert problems(tmp_path / "r")[0].endswith("history 1: has the content of history 0")
 
 
 def test_other_episode_lengths_than_stated(damaged):
@@ -267,15 +267,15 @@ def test_no_damage_makes_verify_raise(damaged):
             flips.append(bytes(data))
         for data in [*flips, *hostile, whole[: len(whole) // 2]]:
             path.write_bytes(data)
-            assert not verify_release(damaged, deep=True).ok, path
+            assert not verify_release(damaged, level="deep").ok, path
             if path.name != "MANIFEST.sha256":  # the hashes of a liar hold
                 write_manifest(damaged)
-                verify_release(damaged, deep=True)
+                verify_release(damaged, level="deep")
                 (damaged / "MANIFEST.sha256").unlink()
                 write_manifest(damaged)
         path.write_bytes(whole)
         write_manifest(damaged)
-    assert verify_release(damaged, deep=True).ok
+    assert verify_release(damaged, level="deep").ok
 
 
 @pytest.mark.parametrize(
@@ -313,14 +313,14 @@ def test_a_group_where_a_dataset_should_be(damaged):
 @pytest.mark.parametrize("column", [0, 2])
 def test_impossible_states_under_deep(tmp_path, column):
     root = rewritten(tmp_path, at("state", (7, column), 255))
-    assert problems(root, deep=True)
+    assert problems(root, level="deep")
 
 
 class TestCommand:
     def test_whole(self, lite):
         result = CliRunner().invoke(cli, ["verify", "--deep", str(lite[0])])
         assert result.exit_code == 0
-        assert "whole; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in result.output
+        assert "valid; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in result.output
 
     def test_damaged(self, damaged):
         path = damaged / SHARD

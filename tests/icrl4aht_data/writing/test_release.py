@@ -97,7 +97,7 @@ def test_any_release_round_trips_and_verifies(tmp_path, layout, episodes, length
         seed=seed,
         shard_histories=shard_histories,
     )
-    report = verify_release(root, deep=True)
+    report = verify_release(root, level="deep")
     assert report.ok, report.findings
     assert report.transitions == 3 * episodes * length
     dataset = load_icrl4aht(root)
@@ -160,7 +160,7 @@ def odd(arrays):
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
-    [(lossy, "values that int8 cannot hold"), (short, "rows, expected"), (bare, "lacks the arrays"), (odd, "10 steps")],
+    [(lossy, "values that int8 cannot hold"), (short, "rows, expected"), (bare, "has no arrays"), (odd, "10 steps")],
 )
 def test_arrays_that_do_not_fit_are_refused_and_nothing_remains(tmp_path, spoil, message):
     (task,) = make_tasks(["cramped_up"])
