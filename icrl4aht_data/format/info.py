@@ -144,7 +144,10 @@ class ReleaseInfo:
             info = msgspec.convert(content, cls)
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
-        check_name(info.data_version)
+        try:
+            check_name(info.data_version)
+        except IndexFormatError as error:
+            raise IndexFormatError(f"data_version: {error}") from error
         if len(content["environment"]) != 2:
             raise IndexFormatError("environment: expected max_steps and kept_steps only")
         return info

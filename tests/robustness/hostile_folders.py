@@ -335,7 +335,7 @@ case(
     "info: version for a terminal", "data_version", json_file(INFO, lambda value: value.update(data_version="\x1b[2J"))
 )
 case("index: one endless line", "a line has more than", replaced(HISTORIES, content(b"a" * 2**24)))
-case("index: wide names", "printable characters", lines(many_names))
+case("index: wide names", "Expected `str` of length <= 512", lines(many_names))
 case("index: a surrogate", "line 1: ", entry(task_id="\ud800"))
 case("index: not a number", "line 1: JSON is malformed", entry(score=float("nan")))
 case("index: infinite", "Expected `float` <", entry(return_end=1e308))

@@ -90,7 +90,7 @@ PUBLISHED_CASES |= {
     "group above": (row(h5_group="../0"), "missing"),
     "group by a circle": (inside_h5(lambda file, out: file["0"].__setitem__("a", file["0"])), "lite"),
     "env_idx of 100 digits": (row(env_idx=10**100), "Expected `int` <="),
-    "rows below zero": (row(T=-5), "expected numbers of shape"),
+    "rows below zero": (row(T=-5), "Expected `int` >= 1"),
     "task id of surrogates": (row(task_id="\ud800"), "printable"),
     "one endless line": (replaced("histories_index.jsonl", content(b"a" * 2**24)), "expected at most"),
     "provenance: a list": (replaced("provenance.json", content("[]")), "an object of objects"),
