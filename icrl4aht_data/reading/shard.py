@@ -19,7 +19,14 @@ from icrl4aht_data.errors import (
     ShardMissingError,
     ShardTruncatedError,
 )
-from icrl4aht_data.format.chunks import BETWEEN, DEFLATE_RATIO, chunk_places, chunk_table_name, decode_chunk, read_table
+from icrl4aht_data.format.chunks import (
+    BETWEEN,
+    DEFLATE_RATIO,
+    chunk_locations,
+    chunk_table_name,
+    decode_chunk,
+    read_table,
+)
 from icrl4aht_data.format.schema import FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
@@ -311,7 +318,7 @@ class Shard:
                         f"{dataset.name}: expected {shape} of {element}, found {dataset.shape} of {dataset.dtype}"
                     )
             if not faults:
-                places += chunk_places(file, self.kind, entry)
+                places += chunk_locations(file, self.kind, entry)
         table = list(zip(*(self._table[name].tolist() for name in ("offset", "size", "rows")), strict=True))
         wrong = [row for row, (a, b) in enumerate(zip(places, table, strict=False)) if a != b]
         if wrong and not faults:

@@ -11,6 +11,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -267,5 +268,6 @@ class _ShardWriter:
             rows[shape] += 1
             group, history_id = f"/{list(rows).index(shape)}", len(self.entries) + number
             row = row if stacked else None
-            placed.append(replace(entry, shard=shard, history_id=history_id, h5_group=group, h5_row=row))
+            position = {"shard": shard, "history_id": history_id, "h5_group": group, "h5_row": row}
+            placed.append(msgspec.structs.replace(entry, **position))
         return placed

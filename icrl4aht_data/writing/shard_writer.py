@@ -11,11 +11,10 @@ import h5py
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.chunks import BETWEEN, chunk_places, chunk_table_path
+from icrl4aht_data.format.chunks import BETWEEN, DEFLATE_LEVEL, chunk_locations, chunk_table_path, encode_chunk
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
-_DEFLATE_LEVEL = 8
 _BLOCK = 2000  # steps: one chunk of scalars, two of records
 
 
@@ -63,7 +62,7 @@ def write_shard(
             checksums += [zlib.crc32(chunk.data) for chunk in chunks]
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = checksums
-        places = [place for entry in entries for place in chunk_places(file, kind, entry)]
+        places = [place for entry in entries for place in chunk_locations(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
     np.save(table_path, np.concatenate([table, _metadata_lines(path, table)]), allow_pickle=False)
 
@@ -99,7 +98,7 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
             dtype=element,
             shuffle=element.itemsize > 1,
             compression="gzip",
-            compression_opts=_DEFLATE_LEVEL,
+            compression_opts=DEFLATE_LEVEL,
         )
 
 
@@ -141,20 +140,3 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
             data = encode_chunk(stored[start : start + length], length, element.itemsize)
             chunks.append(EncodedChunk(field, start, data))
     return chunks
-
-
-def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
-    """Return what HDF5's shuffle and deflate filters make of a chunk.
-
-    Args:
-        rows: its rows.
-        length: rows of a full chunk; missing ones are zero.
-        itemsize: bytes of a row.
-    """
-    raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
-    if itemsize > 1:
-        raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
-    # Actions are drawn at random: short matches among them cost more bytes than they save.
-    strategy = zlib.Z_FILTERED if rows.ndim == 1 else zlib.Z_DEFAULT_STRATEGY
-    deflater = zlib.compressobj(_DEFLATE_LEVEL, strategy=strategy)
-    return deflater.compress(raw) + deflater.flush()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
@@ -113,4 +114,4 @@ def long_index(root: Path, lines: int = 3000) -> list[Entry]:
         json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
     )
     (root / "meta" / "histories.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))
-    return [Entry.from_json(line) for line in made]
+    return [msgspec.convert(line, Entry) for line in made]

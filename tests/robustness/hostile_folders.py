@@ -307,11 +307,11 @@ case("checkpoint by its path, surrogate", "expected a path within", theta(checkp
 
 # Sizes
 
-case("rows: 2**62", "expected less than", entry(T=2**62))
+case("rows: 2**62", "Expected `int` <=", entry(T=2**62))
 case("rows: 2**39", "the index implies", entry(T=2**39))
-case("episodes: 2**62", "episodes in", entry(episodes=2**62))
-case("env_idx: 2**70", "at most 64 bits", entry(env_idx=2**70))
-case("seed: 4,000 digits", "at most 64 bits", entry(seed=10**4000))
+case("episodes: 2**62", "Expected `int` <=", entry(episodes=2**62))
+case("env_idx: 2**70", "Expected `int` <=", entry(env_idx=2**70))
+case("seed: 4,000 digits", "Expected `int` <=", entry(seed=10**4000))
 case("info: histories 2**62", "histories", json_file(INFO, lambda value: value.update(histories=2**62)))
 case(
     "info: steps 2**200",
@@ -335,10 +335,10 @@ case(
     "info: version for a terminal", "data_version", json_file(INFO, lambda value: value.update(data_version="\x1b[2J"))
 )
 case("index: one endless line", "a line has more than", replaced(HISTORIES, content(b"a" * 2**24)))
-case("index: wide names", "printable characters", lines(many_names))
-case("index: a surrogate", "printable characters", entry(task_id="\ud800"))
-case("index: not a number", "expected a number below", entry(score=float("nan")))
-case("index: infinite", "expected a number below", entry(return_end=1e308))
+case("index: wide names", "Expected `str` of length <= 512", lines(many_names))
+case("index: a surrogate", "line 1: ", entry(task_id="\ud800"))
+case("index: not a number", "line 1: JSON is malformed", entry(score=float("nan")))
+case("index: infinite", "Expected `float` <", entry(return_end=1e308))
 case("index: many sets of shards", "implies this shard", many_sets)
 case("tasks: one endless line", "expected at most", replaced(TASKS, content(b"a" * 2**24)))
 case(

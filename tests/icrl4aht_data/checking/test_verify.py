@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from icrl4aht_data import verify_release
 from icrl4aht_data.benchmark.tasks import make_task
+from icrl4aht_data.checking.report import Level
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
@@ -21,7 +22,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_play import SHARD, make_tasks, play, random_release
 
 
-def problems(root, level="full"):
+def problems(root, level: Level = "full"):
     return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
@@ -257,7 +258,7 @@ def test_no_damage_makes_verify_raise(damaged, flips, texts):
     hostile = [b'{"format_version": ' + b"9" * 5000 + b"}", b"[" * 5000, b"", b"[]", b"{}", b"null", b"\xff\xfe"]
     for path in sorted(p for p in damaged.rglob("*") if p.is_file()):
         content = path.read_bytes()
-        spoiled = [flipped(content, rng.integers(len(content)), rng) for _ in range(flips)]
+        spoiled = [flipped(content, int(rng.integers(len(content))), rng) for _ in range(flips)]
         for data in [*spoiled, *hostile[:texts], content[: len(content) // 2]]:
             path.write_bytes(data)
             assert not verify_release(damaged, level="deep").ok, path
