@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.dataset_card import PARQUET_INDEX
@@ -34,7 +34,8 @@ _FORMATS = {
     ".parquet": "application/x-parquet",
     ".safetensors": "application/vnd.safetensors",
 }
-_TYPES = {str: "TEXT", bool: "BOOL", float: "FLOAT", int: "INTEGER", list: "INTEGER"}
+_SHAPE = tuple[int, int, int]
+_TYPES = {str: "TEXT", bool: "BOOL", float: "FLOAT", int: "INTEGER", int | None: "INTEGER", _SHAPE: "INTEGER"}
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",
@@ -93,7 +94,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             name="histories",
             description="One record per learning history: what it is, and where its arrays are stored.",
             key=["histories/history_id"],
-            fields=[_field(context, name, types) for name, types in JSON_TYPES.items()],
+            fields=[_field(context, name, hint) for name, hint in ENTRY_HINTS.items()],
         )
         return mlc.Metadata(
             ctx=context,
@@ -116,18 +117,17 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         ).to_json()
 
 
-def _field(context: mlcroissant.Context, name: str, types: set[type]) -> mlcroissant.Field:
+def _field(context: mlcroissant.Context, name: str, hint: Any) -> mlcroissant.Field:
     """Return the description of one column of the Parquet index."""
     import mlcroissant as mlc
 
-    kind = next(kind for kind in _TYPES if kind in types)
     return mlc.Field(
         ctx=context,
         id=f"histories/{name}",
         name=name,
         description=card_texts("index")[name],
-        data_types=[getattr(mlc.DataType, _TYPES[kind])],
-        is_array=True if kind is list else None,
-        array_shape="3" if kind is list else None,
+        data_types=[getattr(mlc.DataType, _TYPES[hint])],
+        is_array=True if hint == _SHAPE else None,
+        array_shape="3" if hint == _SHAPE else None,
         source=mlc.Source(ctx=context, file_set=PARQUET_INDEX, extract=mlc.Extract(ctx=context, column=name)),
     )

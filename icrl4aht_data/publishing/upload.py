@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -37,24 +37,24 @@ class Upload:
     Args:
         repo: ORG/REPO.
         tag: the data version's tag.
+        url: address of the repository's page.
+        files: path -> bytes, of the complete release.
         done: "already there" if the tag has this content; otherwise "uploaded", or "nothing" in a dry run.
         creates: whether the repository is new.
         private: whether a private repository was requested.
-        files: path -> bytes, of the complete release.
         deletes: files of another version, which are removed from the repository.
         commit: the tagged commit; None in a dry run.
-        url: address of the repository's page.
     """
 
     repo: str
     tag: str
-    done: Literal["already there", "uploaded", "nothing"]
-    creates: bool
-    private: bool
-    files: dict[str, int]
-    deletes: list[str]
-    commit: str | None
     url: str
+    files: dict[str, int]
+    done: Literal["already there", "uploaded", "nothing"] = "nothing"
+    creates: bool = False
+    private: bool = False
+    deletes: list[str] = field(default_factory=list)
+    commit: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self) | {"bytes": sum(self.files.values())}
@@ -106,7 +106,9 @@ def upload_release(
     tag = f"v{read_info(folder).data_version}"
     api = HfApi()
     with _wrap_hub_errors(repo, api.endpoint), _progress_bars(show):
-        return _Uploader(api, folder, repo, tag, files).run(private, dry_run)
+        sizes = {name: files[name].size for name in sorted(files)}
+        plan = Upload(repo, tag, f"{api.endpoint}/datasets/{repo}", sizes)
+        return _Uploader(api, folder, repo, tag, files).run(plan, private, dry_run)
 
 
 @dataclass
@@ -119,7 +121,7 @@ class _Uploader:
     tag: str
     files: Mapping[str, _File]
 
-    def run(self, private: bool, dry_run: bool) -> Upload:
+    def run(self, plan: Upload, private: bool, dry_run: bool) -> Upload:
         tags = self._tags()
         if tags is not None and self.tag in tags:
             differences = self._differences(self._tree(tags[self.tag]))
@@ -128,12 +130,13 @@ class _Uploader:
                     f"{self.repo}: tag {self.tag} has other content: {_some(differences)}; tags do not move: give the "
                     "data another data version"
                 )
-            return self._upload("already there", commit=tags[self.tag])
+            return replace(plan, done="already there", commit=tags[self.tag])
         if private and tags is not None and not self.api.repo_info(self.repo, repo_type=_KIND).private:
             raise UploadError(f"{self.repo}: is public; make it private in its settings, or give another repository")
         foreign = [] if tags is None else self._foreign()
+        plan = replace(plan, creates=tags is None, private=private, deletes=foreign)
         if dry_run:
-            return self._upload("nothing", creates=tags is None, private=private, deletes=foreign)
+            return plan
         if tags is None:
             self.api.create_repo(self.repo, repo_type=_KIND, private=private, exist_ok=True)
         self.api.upload_folder(
@@ -151,20 +154,7 @@ class _Uploader:
                 "not tagged; run the same command again"
             )
         self.api.create_tag(self.repo, tag=self.tag, revision=commit, repo_type=_KIND)
-        return self._upload("uploaded", creates=tags is None, private=private, deletes=foreign, commit=commit)
-
-    def _upload(
-        self,
-        done: Literal["already there", "uploaded", "nothing"],
-        *,
-        creates: bool = False,
-        private: bool = False,
-        deletes: list[str] | None = None,
-        commit: str | None = None,
-    ) -> Upload:
-        sizes = {name: self.files[name].size for name in sorted(self.files)}
-        url = f"{self.api.endpoint}/datasets/{self.repo}"
-        return Upload(self.repo, self.tag, done, creates, private, sizes, deletes or [], commit, url)
+        return replace(plan, done="uploaded", commit=commit)
 
     def _tags(self) -> dict[str, str] | None:
         """Return tag -> commit; None if there is no such repository."""

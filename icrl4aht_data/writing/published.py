@@ -29,6 +29,7 @@ from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.safe_hdf5 import exists, member, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
+    ENTRY_HINTS,
     FIELDS,
     OBSERVATIONS,
     PROVENANCE,
@@ -53,22 +54,7 @@ HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
 
-PUBLISHED_FIELDS = (
-    "history_id",
-    "task_id",
-    "env_idx",
-    "T",
-    "obs_shape",
-    "action_dim",
-    "track",
-    "split",
-    "layout",
-    "teammate_family",
-    "teammate_kind",
-    "h5_group",
-    "has_teammate_actions",
-    "has_expert_actions",
-)
+PUBLISHED_FIELDS = tuple(ENTRY_HINTS)[:14]
 """Fields of an index line (paper, App. D.3)."""
 
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)

@@ -25,7 +25,7 @@ from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
 from icrl4aht_data.utils.templates import card_file, fill
@@ -294,7 +294,7 @@ def test_layouts_of_the_evaluation():
 
 def test_every_field_is_described():
     assert list(card_texts("arrays")) == list(FIELDS)
-    assert list(card_texts("index")) == list(JSON_TYPES)
+    assert list(card_texts("index")) == list(ENTRY_HINTS)
 
 
 def test_learned_teammates_have_cards(with_learned, tmp_path):
