@@ -61,41 +61,12 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         import mlcroissant as mlc
     except ImportError as error:
         raise OptionError("croissant.json needs mlcroissant: pip install 'icrl4aht-data[hf]'") from error
-    info = read_info(root)
-    texts = card_texts("arrays")
+    info, texts = read_info(root), card_texts("arrays")
     arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # raised by libraries that mlcroissant is built on
-        files = [
-            mlc.FileObject(
-                ctx=context,
-                id=name,
-                name=name,
-                content_url=name,
-                content_size=f"{(root / name).stat().st_size} B",
-                encoding_formats=[_FORMATS.get(Path(name).suffix, "text/plain")],
-                sha256=digests[name],
-            )
-            for name in sorted(digests)
-        ]
-        index = mlc.FileSet(
-            ctx=context,
-            id=PARQUET_INDEX,
-            name=PARQUET_INDEX,
-            description="The index, one row per history, in one file for each layout and split.",
-            encoding_formats=[_FORMATS[".parquet"]],
-            includes=[f"{PARQUET_INDEX}/*/*.parquet"],
-        )
-        records = mlc.RecordSet(
-            ctx=context,
-            id="histories",
-            name="histories",
-            description="One record per learning history: what it is, and where its arrays are stored.",
-            key=["histories/history_id"],
-            fields=[_field(context, name, hint) for name, hint in ENTRY_HINTS.items()],
-        )
         return mlc.Metadata(
             ctx=context,
             conforms_to=[_STANDARD],
@@ -112,22 +83,63 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
             creators=[mlc.Organization(ctx=context, name="The icrl4aht-data authors")],
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
-            distribution=[*files, index],
-            record_sets=[records],
+            distribution=[*_files(context, root, digests), _parquet_index(context)],
+            record_sets=[_records(context)],
         ).to_json()
 
 
-def _field(context: mlcroissant.Context, name: str, hint: Any) -> mlcroissant.Field:
-    """Return the description of one column of the Parquet index."""
+def _files(context: mlcroissant.Context, root: Path, digests: Mapping[str, str]) -> list[mlcroissant.FileObject]:
     import mlcroissant as mlc
 
-    return mlc.Field(
+    return [
+        mlc.FileObject(
+            ctx=context,
+            id=name,
+            name=name,
+            content_url=name,
+            content_size=f"{(root / name).stat().st_size} B",
+            encoding_formats=[_FORMATS.get(Path(name).suffix, "text/plain")],
+            sha256=digests[name],
+        )
+        for name in sorted(digests)
+    ]
+
+
+def _parquet_index(context: mlcroissant.Context) -> mlcroissant.FileSet:
+    import mlcroissant as mlc
+
+    return mlc.FileSet(
         ctx=context,
-        id=f"histories/{name}",
-        name=name,
-        description=card_texts("index")[name],
-        data_types=[getattr(mlc.DataType, _TYPES[hint])],
-        is_array=True if hint == _SHAPE else None,
-        array_shape="3" if hint == _SHAPE else None,
-        source=mlc.Source(ctx=context, file_set=PARQUET_INDEX, extract=mlc.Extract(ctx=context, column=name)),
+        id=PARQUET_INDEX,
+        name=PARQUET_INDEX,
+        description="The index, one row per history, in one file for each layout and split.",
+        encoding_formats=[_FORMATS[".parquet"]],
+        includes=[f"{PARQUET_INDEX}/*/*.parquet"],
+    )
+
+
+def _records(context: mlcroissant.Context) -> mlcroissant.RecordSet:
+    """Return the record set of histories, with a field for each column of the Parquet index."""
+    import mlcroissant as mlc
+
+    columns = [
+        mlc.Field(
+            ctx=context,
+            id=f"histories/{name}",
+            name=name,
+            description=card_texts("index")[name],
+            data_types=[getattr(mlc.DataType, _TYPES[hint])],
+            is_array=True if hint == _SHAPE else None,
+            array_shape="3" if hint == _SHAPE else None,
+            source=mlc.Source(ctx=context, file_set=PARQUET_INDEX, extract=mlc.Extract(ctx=context, column=name)),
+        )
+        for name, hint in ENTRY_HINTS.items()
+    ]
+    return mlc.RecordSet(
+        ctx=context,
+        id="histories",
+        name="histories",
+        description="One record per learning history: what it is, and where its arrays are stored.",
+        key=["histories/history_id"],
+        fields=columns,
     )

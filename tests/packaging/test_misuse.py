@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -52,6 +51,7 @@ reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simpl
 reader: list --split tran | unknown split 'tran'; valid: train, test, heldout. Did you mean 'train'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, comedi
+reader: verify --deeep | No such option
 reader: verify --from x | --from is the source of a repair: give --repair with it
 reader: show --history -1 | -1 is not in the range x>=0
 reader: show --history 184 | this selection has no history [184], ids are within 0..183
@@ -196,10 +196,3 @@ def test_invalid_data_version_in_a_profile(tmp_path: Path, say):
     profile.write_text(smoke.replace('data_version = "0.0.1"', 'data_version = "new"'), encoding="utf-8")
     code, said = say("generation", "plan", "--profile", str(profile))
     assert (code, "mine.toml: data version 'new': expected one such as 1.0.0" in said) == (1, True)
-
-
-def test_verify_prints_json_for_a_damaged_release(damaged, say):
-    (damaged / "meta" / "tasks.jsonl").write_text("{")
-    code, said = say("reader", "verify", "--json", str(damaged))
-    assert code == 1
-    assert not json.loads(said)["ok"]
