@@ -36,7 +36,7 @@ DISK_BYTES = 64 * 2**20
 
 @pytest.fixture(scope="module")
 def outcomes(request, tmp_path_factory) -> dict[str, dict[str, Any]]:
-    """What came of the selected cases; a case that is missing ended the process or exceeded the time."""
+    """The outcomes of the selected cases; a missing case ended the process or exceeded the time."""
     names = [item.callspec.params["name"] for item in request.session.items if item.originalname == test_case.__name__]
     folder = tmp_path_factory.mktemp("hostile")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
@@ -113,7 +113,7 @@ def test_a_pipe_for_a_checkpoint(tmp_path):
 @pytest.mark.parametrize(
     "url", ["local:///etc", "reference://x", "simplecache::https://host/x", "memory://x", "git://x/y", "python://"]
 )
-def test_a_note_does_not_choose_a_protocol(damaged, url):
+def test_the_origin_file_does_not_choose_a_protocol(damaged, url):
     (damaged / ORIGIN).write_text(json.dumps({"url": url, "files": []}))
     with pytest.raises(OptionError, match="give --from"):
         repair(damaged, ["README.md"])
@@ -127,20 +127,20 @@ def test_a_link_is_not_written_through(tmp_path):
     assert ((tmp_path / "mine").read_text(), (tmp_path / "file").read_text()) == ("mine", "new")
 
 
-def test_names_are_no_markup(damaged):
+def test_names_are_not_read_as_markup(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
     result = CliRunner().invoke(cli, ["list", str(damaged)], catch_exceptions=False)
     assert "[/b][link=file:///]" in result.output
 
 
-def test_depth_of_json():
+def test_the_depth_of_json_is_limited():
     assert parse_json('{"a": [[1]]}') == {"a": [[1]]}
     with pytest.raises(IndexFormatError, match="levels deep"):
         parse_json("[" * 65 + "]" * 65)
 
 
-def test_names_that_windows_keeps(tmp_path):
+def test_reserved_names_of_windows(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
             parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")

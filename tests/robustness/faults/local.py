@@ -297,7 +297,7 @@ def bit_flips(workspace: Workspace, n: int) -> Iterator[Attempt]:
     def attempt(path: Path, position: int, bit: int) -> str | None:
         data = bytearray(path.read_bytes())
         data[position] ^= 1 << bit
-        with release.damaged(path, data):
+        with release.damaged(path, bytes(data)):
             return release.check()
 
     for number in range(n):
