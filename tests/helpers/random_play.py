@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.dataset import MINI
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.rules import step
@@ -89,7 +91,7 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
-        tasks.append(NewTask(task, {"seed": seed}, streams, lambda histories=histories: histories))
+        tasks.append(NewTask(task, Provenance(seed=seed), streams, lambda histories=histories: histories))
     write_release(
         root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
     )
@@ -112,4 +114,4 @@ def long_index(root: Path, lines: int = 3000) -> list[Entry]:
         json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
     )
     (root / "meta" / "histories.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))
-    return [Entry.from_json(line) for line in made]
+    return [msgspec.convert(line, Entry) for line in made]

@@ -150,8 +150,9 @@ class Workspace:
 
     def open_stream(self, url: str) -> Dataset:
         """Open a remote release for streaming through the default cache folder."""
-        index = read_index(open_root(url, None, RETRIES))
-        return Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+        origin = open_root(url, None, RETRIES)
+        index = read_index(origin.folder)
+        return Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(origin, index))
 
     def stream(self, url: str, to: Path | None) -> None:
         """Stream a few batches and check them."""
@@ -260,7 +261,7 @@ def hash_batches(dataset: Dataset) -> bytes:
 
 def hash_arrays(dataset: Dataset) -> bytes:
     """Return a hash of every stored array and of the observations."""
-    names = [stored.name for stored in held_fields(dataset.info["kind"])]
+    names = [stored.name for stored in held_fields(dataset.info.kind)]
     return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names)] for h in dataset))
 
 

@@ -163,10 +163,9 @@ add_hashed(
 
 # Numbers, sizes and text
 
-add_hashed("expected less than", {"rows: 2**62": entry(T=2**62)})
+_integers = {"T": 2**62, "episodes": 2**62, "env_idx": 2**70, "seed": 10**4000}
+add_hashed("Expected `int` <=", {f"index: large {name}": entry(**{name: value}) for name, value in _integers.items()})
 add_hashed("the index implies", {"rows: 2**39": entry(T=2**39)})
-add_hashed("episodes in", {"episodes: 2**62": entry(episodes=2**62)})
-add_hashed("at most 64 bits", {"env_idx: 2**70": entry(env_idx=2**70), "seed: 4,000 digits": entry(seed=10**4000)})
 add_hashed("at most 64 bits", {"tasks: seed of 4,000 digits": entry(TASKS, seed=10**4000)})
 add_hashed("histories", {"info: histories 2**62": info(histories=2**62)})
 _steps = json_file(INFO, lambda value: value["environment"].update(kept_steps=2**200))
@@ -183,10 +182,10 @@ add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = content(b"a" * 2**24)
 add_hashed("a line has more than", {"index: one endless line": replaced(HISTORIES, _endless_line)})
 add_hashed("expected at most", {"tasks: one endless line": replaced(TASKS, _endless_line)})
-_names = {"index: wide names": lines(many_names), "index: a surrogate": entry(task_id="\ud800")}
-add_hashed("printable characters", _names)
-_numbers = {"index: not a number": entry(score=float("nan")), "index: infinite": entry(return_end=1e308)}
-add_hashed("expected a number below", _numbers)
+add_hashed("printable characters", {"index: wide names": lines(many_names)})
+add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
+add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
+add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
 add_hashed("promises this shard", {"index: many sets of shards": many_sets_of_shards})
 _lists = json_file(PROVENANCE, lambda value: value.update({name: [] for name in value}))
 add_hashed(
@@ -271,7 +270,7 @@ add("published", "filters", {"a built-in filter that needs a library": hdf5(_lzf
 add("published", "not stored as|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published, _H5)})
 add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
 add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
-add("published", "64 bits", {"env_idx of 100 digits": entry(_INDEX, env_idx=10**100)})
+add("published", "Expected `int` <=", {"env_idx of 100 digits": entry(_INDEX, env_idx=10**100)})
 add("published", "printable", {"task id of surrogates": entry(_INDEX, task_id="\ud800")})
 add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
 add("published", "an object of objects", {"provenance: a list": replaced("provenance.json", content("[]"))})
