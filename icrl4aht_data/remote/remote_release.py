@@ -178,7 +178,7 @@ class Remote:
 
     @cached_property
     def _shard_sizes(self) -> dict[str, int]:
-        return read_info(self.folder)["shards"]
+        return read_info(self.folder).shards
 
     def size(self, name: str) -> int:
         """Bytes of a file: of a shard as the release's info says, of another file as the remote says."""

@@ -20,7 +20,15 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 _TRANSIENT_STATUS = {408, 425, 429, 500, 502, 503, 504}
-_PERMANENT = (FileNotFoundError, PermissionError, Icrl4ahtError, ImportError, NotImplementedError, MemoryError, TypeError)
+_PERMANENT = (
+    FileNotFoundError,
+    PermissionError,
+    Icrl4ahtError,
+    ImportError,
+    NotImplementedError,
+    MemoryError,
+    TypeError,
+)
 _TIMEOUT = 30  # seconds without a byte, or until a connection
 _TOTAL_TIMEOUT = 300  # seconds for one request, against a server that sends a byte now and then
 _LOGGED_WAIT = 2.0  # seconds between attempts from which on the wait is logged

@@ -18,7 +18,7 @@ ENDLESS = 2**40
 
 def download(url: str, out: Path) -> None:
     """All of a release, by one try of each request."""
-    fetch_planned(plan_download(url, to=out / "mirror", patience=transport.RetryPolicy(2, 0.01)))
+    fetch_planned(plan_download(url, to=out / "mirror", retry=transport.RetryPolicy(2, 0.01)))
 
 
 def _served(spoil: Callable[[Path], object] | None = None, *rules: Any) -> Callable[[Path, Path], Any]:

@@ -24,7 +24,7 @@ from tests.helpers.batches import assert_equal
 from tests.robustness import bench_remote
 from tests.servers.common import Cut, http_server, hub_server
 
-HASTY = RetryPolicy(attempts=2, first=0.01)
+HASTY = RetryPolicy(attempts=2, first_wait=0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -54,13 +54,13 @@ def in_part(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize(("first", "told"), [(0.001, []), (2.0, ["2 s", "4 s"])])
 def test_a_long_wait_is_told(first, told, monkeypatch, caplog):
     monkeypatch.setattr("tenacity.nap.time.sleep", lambda seconds: None)
-    store = Store("https://nowhere.test/release", RetryPolicy(attempts=3, first=first))
+    store = Store("https://nowhere.test/release", RetryPolicy(attempts=3, first_wait=first))
 
     def refuse():
         raise ConnectionError("no such host")
 
     with pytest.raises(RemoteError, match=r"no such host \(3 attempts\)"):
-        store.patiently("meta/info.json", refuse)
+        store.with_retries("meta/info.json", refuse)
     start = "https://nowhere.test/release/meta/info.json: ConnectionError: no such host; trying again in "
     assert caplog.messages == [start + wait for wait in told]
 
@@ -175,7 +175,7 @@ def test_a_new_version_at_the_same_address(lite, full, tmp_path):
         shutil.rmtree(tmp_path / "served")
         shutil.copytree(full[0], tmp_path / "served")
         second = load_icrl4aht(server.url)
-        assert (first.info["kind"], second.info["kind"]) == ("lite", "full")
+        assert (first.info.kind, second.info.kind) == ("lite", "full")
         assert first.root != second.root
         with pytest.raises(RemoteError, match="damaged or not of this version"):
             first[0].actions[:]
@@ -186,7 +186,7 @@ def test_a_cut_download_goes_on_where_it_was_cut(many, folders):
     with http_server(many) as server:
         server.faults.next(Cut(1000), times=10**6, path=f"*{Path(name).name}", method="GET")
         with pytest.raises(RemoteError, match="what has arrived is kept: try again to go on"):
-            fetch_planned(plan_download(server.url, patience=HASTY))
+            fetch_planned(plan_download(server.url, retry=HASTY))
         server.faults.clear()
         size = (many / name).stat().st_size
         root = load_icrl4aht(server.url).origin
@@ -195,7 +195,7 @@ def test_a_cut_download_goes_on_where_it_was_cut(many, folders):
         with (many / name).open("rb") as stream:
             part.put(0, stream.read(size // 2))  # half of it had arrived
         seen = len(server.log)
-        fetch_planned(plan_download(server.url, layout="demo_wide", patience=HASTY))
+        fetch_planned(plan_download(server.url, layout="demo_wide", retry=HASTY))
         again = sum(r.sent for r in server.log[seen:] if r.path.endswith(name) and r.method == "GET")
         assert size // 2 <= again <= size // 2 + 4096
         assert verify_release(server.url, layout="demo_wide").ok
@@ -237,10 +237,10 @@ def test_the_revision_is_pinned_and_shown(lite, full, tmp_path):
         first = hub.add_repo("org/name", lite[0], tag="v0.0.1")
         hub.add_repo("org/name", full[0])
         tagged, newest = (load_icrl4aht(f"hf://datasets/org/name{at}") for at in ("@v0.0.1", ""))
-        assert (tagged.info["kind"], newest.info["kind"]) == ("lite", "full")
+        assert (tagged.info.kind, newest.info.kind) == ("lite", "full")
         assert str(tagged.origin) == f"hf://datasets/org/name@{first}"
         shown = json.loads(CliRunner().invoke(cli, ["show", "hf://datasets/org/name@v0.0.1", "--json"]).output)
-        assert (shown["revision"], shown["data_version"]) == (first, tagged.info["data_version"])
+        assert (shown["revision"], shown["data_version"]) == (first, tagged.info.data_version)
 
 
 @pytest.mark.parametrize("what", ["shard", "two shards", "missing", "index", "table and shard", "manifest", "all"])
@@ -305,7 +305,7 @@ def test_a_source_that_is_damaged_itself_damages_nothing(lite, tmp_path):
         (tmp_path / name / shard).write_bytes(data)
     before = in_part(tmp_path / "here")
     with http_server(tmp_path / "there") as server:
-        outcome, _ = repair(tmp_path / "here", [shard], source=server.url, patience=HASTY)
+        outcome, _ = repair(tmp_path / "here", [shard], source=server.url, retry=HASTY)
     assert "expected crc32" in str(outcome[shard])
     assert in_part(tmp_path / "here") == before
 

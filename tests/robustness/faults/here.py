@@ -120,8 +120,11 @@ def full_cache(scene: Scene, n: int) -> Iterator[Try]:
     def attempt(target: Target, size: int, mounted: bool) -> None:
         with scene.met() as to:
             disk = small_disk(to.parent, 64 * 2**20) if mounted else small_files(size)
-            index = read_index(open_root(target.url, None, PATIENCE))
-            dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+            origin = open_root(target.url, None, PATIENCE)
+            index = read_index(origin.folder)
+            dataset = Dataset(
+                index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(origin, index)
+            )
             for history in dataset:
                 history.read("dones", 0, 1)  # brings the chunk table
             began = len(target.log)
@@ -152,7 +155,7 @@ def _kept(scene: Scene, to: Path) -> dict[str, list[tuple[int, int]]]:
     for name in (name for name in scene.content if name.startswith("data/") and f"/{name}" not in found):
         table = np.array(read_table(scene.release / chunk_table_name(name)))
         part = PartialFile(Store("file://"), name, to.with_name(f"{to.name}.partial") / name)
-        missing = set(part.missing(table)["offset"].tolist())
+        missing = set(part.missing_chunks(table)["offset"].tolist())
         chunks = table[["offset", "size"]].tolist()
         found[f"/{name}"] = [(start, start + size) for start, size in chunks if start not in missing]
     return found
@@ -170,7 +173,7 @@ from pathlib import Path
 from icrl4aht_data.remote import partial_file as blocks
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 
-blocks._PIECE = int(sys.argv[3])
+blocks._REQUEST_BYTES = int(sys.argv[3])
 fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2])))
 """
 
@@ -365,7 +368,7 @@ def mutations(scene: Scene, n: int) -> Iterator[Try]:
     def _check_manifest(root: Path, before: tuple[bytes, str]) -> str | None:
         with on_http(scene, root) as target, scene.met() as to:
             try:
-                fetch_planned(plan_download(target.url, to=to, patience=PATIENCE))
+                fetch_planned(plan_download(target.url, to=to, retry=PATIENCE))
                 check(_read(to) == before, "other data, downloaded")
             except Icrl4ahtError:
                 pass

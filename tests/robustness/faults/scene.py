@@ -33,7 +33,7 @@ from tests.servers.process import environment
 PIECE = 2**14
 """Bytes asked for at once, so that the files of a small release come in many parts."""
 
-PATIENCE = RetryPolicy(attempts=4, first=0.01, longest=5)
+PATIENCE = RetryPolicy(attempts=4, first_wait=0.01, longest_wait=5)
 
 Try = Callable[[], str | None]
 """Meets one fault. Raises if something is lost; may say what was odd, which is counted."""
@@ -131,14 +131,17 @@ class Scene:
 
     def download(self, url: str, to: Path | None) -> None:
         """All of it, whole."""
-        plan = plan_download(url, to=to, patience=PATIENCE)
+        plan = plan_download(url, to=to, retry=PATIENCE)
         fetch_planned(plan)
         self.check_arrived(plan.root.folder, everything=True)
 
     def stream(self, url: str, to: Path | None) -> None:
         """A few batches, the right ones; what comes goes to the default folder."""
-        index = read_index(open_root(url, None, PATIENCE))
-        dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+        origin = open_root(url, None, PATIENCE)
+        index = read_index(origin.folder)
+        dataset = Dataset(
+            index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(origin, index)
+        )
         check(batches(dataset) == self.batches, "other batches than those of the release")
 
     def check_arrived(self, folder: Path, everything: bool = False) -> None:
@@ -157,7 +160,7 @@ class Scene:
         """A folder for what comes, with our own folders beside it."""
         to = self.new()
         folders = {"ICRL4AHT_DATA_DIR": str(to / "data"), "ICRL4AHT_CACHE_DIR": str(to / "cache")}
-        with environment(folders), patch.object(blocks, "_PIECE", PIECE):
+        with environment(folders), patch.object(blocks, "_REQUEST_BYTES", PIECE):
             yield to / "release"
 
     def meet(self, target: Target, rule: Ordered, *, passing: bool, stream: bool = False, hub: bool = False) -> None:
@@ -236,7 +239,7 @@ def batches(dataset: Dataset) -> bytes:
 
 def arrays(dataset: Dataset) -> bytes:
     """A hash of every stored array and of observations."""
-    names = [stored.name for stored in held_fields(dataset.info["kind"])]
+    names = [stored.name for stored in held_fields(dataset.info.kind)]
     return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names)] for h in dataset))
 
 
