@@ -245,8 +245,6 @@ class Remote:
 class HubRemote(Remote):
     """A dataset repository of the Hub, whose complete files are downloaded by the Hub's own client."""
 
-    store: HubStore
-
     def _fetch_files(self, names: Sequence[str], advance: Advance) -> None:
         """Download files to the Hub's cache, or by way of `partial` to `folder`; damaged ones are fetched twice."""
         damaged: dict[str, str] = {}
@@ -265,6 +263,7 @@ class HubRemote(Remote):
 
     def _fetch_snapshot(self, names: Sequence[str], advance: Advance) -> dict[str, str]:
         """Download files once, remove those with a wrong hash, and return them: name -> SHA-256 found."""
+        assert isinstance(self.store, HubStore)
         arrived = 0
 
         def count(size: int) -> None:

@@ -177,18 +177,24 @@ class Store:
 
         address = f"{self.url}/{name}"
 
-        def wait(state: tenacity.RetryCallState) -> float:
-            error = state.outcome.exception() if state.outcome else None
+        def seconds_before_next(state: Any) -> float:
             doubled = self.retry.first_wait * 2 ** (state.attempt_number - 1)
-            seconds = min(max(doubled, _retry_after(error)), self.retry.longest_wait)
-            if seconds >= _LOGGED_WAIT and error is not None:
-                _log.warning("%s: %s; trying again in %.0f s", address, _one_line(_root_cause(error)), seconds)
-            return seconds
+            return min(max(doubled, _retry_after(state.outcome.exception())), self.retry.longest_wait)
 
-        stop = tenacity.stop_after_attempt(self.retry.attempts)
-        transient = tenacity.retry_if_exception(_is_transient)
+        def log_long_wait(state: Any) -> None:
+            if state.next_action.sleep >= _LOGGED_WAIT:
+                what = _one_line(_root_cause(state.outcome.exception()))
+                _log.warning("%s: %s; trying again in %.0f s", address, what, state.next_action.sleep)
+
+        retrying = tenacity.Retrying(
+            retry=tenacity.retry_if_exception(_is_transient),
+            stop=tenacity.stop_after_attempt(self.retry.attempts),
+            wait=seconds_before_next,
+            before_sleep=log_long_wait,
+            reraise=True,
+        )
         with wrap_remote_errors(address, self.retry.attempts):
-            return tenacity.Retrying(retry=transient, stop=stop, wait=wait, reraise=True)(request)
+            return retrying(request)
 
 
 @contextmanager

@@ -185,7 +185,7 @@ def test_a_cut_download_goes_on_where_it_was_cut(many, folders):
     name = load_icrl4aht(many, layout="demo_wide").shards[0]
     with http_server(many) as server:
         server.faults.next(Cut(1000), times=10**6, path=f"*{Path(name).name}", method="GET")
-        with pytest.raises(RemoteError, match="what has arrived is kept: try again to go on"):
+        with pytest.raises(RemoteError, match="what has arrived is kept: repeat the command to resume"):
             fetch_planned(plan_download(server.url, retry=HASTY))
         server.faults.clear()
         size = (many / name).stat().st_size
@@ -227,7 +227,7 @@ def test_offline(served, lite, monkeypatch, variable):
     )
     missing = load_icrl4aht(served, layout="coord_simple", cache="ram")
     with pytest.raises(
-        OfflineError, match=r"offline, and not here: data/teammate/coord_simple/train-00000-of-00001\.h5"
+        OfflineError, match=r"offline, and not downloaded: data/teammate/coord_simple/train-00000-of-00001\.h5"
     ):
         missing.ad(batch_size=4, length=30)[0]
 
@@ -282,7 +282,7 @@ def test_repair_needs_the_right_source(lite, full, tmp_path, monkeypatch):
     root = tmp_path / "copy"
     shutil.copytree(lite[0], root)
     monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
-    with pytest.raises(OptionError, match="needs the address of a whole copy"):
+    with pytest.raises(OptionError, match="needs the address of a complete copy"):
         repair(root, ["README.md"])
     before = in_part(root)
     with http_server(full[0]) as server, pytest.raises(OptionError, match="it has another release or version"):
