@@ -119,7 +119,7 @@ def fetch_snapshot(
     options: dict[str, Any] = {"repo_type": "dataset", "revision": revision, "local_dir": local_dir}
     options |= {"local_files_only": offline() or unreachable is not None, "tqdm_class": CountingBar}
     patterns, folder = [glob.escape(name) for name in names], Path()
-    with wrap_remote_errors(f"{url}/{names[0]}"):
+    with wrap_remote_errors(f"{url}/{', '.join(names[:3])}"):
         try:
             folder = Path(snapshot_download(repo, allow_patterns=patterns, **options))
             absent = [name for name in names if not (folder / name).exists()]

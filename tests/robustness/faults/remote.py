@@ -109,7 +109,9 @@ def cuts(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
 
 def busy(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
     """Errors 5xx of any request: bursts shorter than our patience, or without end."""
-    yield from _anywhere(scene, n, place, lambda: Status(int(scene.rng.choice(BUSY))), longest=3, methods=ANY)
+    yield from _anywhere(
+        scene, n, place, lambda: Status(int(scene.rng.choice(BUSY))), longest=3, methods=ANY, in_hub=False
+    )
 
 
 def flips(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
@@ -163,8 +165,12 @@ def _anywhere(
     order: Callable[[], Any],
     longest: int = 1,
     methods: tuple[str, ...] = ("GET",),
+    in_hub: bool = True,
 ) -> Iterator[Try]:
-    """A fault from a random request on: for at most `longest` requests, or for all that follow."""
+    """A fault from a random request on: for at most `longest` requests, or for all that follow.
+
+    `in_hub` says whether the Hub's own client survives it when it passes.
+    """
     with place(scene) as target:
         hub = target.url.startswith("hf://")
         kinds = [(False, False), (True, False), (False, True)] if hub else [(False, False), (True, False)]
@@ -173,8 +179,9 @@ def _anywhere(
             stream, cached = kinds[number % len(kinds)]
             passing = number // len(kinds) % 2 == 0
             times = int(scene.rng.integers(1, longest + 1)) if passing else ALWAYS
-            rule = Ordered(order(), int(scene.rng.integers(requests[stream, cached])), times, methods=methods)
-            yield partial(_attempt, scene, target, rule, passing, stream, cached)
+            path = "/[!a]*" if hub and in_hub else "*"  # the Hub's client does not retry what it asks below /api
+            rule = Ordered(order(), int(scene.rng.integers(requests[stream, cached])), times, path, methods)
+            yield partial(_attempt, scene, target, rule, passing and (in_hub or not hub), stream, cached)
 
 
 def _attempt(scene: Scene, target: Target, rule: Ordered, passing: bool, stream: bool, cached: bool) -> None:
