@@ -31,7 +31,7 @@ _PLAIN_ADDRESS = re.compile(r"(hf|s3|https?)://[^:\s]+(:\d+)?(/[^:\s]*)?")
 
 @dataclass(frozen=True)
 class DownloadPlan:
-    """What a download fetches.
+    """Files that a download fetches.
 
     Args:
         root: the remote release.

@@ -140,6 +140,17 @@ def fetch_snapshot(
     return folder
 
 
+def listed_sizes(repo: str, commit: str) -> dict[str, int]:
+    """Path -> bytes of all files at a commit, as listed when the client downloaded from it; empty without a listing."""
+    from huggingface_hub import get_cached_repo_tree
+    from huggingface_hub.errors import CachedRepoTreeNotFoundError
+
+    try:
+        return {file.path: file.size for file in get_cached_repo_tree(repo, repo_type="dataset", revision=commit)}
+    except CachedRepoTreeNotFoundError:
+        return {}
+
+
 def _connection_error(repo: str, revision: str | None, name: str) -> Exception | None:
     """The error of a first request if the Hub does not answer it in time; None if it does, whatever the answer.
 

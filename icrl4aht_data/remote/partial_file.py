@@ -180,7 +180,7 @@ def complete_file(
             file.path.unlink()
     raise RemoteError(
         f"{file.store.url}/{file.name}: expected sha256 {digest}, found {found} in {size} bytes: the remote's file is "
-        f"damaged or not of this version; tell its publisher"
+        f"damaged or not of this version; report it to its publisher"
     )
 
 
@@ -241,7 +241,7 @@ def _fetch(file: PartialFile, wanted: ByteRange) -> bytes:
             return data
     raise RemoteError(
         f"{file.store.url}/{file.name}: bytes {damaged[0]}..{damaged[1]}: expected crc32 {damaged[2]:08x}, got others "
-        f"{_ATTEMPTS} times: the remote's file is damaged or not of this version; tell its publisher"
+        f"{_ATTEMPTS} times: the remote's file is damaged or not of this version; report it to its publisher"
     )
 
 

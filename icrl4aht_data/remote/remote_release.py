@@ -33,7 +33,7 @@ from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.remote.hub import HubStore, fetch_snapshot
+from icrl4aht_data.remote.hub import HubStore, fetch_snapshot, listed_sizes
 from icrl4aht_data.remote.partial_file import PartialFile, complete_file
 from icrl4aht_data.remote.store import RetryPolicy, Store, offline
 from icrl4aht_data.utils.cache import data_folder
@@ -193,10 +193,13 @@ class Remote:
             return dict(zip(names, pool.map(self.size, names), strict=True))
 
     def _size_at_remote(self, name: str) -> int:
-        size = self.store.size(name)
+        size = self._requested_size(name)
         if not name.startswith("data/") and not 0 <= size <= LARGEST:  # a shard's size is checked by its chunk table
             raise RemoteError(f"{self.url}/{name}: expected at most {LARGEST:,} bytes, the remote says {size:,}")
         return size
+
+    def _requested_size(self, name: str) -> int:
+        return self.store.size(name)
 
     def _fetch_files(self, names: Sequence[str], advance: Advance) -> None:
         """Download files that are not in the folder; if one fails, the others are downloaded first."""
@@ -258,8 +261,16 @@ class HubRemote(Remote):
         name, found = next(iter(damaged.items()))
         raise RemoteError(
             f"{self.url}/{name}: expected sha256 {self.manifest[name]}, found {found}: the repository's file is not "
-            f"the one that its manifest lists; tell its publisher"
+            f"the one that its manifest lists; report it to its publisher"
         )
+
+    def _requested_size(self, name: str) -> int:
+        return self._listed_sizes[name] if name in self._listed_sizes else self.store.size(name)
+
+    @cached_property
+    def _listed_sizes(self) -> dict[str, int]:
+        assert isinstance(self.store, HubStore)
+        return listed_sizes(self.store.repo, self.revision)
 
     def _fetch_snapshot(self, names: Sequence[str], advance: Advance) -> dict[str, str]:
         """Download files once, remove those with a wrong hash, and return them: name -> SHA-256 found."""

@@ -37,7 +37,7 @@ _UNRANGED_BYTES = 64 * 2**20  # accepted from a server that answers a range requ
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How often a request for a byte range is tried, and how long to wait in between.
+    """Number of attempts of a request for a byte range, and the waits between them.
 
     Args:
         attempts: requests in total, the first one included.
