@@ -91,7 +91,7 @@ def _kept_ranges(workspace: Workspace, to: Path) -> dict[str, list[tuple[int, in
     for name in (name for name in workspace.content if name.startswith("data/") and f"/{name}" not in found):
         table = np.array(read_table(workspace.release / chunk_table_name(name)))
         part = PartialFile(Store("file://"), name, to.with_name(f"{to.name}.partial") / name)
-        missing = set(part.missing(table)["offset"].tolist())
+        missing = set(part.missing_chunks(table)["offset"].tolist())
         chunks = table[["offset", "size"]].tolist()
         found[f"/{name}"] = [(start, start + size) for start, size in chunks if start not in missing]
     return found
@@ -137,7 +137,7 @@ from pathlib import Path
 from icrl4aht_data.remote import partial_file
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 
-partial_file._PIECE = int(sys.argv[3])
+partial_file._REQUEST_BYTES = int(sys.argv[3])
 fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2])))
 """
 
@@ -321,7 +321,7 @@ def mutations(workspace: Workspace, n: int) -> Iterator[Attempt]:
     def check_manifest() -> str | None:
         with on_http(workspace, release.root) as target, workspace.fresh_folders() as to:
             try:
-                fetch_planned(plan_download(target.url, to=to, patience=RETRIES))
+                fetch_planned(plan_download(target.url, to=to, retry=RETRIES))
                 check(release.read(to) == release.before, "other data, downloaded")
             except Icrl4ahtError:
                 pass

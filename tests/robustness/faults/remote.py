@@ -124,8 +124,17 @@ def anywhere(
     serve: Serve = on_http,
     longest: int = 1,
     methods: tuple[str, ...] = ("GET",),
+    hub_retries: bool = True,
 ) -> Family:
-    """Return the family of a fault from a random request on: for at most `longest` requests, or for all that follow."""
+    """Return the family of a fault from a random request on: for at most `longest` requests, or for all that follow.
+
+    Args:
+        make: makes a fault from random numbers.
+        serve: the server.
+        longest: most requests that meet a fault that passes.
+        methods: HTTP methods that meet the fault.
+        hub_retries: whether the Hub's client retries such requests for files; it never retries those below /api.
+    """
 
     def family(workspace: Workspace, n: int) -> Iterator[Attempt]:
         with serve(workspace) as target:
@@ -137,8 +146,9 @@ def anywhere(
                 use, succeeds = uses[number % len(uses)], number // len(uses) % 2 == 0
                 times = int(workspace.rng.integers(1, longest + 1)) if succeeds else ALWAYS
                 first = int(workspace.rng.integers(requests[use]))
-                rule = FaultRule(make(workspace.rng), first, times, methods=methods)
-                yield partial(attempt, workspace, target, rule, succeeds, *use)
+                path = "/[!a]*" if target.is_hub and hub_retries else "*"
+                rule = FaultRule(make(workspace.rng), first, times, path, methods)
+                yield partial(attempt, workspace, target, rule, succeeds and (hub_retries or not target.is_hub), *use)
 
     def attempt(
         workspace: Workspace, target: Target, rule: FaultRule, succeeds: bool, stream: bool, default_folder: bool

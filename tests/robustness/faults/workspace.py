@@ -33,7 +33,7 @@ from tests.servers.process import environment
 PIECE = 2**14
 """Bytes of one range request, small enough that the files of a small release take many."""
 
-RETRIES = RetryPolicy(attempts=4, first=0.01, longest=5)
+RETRIES = RetryPolicy(attempts=4, first_wait=0.01, longest_wait=5)
 
 Attempt = Callable[[], str | None]
 """Injects one fault. Raises LostError if data or progress is lost; may return a remark, which is counted."""
@@ -144,7 +144,7 @@ class Workspace:
 
     def download(self, url: str, to: Path | None) -> None:
         """Download a complete release and check it."""
-        plan = plan_download(url, to=to, patience=RETRIES)
+        plan = plan_download(url, to=to, retry=RETRIES)
         fetch_planned(plan)
         self.check_files(plan.root.folder, complete=True)
 
@@ -176,7 +176,7 @@ class Workspace:
         """Redirect cache and data folders to empty ones; yields a path for a download."""
         to = self.new_path()
         folders = {"ICRL4AHT_DATA_DIR": str(to / "data"), "ICRL4AHT_CACHE_DIR": str(to / "cache")}
-        with environment(folders), patch.object(partial_file, "_PIECE", PIECE):
+        with environment(folders), patch.object(partial_file, "_REQUEST_BYTES", PIECE):
             yield to / "release"
 
     def use_with_fault(

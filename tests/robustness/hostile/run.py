@@ -132,7 +132,7 @@ def download(root: Path, out: Path, case: Case) -> None:
     for path, fault in case.rules.items():
         faults.every(1, fault, path=path, method=None)
     with http_server(root, faults) as server:
-        fetch_planned(plan_download(server.url, to=out / "mirror", patience=RetryPolicy(2, 0.01)))
+        fetch_planned(plan_download(server.url, to=out / "mirror", retry=RetryPolicy(2, 0.01)))
 
 
 def steps_of(case: Case, root: Path, out: Path) -> Steps:
