@@ -104,7 +104,7 @@ def test_what_it_costs(many, kind, folders):
 def test_a_batch_asks_for_exactly_the_ranges_it_counts(many):
     with http_server(many) as server:
         dataset = load_icrl4aht(server.url, layout="demo_wide", obs="state")
-        _ = dataset.holding
+        _ = dataset.storage
         seen, before = len(server.log), dataset.traffic
         sampler = dataset.ad(batch_size=8, length=500, seed=1)
         sampler[0]
@@ -114,7 +114,7 @@ def test_a_batch_asks_for_exactly_the_ranges_it_counts(many):
         sampler[0]
         assert dataset.traffic - before == traffic, "what has come is not asked for again"
         again = load_icrl4aht(server.url, layout="demo_wide", obs="state")
-        _ = again.holding
+        _ = again.storage
         before = again.traffic
         again.ad(batch_size=8, length=500, seed=1)[0]
         assert (again.traffic - before).requests == 0, "nor by another process: it is kept on disk"

@@ -23,15 +23,13 @@ import numpy as np
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.dataset import open_dataset
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format import columns
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
-from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.reading.selection import ReadOptions
-from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.partial_file import PartialFile
 from icrl4aht_data.remote.remote_release import open_root
@@ -120,8 +118,7 @@ def full_cache(scene: Scene, n: int) -> Iterator[Try]:
     def attempt(target: Target, size: int, mounted: bool) -> None:
         with scene.met() as to:
             disk = small_disk(to.parent, 64 * 2**20) if mounted else small_files(size)
-            index = read_index(open_root(target.url, None, PATIENCE))
-            dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+            dataset = open_dataset(open_root(target.url, None, PATIENCE), ReadOptions("uint8", "stream", 1))
             for history in dataset:
                 history.read("dones", 0, 1)  # brings the chunk table
             began = len(target.log)
@@ -195,7 +192,7 @@ columns._UNCACHED = cache._SMALL = 0
 for number in itertools.count():
     os.environ["ICRL4AHT_CACHE_DIR"] = f"{sys.argv[2]}/{number}"
     print(number, flush=True)
-    load_icrl4aht(sys.argv[1], cache="mmap").holding
+    load_icrl4aht(sys.argv[1], cache="mmap").storage
 """
 
 

@@ -16,12 +16,10 @@ from unittest.mock import patch
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.dataset import Dataset, open_dataset
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.schema import MANIFEST, held_fields
 from icrl4aht_data.reading.selection import ReadOptions
-from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.remote import partial_file as blocks
 from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
@@ -137,8 +135,7 @@ class Scene:
 
     def stream(self, url: str, to: Path | None) -> None:
         """A few batches, the right ones; what comes goes to the default folder."""
-        index = read_index(open_root(url, None, PATIENCE))
-        dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+        dataset = open_dataset(open_root(url, None, PATIENCE), ReadOptions("uint8", "stream", 1))
         check(batches(dataset) == self.batches, "other batches than those of the release")
 
     def check_arrived(self, folder: Path, everything: bool = False) -> None:
