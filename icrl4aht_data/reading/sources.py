@@ -227,7 +227,10 @@ class FlatSource:
         axis, length = FIELDS[name].axis, out.shape[1]
         first = self._first[axis][histories]
         if rows.ndim == 2:
-            out[...] = array[first[:, None] + rows]
+            if out.dtype == array.dtype:
+                np.take(array, first[:, None] + rows, axis=0, out=out, mode="clip")  # other modes copy once more
+            else:
+                out[...] = array[first[:, None] + rows]
             return
         first = first + rows
         beyond = rows + length - self._rows[axis][histories]
@@ -299,13 +302,12 @@ def _on_threads(read: Callable[[ReadRequest], None], requests: Sequence[ReadRequ
     Each thread takes the same share of every request, so that windows of one history, which share chunks, are read
     by one thread.
     """
-    most = max(len(request.out) for request in requests)
-    steps = max(request.out.shape[1] for request in requests)
+    rows, steps = max((request.out.shape[:2] for request in requests), key=lambda shape: shape[1])
 
     def work(first: int, last: int) -> None:
-        for field, histories, rows, out in requests:
-            part = slice(len(out) * first // most, len(out) * last // most)
+        for field, histories, wanted, out in requests:
+            part = slice(len(out) * first // rows, len(out) * last // rows)
             if part.stop > part.start:
-                read(ReadRequest(field, histories[part], rows[part], out[part]))
+                read(ReadRequest(field, histories[part], wanted[part], out[part]))
 
-    in_slices(work, most, threads, least=max(1, _STEPS // steps))
+    in_slices(work, rows, threads, least=max(1, _STEPS // steps))

@@ -123,9 +123,10 @@ class ADSampler(Sampler[ADBatch]):
         self._observer.observe(position, records, batch.obs)
         if batch.layouts is not None:
             batch.layouts[...] = self.dataset.layout_numbers[position]
-        np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
+        batch.attention_mask[...] = True
         if valid.min() < self.length:
-            # What was read there belongs to later episodes, or renders the zeros after the history's end.
+            np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
+            # What was read on padding is of later episodes, or rendered of the zeros after the history's end.
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch

@@ -144,10 +144,11 @@ class DPTSampler(Sampler[DPTBatch]):
         if batch.context_teammate_actions is not None:
             reads.append(ReadRequest("teammate_actions", context, rows, batch.context_teammate_actions))
         # An episode's last step is followed by the episode's end, never by the next episode's first step.
-        ends = np.nonzero((steps + 1) % kept_steps == 0) if self.dataset.has_states else ()
+        episodes = steps // kept_steps
+        ends = np.nonzero(steps == episodes * kept_steps + kept_steps - 1) if self.dataset.has_states else ()
         if ends:
             end_records = np.empty((len(ends[0]), 1, next_records.shape[-1]), np.uint8)
-            reads.append(ReadRequest("episode_end_state", context[ends[0]], steps[ends] // kept_steps, end_records))
+            reads.append(ReadRequest("episode_end_state", context[ends[0]], episodes[ends], end_records))
         self.dataset.storage.read(reads)
         if ends:
             next_records[ends] = end_records[:, 0]
