@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Unpack
@@ -9,7 +10,7 @@ from typing import Any, Unpack
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.errors import NotStoredError, unknown
 from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Obs
@@ -97,7 +98,7 @@ class Dataset(Selection):
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
     @cached_property
-    def _provenance(self) -> dict[str, Any]:
+    def _provenance(self) -> dict[str, Provenance]:
         return read_provenance(self.origin.file(PROVENANCE))
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
@@ -113,7 +114,7 @@ class Dataset(Selection):
             "environment_name": layout.alias,
             "map": list(layout.rows),
             "recipes": [list(recipe) for recipe in layout.recipes],
-            **self.info["environment"],
+            **asdict(self.info.environment),
         }
 
     def recover_teammate(self, history_id: int) -> dict[str, Any]:
@@ -136,7 +137,8 @@ class Dataset(Selection):
             )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        return self._tasks[entry.task_id].teammate | self._provenance.get(entry.task_id, {}).get("teammate", {})
+        provenance = self._provenance.get(entry.task_id, Provenance())
+        return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
         """Sampler of windows for Algorithm Distillation; see `ADSampler` for the options."""

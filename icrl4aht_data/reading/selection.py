@@ -14,6 +14,7 @@ import numpy as np
 
 from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import KINDS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import OBS, History, Obs
@@ -123,14 +124,14 @@ class Selection:
         return Traffic() if remote is None else remote.store.traffic
 
     @property
-    def info(self) -> dict[str, Any]:
-        """meta/info.json: versions, kind, environment, totals."""
+    def info(self) -> ReleaseInfo:
+        """The release's versions, kind, environment and totals, as in meta/info.json."""
         return self.index.info
 
     @property
     def has_states(self) -> bool:
         """Whether the release has state records; a release of observations has none."""
-        return self.info["kind"] in KINDS
+        return self.info.kind in KINDS
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -155,7 +156,7 @@ class Selection:
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
-            f"{self.info['kind']} release {self.info['data_version']} at {self.origin})"
+            f"{self.info.kind} release {self.info.data_version} at {self.origin})"
         )
 
     def history(self, history_id: int) -> History:
@@ -207,7 +208,7 @@ class Selection:
         for number, layout in enumerate(self.layouts):
             members = self.layout_numbers == number
             steps, episodes = (int(self.column(name)[members].sum()) for name in ("T", "episodes"))
-            size += decoded_size(layout, self.info["kind"], steps, int(members.sum()), episodes)
+            size += decoded_size(layout, self.info.kind, steps, int(members.sum()), episodes)
         return choose_cache(self.options.cache, size)
 
     @property

@@ -277,5 +277,5 @@ class Shards:
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
-            self._open[name] = Shard(self._location, name, self._index.info["kind"], members, self.cache)
+            self._open[name] = Shard(self._location, name, self._index.info.kind, members, self.cache)
         return self._open[name]

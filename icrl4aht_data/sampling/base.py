@@ -109,7 +109,7 @@ class Sampler(Generic[B]):
         return {
             "sampler": type(self).__name__,
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
-            "data_version": self.dataset.info["data_version"],
+            "data_version": self.dataset.info.data_version,
             "obs": self.dataset.obs,
             "batch_size": self.batch_size,
             "length": self.length,

@@ -109,7 +109,7 @@ class HistoryDraws:
         self, selection: Selection, weights: Weights, episodes: Episodes | None, curriculum: Curriculum | None
     ) -> None:
         self.lengths, self._counts = selection.column("T"), selection.column("episodes")
-        self.kept_steps: int = selection.info["environment"]["kept_steps"]
+        self.kept_steps: int = selection.info.environment.kept_steps
         ended, cut = np.divmod(self.lengths, self.kept_steps)
         # Only histories of releases without states may end within an episode.
         if (ended != self._counts).any() or (selection.has_states and cut.any()):

@@ -46,7 +46,7 @@ class Observer:
                 f"the selection spans layouts {', '.join(layout.name for layout in self._layouts)} with observations "
                 f"of unequal shape, a sampler takes one shape: add layout={self._layouts[0].name!r}"
             )
-        self.field = record_field(selection.info["kind"]).name
+        self.field = record_field(selection.info.kind).name
         self._renders = selection.has_states and selection.obs != "state"
         self._size = max(record_size(layout) for layout in self._layouts)
 

@@ -233,7 +233,7 @@ def batches(dataset: Dataset) -> bytes:
 
 def arrays(dataset: Dataset) -> bytes:
     """A hash of every stored array and of observations."""
-    names = [stored.name for stored in held_fields(dataset.info["kind"])]
+    names = [stored.name for stored in held_fields(dataset.info.kind)]
     return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names)] for h in dataset))
 
 
