@@ -216,12 +216,18 @@ class FlatSource:
             self._copy(self._arrays[0][name], *request)
             return
         layout = self._layout[histories]
-        for number in np.unique(layout).tolist():
-            array, chosen = self._arrays[number][name], np.flatnonzero(layout == number)
+        for number, arrays in enumerate(self._arrays):
+            chosen = np.flatnonzero(layout == number)
+            if not len(chosen):
+                continue
+            array = arrays[name]
             part = np.empty((len(chosen), out.shape[1], *array.shape[1:]), out.dtype)
             self._copy(array, name, histories[chosen], rows[chosen], part)
-            out[chosen, ..., : part.shape[-1]] = part
-            out[chosen, ..., part.shape[-1] :] = 0
+            if part.shape == (len(chosen), *out.shape[1:]):
+                out[chosen] = part
+            else:  # a shorter state record
+                out[chosen, ..., : part.shape[-1]] = part
+                out[chosen, ..., part.shape[-1] :] = 0
 
     def _copy(self, array: np.ndarray, name: str, histories: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
         axis, length = FIELDS[name].axis, out.shape[1]

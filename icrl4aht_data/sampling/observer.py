@@ -83,7 +83,7 @@ class Observer:
             def render(start: int, stop: int, layout=layout, rows=rows) -> None:
                 for first in range(start, stop, slab):
                     part = rows[first : min(first + slab, stop)]
-                    shown = records[part][..., : record_size(layout)]
+                    shown = records[part, ..., : record_size(layout)]
                     out[part] = fast_observe(layout, shown, np.empty((len(part), *out.shape[1:]), out.dtype))
 
             in_slices(render, len(rows), threads, least=slab)
