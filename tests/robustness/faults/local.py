@@ -161,7 +161,7 @@ columns._UNCACHED = cache._SMALL = 0
 for number in itertools.count():
     os.environ["ICRL4AHT_CACHE_DIR"] = f"{sys.argv[2]}/{number}"
     print(number, flush=True)
-    load_icrl4aht(sys.argv[1], cache="mmap").holding
+    load_icrl4aht(sys.argv[1], cache="mmap").storage
 """
 
 

@@ -16,12 +16,10 @@ from unittest.mock import patch
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.dataset import Dataset, open_dataset
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.schema import MANIFEST, held_fields
 from icrl4aht_data.reading.selection import ReadOptions
-from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.remote import partial_file
 from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
@@ -150,9 +148,7 @@ class Workspace:
 
     def open_stream(self, url: str) -> Dataset:
         """Open a remote release for streaming through the default cache folder."""
-        origin = open_root(url, None, RETRIES)
-        index = read_index(origin.folder)
-        return Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(origin, index))
+        return open_dataset(open_root(url, None, RETRIES), ReadOptions("uint8", "stream", 1))
 
     def stream(self, url: str, to: Path | None) -> None:
         """Stream a few batches and check them."""
