@@ -13,8 +13,8 @@ import pytest
 from tests.helpers.paths import ROOT
 
 PACKAGES = ("icrl4aht_data", "generation", "baselines", "benchmarks")
-OF_EVERY_COMMAND = {"cli", "main"}
-"""Names that each command line has."""
+ENTRY_POINTS = {"main"}
+"""Names that several command lines have."""
 OPENING = re.compile(r"(Of|The same|By|Its)\b")
 """Openings of sentences that only the previous docstring explains."""
 
@@ -26,12 +26,13 @@ def parsed(*packages: str) -> Iterator[tuple[Path, ast.Module]]:
 
 
 def public_names(tree: ast.Module) -> set[str]:
-    """Names that a module defines at the top level, without those it imports."""
+    """Names that a module defines at the top level, without commands, type variables and the names it imports."""
     found: set[str] = set()
     for node in tree.body:
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
-            found.add(node.name)
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            decorators = " ".join(map(ast.unparse, node.decorator_list))
+            found |= set() if ".command(" in decorators or ".group(" in decorators else {node.name}
+        elif isinstance(node, ast.Assign | ast.AnnAssign) and "TypeVar(" not in ast.unparse(node):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             found |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
     return {name for name in found if not name.startswith("_")}
@@ -49,7 +50,7 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 def test_public_names_are_unique():
     modules: dict[str, list[str]] = defaultdict(list)
     for path, tree in parsed(*PACKAGES):
-        for name in public_names(tree) - OF_EVERY_COMMAND:
+        for name in public_names(tree) - ENTRY_POINTS:
             modules[name].append(str(path))
     shared = [f"{name}: {', '.join(paths)}" for name, paths in sorted(modules.items()) if len(paths) > 1]
     assert not shared, "\n".join(shared)

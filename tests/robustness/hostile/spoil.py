@@ -143,7 +143,7 @@ def lines(change: Callable[[list[dict[str, Any]]], list | None], name: str = HIS
     return spoil
 
 
-def entry(name: str = HISTORIES, **changes: Any) -> Spoil:
+def entry(name: str = HISTORIES, /, **changes: Any) -> Spoil:
     """Change fields of the first line of the index."""
     return lines(lambda values: values[0].update(changes), name)
 
