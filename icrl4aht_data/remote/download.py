@@ -16,6 +16,7 @@ from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
+from icrl4aht_data.remote.partial_file import map_parallel
 from icrl4aht_data.remote.remote_release import Advance, ReleaseLocation, folder_lock, is_address, open_root
 from icrl4aht_data.remote.store import RetryPolicy, Traffic
 from icrl4aht_data.utils.files import atomic_write, has_content, parse_json, read_text, write_json
@@ -87,7 +88,8 @@ def plan_download(
     assert root.remote is not None
     names = sorted(chosen_files(root, **wanted))
     absent = [name for name in names if not root.is_here(name)]
-    return DownloadPlan(root, root.remote.sizes(names), absent)
+    sizes = map_parallel(root.remote.size, names)
+    return DownloadPlan(root, dict(zip(names, sizes, strict=True)), absent)
 
 
 def fetch_planned(plan: DownloadPlan, advance: Advance = lambda size: None) -> Traffic:

@@ -26,6 +26,7 @@ from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.hashes import file_hash
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 _GAP = 4096  # bytes between two chunks that cost less than another request
 _REQUEST_BYTES = 2**20  # longest range of one request: what a cut connection can lose
@@ -139,7 +140,7 @@ def fetch_chunks(wanted: Iterable[tuple[PartialFile, np.ndarray]]) -> None:
         RemoteError: if bytes cannot be fetched, or arrive with a wrong checksum three times.
     """
     requests = [(file, span) for file, chunks in wanted for span in _ranges(file.missing_chunks(chunks))]
-    _for_each(lambda request: request[0].cache(request[1], _fetch(*request)), requests)
+    map_parallel(lambda request: request[0].cache(request[1], _fetch(*request)), requests)
     if requests:
         blocks = sum(span.stop // _DISK_BLOCK - span.start // _DISK_BLOCK + 1 for _, span in requests)
         _limit_disk_use({file.path for file, _ in requests}, blocks * _DISK_BLOCK)
@@ -208,7 +209,7 @@ def _fetch_missing(file: PartialFile, size: int, chunks: np.ndarray | None, adva
         advance(span.stop - span.start)
 
     # Without checksums the file must grow from its beginning, or a hole would pass for data after a cut.
-    _for_each(fetch, spans, threads=1 if chunks is None else _PARALLEL_REQUESTS)
+    map_parallel(fetch, spans, threads=1 if chunks is None else _PARALLEL_REQUESTS)
     with add_filename(file.path), file.path.open("r+b") as stream:
         stream.truncate(size)
 
@@ -245,16 +246,13 @@ def _fetch(file: PartialFile, wanted: ByteRange) -> bytes:
     )
 
 
-def _for_each(work: Callable[[T], object], items: Sequence[T], threads: int = _PARALLEL_REQUESTS) -> None:
-    """Call `work` for every item on a few threads; raise the first error after all calls have ended."""
+def map_parallel(work: Callable[[T], R], items: Sequence[T], threads: int = _PARALLEL_REQUESTS) -> list[R]:
+    """Results of `work` for every item, called on a few threads; raises the first error after all calls have ended."""
     if threads == 1 or len(items) < 2:
-        for item in items:
-            work(item)
-        return
+        return [work(item) for item in items]
     with ThreadPoolExecutor(min(threads, len(items))) as pool:
         futures = [pool.submit(work, item) for item in items]
-    for future in futures:
-        future.result()
+    return [future.result() for future in futures]
 
 
 _written_since_check = 0

@@ -11,9 +11,8 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,8 +32,8 @@ from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.remote.hub import HubStore, fetch_snapshot, listed_sizes
-from icrl4aht_data.remote.partial_file import PartialFile, complete_file
+from icrl4aht_data.remote.hub import HubStore
+from icrl4aht_data.remote.partial_file import PartialFile, complete_file, map_parallel
 from icrl4aht_data.remote.store import RetryPolicy, Store, offline
 from icrl4aht_data.utils.cache import data_folder
 from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size
@@ -187,26 +186,15 @@ class Remote:
         path = self.path(name)
         return path.stat().st_size if path.exists() else self._size_at_remote(name)
 
-    def sizes(self, names: Sequence[str]) -> dict[str, int]:
-        """Bytes of several files, by name; requested in parallel."""
-        with ThreadPoolExecutor(_PARALLEL_FILES) as pool:
-            return dict(zip(names, pool.map(self.size, names), strict=True))
-
     def _size_at_remote(self, name: str) -> int:
-        size = self._requested_size(name)
+        size = self.store.size(name)
         if not name.startswith("data/") and not 0 <= size <= LARGEST:  # a shard's size is checked by its chunk table
             raise RemoteError(f"{self.url}/{name}: expected at most {LARGEST:,} bytes, the remote says {size:,}")
         return size
 
-    def _requested_size(self, name: str) -> int:
-        return self.store.size(name)
-
     def _fetch_files(self, names: Sequence[str], advance: Advance) -> None:
         """Download files that are not in the folder; if one fails, the others are downloaded first."""
-        with ThreadPoolExecutor(min(_PARALLEL_FILES, len(names))) as pool:
-            futures = [pool.submit(self._fetch_file, name, advance) for name in names]
-        for future in futures:
-            future.result()
+        map_parallel(lambda name: self._fetch_file(name, advance), names, _PARALLEL_FILES)
 
     def _fetch_file(self, name: str, advance: Advance) -> None:
         target, part = self.path(name), self.part(name)
@@ -249,61 +237,25 @@ class HubRemote(Remote):
     """A dataset repository of the Hub, whose complete files are downloaded by the Hub's own client."""
 
     def _fetch_files(self, names: Sequence[str], advance: Advance) -> None:
-        """Download files to the Hub's cache, or by way of `partial` to `folder`; damaged ones are fetched twice."""
-        damaged: dict[str, str] = {}
+        """Download files to the Hub's cache, or by way of `partial` to `folder`; remove those with a wrong hash."""
+        assert isinstance(self.store, HubStore)
+        damaged = ""
         with nullcontext() if self.in_hub_cache else folder_lock(self.partial):
-            for _ in range(2):
-                names = [name for name in names if not self.path(name).exists()]
-                damaged = self._fetch_snapshot(names, advance) if names else {}
-                if not damaged:
-                    return
-                names = list(damaged)
-        name, found = next(iter(damaged.items()))
-        raise RemoteError(
-            f"{self.url}/{name}: expected sha256 {self.manifest[name]}, found {found}: the repository's file is not "
-            f"the one that its manifest lists; report it to its publisher"
-        )
-
-    def _requested_size(self, name: str) -> int:
-        return self._listed_sizes[name] if name in self._listed_sizes else self.store.size(name)
-
-    @cached_property
-    def _listed_sizes(self) -> dict[str, int]:
-        assert isinstance(self.store, HubStore)
-        return listed_sizes(self.store.repo, self.revision)
-
-    def _fetch_snapshot(self, names: Sequence[str], advance: Advance) -> dict[str, str]:
-        """Download files once, remove those with a wrong hash, and return them: name -> SHA-256 found."""
-        assert isinstance(self.store, HubStore)
-        arrived = 0
-
-        def count(size: int) -> None:
-            nonlocal arrived
-            arrived += size
-            advance(size)
-
-        # Twice a shard's size, because bytes before a cut count as well; less than that only a hostile server exceeds.
-        limit = sum(2 * self._shard_sizes.get(n, LARGEST) if n.startswith("data/") else LARGEST for n in names)
-        local_dir = None if self.in_hub_cache else self.partial
-        folder = fetch_snapshot(
-            self.url, self.store.repo, self.revision, names, limit=limit, count=count, local_dir=local_dir
-        )
-        self.store.count(len(names), arrived)
-        damaged, valid_bytes = {}, 0
-        for name in names:
-            path = folder / name
-            found = file_hash(path)
-            if found != self.manifest[name]:
-                damaged[name] = found
-                _remove_from_cache(path)
-                continue
-            valid_bytes += path.stat().st_size
-            if not self.in_hub_cache:
-                target = self.path(name)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                path.replace(target)
-        advance(valid_bytes - arrived)  # files that the cache had under another name have not been counted
-        return damaged
+            names = [name for name in names if not self.path(name).exists()]
+            # Twice a shard's size, because the client counts the bytes before a cut as well.
+            limit = sum(2 * self._shard_sizes.get(n, LARGEST) if n.startswith("data/") else LARGEST for n in names)
+            local_dir = None if self.in_hub_cache else self.partial
+            folder = self.store.fetch_files(names, limit, advance, local_dir) if names else self.folder
+            for name in names:
+                path, target, found = folder / name, self.path(name), file_hash(folder / name)
+                if found != self.manifest[name]:
+                    damaged = damaged or f"{self.url}/{name}: expected sha256 {self.manifest[name]}, found {found}"
+                    _remove_from_cache(path)
+                elif not self.in_hub_cache:
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    path.replace(target)
+        if damaged:
+            raise RemoteError(f"{damaged}: fetch it again; if that does not help, report it to its publisher")
 
 
 def _remove_from_cache(path: Path) -> None:
@@ -316,33 +268,20 @@ def _open_hub(url: str, to: Path | None, retry: RetryPolicy | None) -> Remote:
     match = _HUB.fullmatch(url)
     if match is None:
         raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
-    try:
-        snapshot = fetch_snapshot(url, match["repo"], match["revision"], [MANIFEST], limit=TEXT_BYTES)
-    except RemoteError as error:
-        if error.missing:
-            raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
-        raise
-    text = _hub_manifest(snapshot / MANIFEST, url)
-    commit = snapshot.name
-    pinned = f"hf://datasets/{match['repo']}@{commit}"
-    manifest = _checked_manifest(text, pinned)
-    store = HubStore(match["repo"], commit, retry)
-    if to is None:
-        partial = data_folder() / _folder_name(url) / f"{commit}.partial"
-        return HubRemote(pinned, commit, snapshot, partial, manifest, store, in_hub_cache=True)
-    _write_manifest(to, text, manifest, pinned)
-    return HubRemote(pinned, commit, to, _partial_folder(to), manifest, store)
-
-
-def _hub_manifest(path: Path, url: str) -> bytes:
-    """Content of the manifest in the Hub's cache, checked against git's hash, by which the cache names its files."""
+    with _missing_release(url):
+        snapshot = HubStore(match["repo"], match["revision"]).fetch_files([MANIFEST], TEXT_BYTES, lambda size: None)
+    path, store = snapshot / MANIFEST, HubStore(match["repo"], snapshot.name, retry)
     plain_size(path, TEXT_BYTES)
     text, blob = path.read_bytes(), path.resolve()
-    expected = git_hash(text)
-    if len(blob.name) == len(expected) and blob.name != expected:
+    if len(blob.name) == 40 and blob.name != git_hash(text):  # the cache names a small file by the hash that git has
         _remove_from_cache(path)
-        raise RemoteError(f"{url}/{MANIFEST}: arrived damaged: its git hash is {expected}, not {blob.name}; try again")
-    return text
+        raise RemoteError(f"{url}/{MANIFEST}: arrived damaged: expected git hash {blob.name}; fetch it again")
+    manifest = _parse_manifest(text, store.url)
+    if to is None:
+        partial = data_folder() / _folder_name(url) / f"{snapshot.name}.partial"
+        return HubRemote(store.url, snapshot.name, snapshot, partial, manifest, store, in_hub_cache=True)
+    _write_manifest(to, text, manifest, store.url)
+    return HubRemote(store.url, snapshot.name, to, _partial_folder(to), manifest, store)
 
 
 def _open_address(url: str, to: Path | None, retry: RetryPolicy | None) -> Remote:
@@ -350,9 +289,15 @@ def _open_address(url: str, to: Path | None, retry: RetryPolicy | None) -> Remot
     store, base = Store(url, retry), data_folder() / _folder_name(url)
     latest = base / "latest"  # the version that this address had when it was last opened
     known = latest.read_text(encoding="utf-8") if latest.exists() else ""
-    text = _downloaded_manifest(url, to or base / known) if offline() else _fetch_manifest(url, store)
-    manifest = _checked_manifest(text, url)
-    revision = hashlib.sha256(text).hexdigest()[:16]
+    if offline():
+        text = _downloaded_manifest(url, to or base / known)
+    else:
+        with _missing_release(url):
+            size = store.size(MANIFEST)
+            if size > TEXT_BYTES:
+                raise IndexFormatError(f"{url}/{MANIFEST}: expected at most {TEXT_BYTES:,} bytes, found {size:,}")
+            text = store.read(MANIFEST, 0, size)
+    manifest, revision = _parse_manifest(text, url), hashlib.sha256(text).hexdigest()[:16]
     folder = to or base / revision
     _write_manifest(folder, text, manifest, url)
     if to is None and known != revision:
@@ -361,15 +306,14 @@ def _open_address(url: str, to: Path | None, retry: RetryPolicy | None) -> Remot
     return Remote(url, revision, folder, _partial_folder(folder), manifest, store)
 
 
-def _fetch_manifest(url: str, store: Store) -> bytes:
+@contextmanager
+def _missing_release(url: str) -> Iterator[None]:
+    """Report a missing manifest as a missing release."""
     try:
-        size = store.size(MANIFEST)
-        if size > TEXT_BYTES:
-            raise IndexFormatError(f"{url}/{MANIFEST}: expected at most {TEXT_BYTES:,} bytes, found {size:,}")
-        return store.read(MANIFEST, 0, size)
+        yield
     except RemoteError as error:
         if error.missing:
-            raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it") from error
+            raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
         raise
 
 
@@ -381,11 +325,9 @@ def _downloaded_manifest(url: str, folder: Path) -> bytes:
         raise OfflineError(f"{url}: offline, and nothing of it is downloaded; go online to fetch it") from error
 
 
-def _checked_manifest(text: bytes, url: str) -> dict[str, str]:
-    try:
-        return parse_manifest(text.decode(), f"{url}/{MANIFEST}")
-    except UnicodeDecodeError as error:
-        raise IndexFormatError(f"{url}/{MANIFEST}: not UTF-8 text: {error}") from error
+def _parse_manifest(text: bytes, url: str) -> dict[str, str]:
+    # What is not UTF-8 becomes unprintable characters, which no line may have.
+    return parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}")
 
 
 def _write_manifest(folder: Path, text: bytes, manifest: dict[str, str], url: str) -> None:

@@ -45,7 +45,7 @@ FAMILIES: dict[str, tuple[remote.Family, int]] = {
     "mutated index or manifest": (local.mutations, 200),
     "hub: connection cut": (anywhere(remote.cut, on_hub), 12),
     "hub: bursts of 5xx": (anywhere(remote.busy, on_hub, longest=3, methods=remote.ANY, hub_retries=False), 9),
-    "hub: wrong bytes": (anywhere(remote.flip, on_hub), 12),
+    "hub: wrong bytes": (anywhere(remote.flip, on_hub, hub_retries=False), 12),
     "hub: wrong manifest": (flipped_manifest(on_hub), 12),
     "s3: connection cut": (anywhere(remote.cut, on_s3), 6),
     "s3: bursts of 5xx": (anywhere(remote.busy, on_s3, longest=3, methods=remote.ANY), 4),
