@@ -6,9 +6,11 @@ The hashes of a hostile release are right unless the case is about the manifest 
 from __future__ import annotations
 
 import os
+import socket
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -23,44 +25,27 @@ from tests.robustness.hostile.spoil import (
     ChangeFile,
     Spoil,
     actions,
-    another_name,
-    archive,
-    chain_of_links,
     content,
     dataset,
     deep,
-    deep_folder,
-    endless_heap,
-    endless_history,
     entry,
-    external,
-    filtered,
     folder_link_out,
-    group_link_out,
     hdf5,
-    inflating,
-    inflating_published,
-    inflating_within_bounds,
     info,
     json_file,
     lines,
     link,
     link_out,
     listed,
-    many_names,
-    many_sets_of_shards,
-    nested,
     npy,
-    pickled,
+    outside,
     pipe,
     replaced,
-    socket_at,
     sparse,
     table,
     teammate,
     theta,
     typed,
-    virtual,
 )
 from tests.servers.common import Fault, IgnoreRange, Long, Redirect
 
@@ -130,6 +115,35 @@ for _file in (INFO, HISTORIES, TASKS, PROVENANCE, TABLE, SHARD, "README.md", tea
     _too_large = r"expected at most|more than|truncated|twice|chunk table"
     add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, sparse)})
 
+
+def socket_at(path: Path, root: Path) -> None:
+    working_directory = Path.cwd()
+    os.chdir(path.parent)  # the address of a socket is at most about 100 bytes
+    try:
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(path.name)
+    finally:
+        os.chdir(working_directory)
+
+
+def chain_of_links(path: Path, root: Path) -> None:
+    path.symlink_to("two")
+    (path.parent / "two").symlink_to("three")
+    (path.parent / "three").symlink_to("../../outside/secret.txt")
+
+
+def deep_folder(root: Path) -> None:
+    working_directory = Path.cwd()
+    os.chdir(root / "meta")
+    try:
+        for _ in range(1500):
+            Path("d").mkdir()
+            os.chdir("d")
+        Path("file").touch()
+    finally:
+        os.chdir(working_directory)
+
+
 _folders = ("data", "teammates", "meta/chunks", "meta")
 add(
     "release",
@@ -176,6 +190,32 @@ _digits = content('{"format_version": ' + "9" * 10**6 + "}")
 add_hashed("malformed", {"info: too deep": replaced(INFO, deep(100_000)), "info: many digits": replaced(INFO, _digits)})
 add_hashed("printable characters", {"info: version with terminal codes": info(data_version="\x1b[2J")})
 
+
+def nested(levels: int) -> list:
+    """Return lists in lists."""
+    value: list = []
+    for _ in range(levels):
+        value = [value]
+    return value
+
+
+def many_names(values: list[dict[str, Any]]) -> list:
+    """Return lines with many short task ids and one long one; an array of them would take gigabytes."""
+    ids = [f"t{number}" for number in range(20_000)] + ["x" * 200_000]
+    return [values[0] | {"history_id": number, "task_id": name} for number, name in enumerate(ids)]
+
+
+def many_sets_of_shards(root: Path) -> None:
+    """Let each line name another set of 99,999 shards."""
+
+    def change(values: list[dict[str, Any]]) -> list:
+        names = (f"data/teammate/coord_simple/train-{k:05}-of-{99_999 - k:05}.h5" for k in range(500))
+        return [values[0] | {"history_id": number, "shard": name} for number, name in enumerate(names)]
+
+    lines(change)(root)
+    info(histories=500)(root)
+
+
 _deep_theta = lines(lambda values: values[0]["teammate"]["theta"].update(x=nested(400)), TASKS)
 _deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
 add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
@@ -196,6 +236,54 @@ _words = json_file(PROVENANCE, lambda value: [note.update(streams_recorded="many
 add_hashed("statistics", {"provenance: text as number": _words})
 
 # Chunk tables and chunks
+
+
+class Bomb:
+    """Object that creates a folder when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.target),)
+
+
+def pickled(path: Path, root: Path) -> None:
+    np.save(path, np.array([Bomb(outside(root) / "executed")], object), allow_pickle=True)
+
+
+def archive(path: Path, root: Path) -> None:
+    np.savez(path.with_suffix(".npz"), np.zeros(4, CHUNK_DTYPE))
+    path.with_suffix(".npz").rename(path)
+
+
+def gigabyte_of_zeros() -> bytes:
+    """Return a gigabyte of zeros, deflated."""
+    compressor = zlib.compressobj(9)
+    return b"".join(compressor.compress(bytes(2**24)) for _ in range(64)) + compressor.flush()
+
+
+def inflating(root: Path) -> None:
+    """Replace the first chunk by one that inflates to a gigabyte."""
+    data, path, rows = gigabyte_of_zeros(), root / SHARD, np.load(root / TABLE)
+    rows["offset"][0], rows["size"][0], rows["crc32"][0] = path.stat().st_size, len(data), zlib.crc32(data)
+    with path.open("ab") as stream:
+        stream.write(data)
+    np.save(root / TABLE, rows)
+
+
+def inflating_within_bounds(root: Path) -> None:
+    """Replace the first chunk by one of its size that inflates to more than a chunk has."""
+    rows = np.load(root / TABLE)
+    data = zlib.compress(bytes(300 * int(rows["size"][0])), 9)
+    assert len(data) <= rows["size"][0]
+    with (root / SHARD).open("r+b") as stream:
+        stream.seek(int(rows["offset"][0]))
+        stream.write(data.ljust(int(rows["size"][0]), b"\0"))
+        stream.seek(int(rows["offset"][0]))
+        rows["crc32"][0] = zlib.crc32(stream.read(int(rows["size"][0])))
+    np.save(root / TABLE, rows)
+
 
 _HEADER = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"
 _ROWS = str(CHUNK_DTYPE.descr)
@@ -219,6 +307,45 @@ add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating})
 add_hashed("does not inflate to", {"chunk that inflates a little": inflating_within_bounds})
 
 # Structures that libhdf5 would follow, load or believe
+
+
+def virtual(group: Any, out: Path) -> None:
+    layout = h5py.VirtualLayout((4, 120), "i1")
+    layout[0] = h5py.VirtualSource(str(out / "secret.h5"), "secret", (120,))
+    group.create_virtual_dataset("actions", layout)
+
+
+def external(group: Any, out: Path) -> None:
+    group.create_dataset("actions", (480,), "i1", external=[(str(out / "secret.txt"), 0, 480)])
+
+
+def filtered(group: Any, out: Path) -> None:
+    """Create a dataset whose filter libhdf5 would load from a plugin."""
+    low: Any = h5py
+    properties = low.h5p.create(low.h5p.DATASET_CREATE)
+    properties.set_chunk((1, 120))
+    properties.set_filter(32_004, low.h5z.FLAG_OPTIONAL, (1,))
+    space = low.h5s.create_simple((4, 120))
+    low.h5d.create(group.id, b"actions", low.h5t.NATIVE_INT8, space, properties)
+
+
+def another_name(file: Any, out: Path) -> None:
+    file["0"]["more"] = h5py.ExternalLink(str(out / "secret.h5"), "/secret")
+
+
+def group_link_out(file: Any, out: Path) -> None:
+    file.move("0", "kept")
+    file["0"] = h5py.ExternalLink(str(out / "secret.h5"), "/")
+
+
+def endless_heap(root: Path) -> None:
+    """Set the size of the free space in the heap of texts to zero."""
+    data = bytearray((root / SHARD).read_bytes())
+    left = data.index(b"GCOL") + 16 + 16 + 16  # after the heap's header and "coord_simple" with its own
+    assert data[left : left + 2] == b"\0\0"
+    data[left + 8 : left + 16] = bytes(8)
+    (root / SHARD).write_bytes(data)
+
 
 _SHARED: dict[str, dict[str, ChangeFile]] = {
     "lead out of the file": {
@@ -252,6 +379,26 @@ for _message, _changes in (_SHARED | _OF_SHARDS).items():
 add_hashed("not stored as libhdf5", {"shard: endless heap of texts": endless_heap})
 
 # Published files
+
+
+def endless_history(root: Path) -> None:
+    """Let all datasets of the first published history have 2**39 rows, as its line states."""
+    entry("histories_index.jsonl", T=2**39)(root)
+    with h5py.File(root / "histories.h5", "r+") as file:
+        group: Any = file["0"]
+        for name, old in list(group.items()):
+            rest, dtype = old.shape[1:], old.dtype
+            del group[name]
+            group.create_dataset(name, (2**39, *rest), dtype, chunks=(100, *rest), compression="gzip")
+
+
+def inflating_published(file: Any, out: Path) -> None:
+    """Replace the first chunks of the first published history by ones that inflate to a gigabyte."""
+    data = gigabyte_of_zeros()
+    for name in ("dones", "actions", "obs", "state"):
+        stored = file["0"][name].id
+        stored.write_direct_chunk((0,) * stored.rank, data)
+
 
 _H5, _INDEX = "histories.h5", "histories_index.jsonl"
 for _message, _changes in _SHARED.items():
