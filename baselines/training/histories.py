@@ -83,11 +83,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 def _load(histories: HistoryOptions) -> Dataset:
     names = [get_layout(name).name for name in histories.layouts]
     found = load_icrl4aht(histories.root, split=histories.split, layout=names, obs=histories.obs or "uint8")
-    return (
-        found
-        if histories.obs or not found.has_states
-        else load_icrl4aht(histories.root, split=histories.split, layout=names, obs="state")
-    )
+    return found if histories.obs or not found.has_states else found.with_options(obs="state")
 
 
 def _sampler(method: Method, dataset: Dataset, options: TrainOptions, mates: bool, order: ContextOrder) -> Any:

@@ -54,7 +54,7 @@ def measure(url: str, local: Path, windows: int, length: int) -> dict[str, Any]:
     """Stream, download, cut and go on, flip and repair; figures by name."""
     facts: dict[str, Any] = {}
     dataset = load_icrl4aht(url, obs="state", layout=LAYOUTS[0])
-    _ = dataset.holding  # the chunk table comes with the metadata, whole and once
+    _ = dataset.storage  # the chunk table comes with the metadata, whole and once
     facts["metadata_bytes"] = dataset.traffic.bytes
     before, began = dataset.traffic, time.perf_counter()
     batch = dataset.ad(batch_size=windows, length=length, seed=0)[0]

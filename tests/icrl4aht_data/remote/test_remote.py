@@ -108,7 +108,7 @@ def test_requests_and_bytes(many, kind, folders):
 def test_a_batch_requests_exactly_the_ranges_it_counts(many):
     with http_server(many) as server:
         dataset = load_icrl4aht(server.url, layout="demo_wide", obs="state")
-        _ = dataset.holding
+        _ = dataset.storage
         seen, before = len(server.log), dataset.traffic
         sampler = dataset.ad(batch_size=8, length=500, seed=1)
         sampler[0]
@@ -118,7 +118,7 @@ def test_a_batch_requests_exactly_the_ranges_it_counts(many):
         sampler[0]
         assert dataset.traffic - before == traffic, "downloaded chunks are not requested again"
         again = load_icrl4aht(server.url, layout="demo_wide", obs="state")
-        _ = again.holding
+        _ = again.storage
         before = again.traffic
         again.ad(batch_size=8, length=500, seed=1)[0]
         assert (again.traffic - before).requests == 0, "nor by another process: they are on disk"
