@@ -102,7 +102,7 @@ class Dataset(Selection):
         return read_provenance(self.origin.file(PROVENANCE))
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
-        """What rebuilds the environment of a history: layout names, map, recipes, episode lengths.
+        """Parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -118,7 +118,7 @@ class Dataset(Selection):
         }
 
     def recover_teammate(self, history_id: int) -> dict[str, Any]:
-        """What rebuilds the teammate of a history.
+        """Parameters that rebuild the teammate of a history.
 
         Args:
             history_id: a history of the release, whether selected or not.

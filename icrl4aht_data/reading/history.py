@@ -171,27 +171,20 @@ class LazyArray:
         return f"LazyArray({self._name}, shape={self.shape}, dtype={self.dtype})"
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
+        first, *rest = key if isinstance(key, tuple) else (key,)
         if isinstance(first, slice):
-            start, stop, step = first.indices(len(self))
-            low, high = (start, stop) if step > 0 else (stop + 1, start + 1)
-            rows = self._read(max(low, 0), max(high, low, 0))
-            rows = rows[::step] if step > 0 else rows[::-1][::-step]
-        elif isinstance(first, (int, np.integer)):
-            position = range(len(self))[first]
-            rows = self._read(position, position + 1)[0]
-        elif first is None or first is Ellipsis:
-            return self._read(0, len(self))[key]
-        else:
-            rows = self._read(0, len(self))[np.asarray(first)]
-        if not rest:
-            return rows
-        return rows[rest] if isinstance(first, (int, np.integer)) else rows[(slice(None), *rest)]
+            rows = range(len(self))[first]
+            low, high = sorted((rows[0], rows[-1])) if rows else (0, -1)
+            return self._read(low, high + 1)[:: rows.step][(slice(None), *rest)]
+        if isinstance(first, (int, np.integer)):
+            row = range(len(self))[first]
+            return self._read(row, row + 1)[(0, *rest)]
+        return self._read(0, len(self))[key]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return self[:].astype(dtype or self.dtype, copy=False)
 
     def _read(self, start: int, stop: int) -> np.ndarray:
         if self._name == "obs" and self._history.kind in FIELDS["obs"].absent:
-            return self._history._rendered(start, max(start, stop), self.dtype)
+            return self._history._rendered(start, stop, self.dtype)
         return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)

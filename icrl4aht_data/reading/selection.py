@@ -39,7 +39,7 @@ Names = str | Sequence[str] | None
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How histories are read.
+    """Options of reading histories.
 
     Args:
         obs: how observations are presented; see `history.OBS`.
@@ -104,12 +104,12 @@ class Selection:
 
     @property
     def obs(self) -> Obs:
-        """How observations are presented."""
+        """The presentation of observations; see `history.OBS`."""
         return self.options.obs
 
     @property
     def threads(self) -> int:
-        """How many threads decode and render."""
+        """Number of threads that decode and render."""
         return self.options.threads
 
     @property
@@ -200,7 +200,7 @@ class Selection:
 
     @cached_property
     def cache(self) -> CacheChoice:
-        """How samplers hold the selection, and why; see `sources.CACHE_MODES`."""
+        """The way in which samplers hold the selection, and the reason; see `sources.CACHE_MODES`."""
         absent = [name for name in self.shards if not self.origin.is_here(name)]
         if self.options.cache == "auto" and absent:
             return CacheChoice("stream", f"{len(absent)} of {len(self.shards)} shards are not downloaded")

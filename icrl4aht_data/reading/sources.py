@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.cache import cache_room, cached_arrays
@@ -35,7 +35,7 @@ _STEPS = 8192  # for fewer steps another thread costs more than it saves
 
 
 class CacheChoice(NamedTuple):
-    """How a selection is held.
+    """The way in which a selection is held.
 
     Attributes:
         cache: "ram", "mmap" or "stream".
@@ -64,7 +64,7 @@ class ReadRequest(NamedTuple):
 
 
 class HistorySource(Protocol):
-    """Where a sampler reads rows of histories, which it names by their positions in the selection."""
+    """Rows of the histories of a selection, which requests name by their positions in it."""
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
         """Carry out requests, in parallel. Chunks of a remote release that they need are downloaded first, all at once.
@@ -77,7 +77,7 @@ class HistorySource(Protocol):
 
 
 def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
-    """How to hold arrays of `size` bytes."""
+    """The way to hold arrays of `size` bytes."""
     if cache != "auto":
         return CacheChoice(cache, "as the option says")
     memory = free_memory()
@@ -120,20 +120,17 @@ def open_source(
         by_id = {entry.history_id: entry for entry in entries if entry.layout == name}
         members = [by_id[history_id] for history_id in sorted(by_id)]
         shards = [open_shard(entry.shard) for entry in members]
-        source.add(members, hold(get_layout(name), members, shards, threads))
+        source.add(members, hold(members, shards, threads))
     return source
 
 
-def _arrays_in_memory(
-    layout: Layout, entries: Sequence[Entry], shards: Sequence[Shard], threads: int
-) -> dict[str, np.ndarray]:
-    return _decode(layout, entries, shards, threads, lambda shape, dtype, name: np.zeros(shape, dtype))
+def _arrays_in_memory(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
+    return _decode(entries, shards, threads, lambda shape, dtype, name: np.zeros(shape, dtype))
 
 
-def _mapped_arrays(
-    layout: Layout, entries: Sequence[Entry], shards: Sequence[Shard], threads: int
-) -> dict[str, np.ndarray]:
+def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
     """Arrays of the cache folder whose key is the histories' content; decoded if they are not there."""
+    layout = shards[0].layout
     digest = hashlib.blake2b(f"{_VERSION} {layout.name} {layout.rows}".encode(), digest_size=16)
     for entry, shard in zip(entries, shards, strict=True):
         digest.update(f" {entry.T} {entry.episodes} ".encode() + shard.fingerprint(entry.history_id))
@@ -142,7 +139,7 @@ def _mapped_arrays(
         def make(shape: tuple[int, ...], dtype: np.dtype, name: str) -> np.memmap:
             return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape)
 
-        for array in _decode(layout, entries, shards, threads, make).values():
+        for array in _decode(entries, shards, threads, make).values():
             array.flush()  # type: ignore[attr-defined]
 
     steps, episodes = sum(entry.T for entry in entries), sum(entry.episodes for entry in entries)
@@ -151,18 +148,14 @@ def _mapped_arrays(
 
 
 def _decode(
-    layout: Layout,
-    entries: Sequence[Entry],
-    shards: Sequence[Shard],
-    threads: int,
-    make: Callable[[tuple[int, ...], np.dtype, str], np.ndarray],
+    entries: Sequence[Entry], shards: Sequence[Shard], threads: int, make: Callable[..., np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Field -> array (rows, ...) with the histories of one layout; `make(shape, dtype, name)` allocates one, zeroed."""
     arrays = {}
     for field in held_fields(shards[0].kind):
         if any(entry.has(field) for entry in entries):
             rows = sum(entry.rows(field) for entry in entries) + (len(entries) + 1 if field.axis == "T" else 0)
-            element = field.held(layout)
+            element = field.held(shards[0].layout)
             arrays[field.name] = make((rows, *element.shape), element.base, field.name)
     firsts = {axis: _first_rows(entries, axis) for axis in ("T", "E")}
 

@@ -14,7 +14,7 @@ from icrl4aht_data.sampling.observer import ArraySpec
 
 
 class ADBatch(NamedTuple):
-    """Windows of learning histories (paper, table of the AD batch).
+    """Windows of learning histories (paper, App. D.4).
 
     All arrays are 0 on padding, which follows the last step of a history or range shorter than L.
 

@@ -1,9 +1,10 @@
-"""What the AD and the DPT sampler share: a sequence of batches with declared arrays, shared between processes."""
+"""Base of the AD and the DPT sampler: a sequence of batches with declared arrays, divided among processes."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, Generic, TypedDict, TypeVar
 
 import numpy as np
@@ -37,12 +38,10 @@ class Sampler(Generic[B]):
     `len(sampler)` batches have as many steps as the selection; batches beyond exist as well.
 
     Attributes:
-        specs: field -> declared dtype and shape of every array of a batch.
         layouts: the layouts of the selection.
     """
 
     batch_type: type[B]
-    specs: dict[str, ArraySpec]
 
     def __init__(
         self,
@@ -71,6 +70,11 @@ class Sampler(Generic[B]):
             raise LabelsMissingError("teammate_actions = True, but some histories have none")
         self.teammate_actions = teammate_actions
         self._draws = HistoryDraws(dataset, weights, episodes, curriculum)
+
+    @cached_property
+    def specs(self) -> dict[str, ArraySpec]:
+        """Declared dtype and shape of every array of a batch."""
+        raise NotImplementedError
 
     def __len__(self) -> int:
         return max(1, int(self._draws.lengths.sum()) // (self.batch_size * self.length))
@@ -105,7 +109,7 @@ class Sampler(Generic[B]):
         return Batches(self, start, stop, prefetch=prefetch, device=device, reuse=reuse)
 
     def options(self) -> dict[str, Any]:
-        """What the batches are a function of, as JSON; stored with a position and compared when resuming."""
+        """All options that determine the batches, as JSON; stored with a position and compared when resuming."""
         return {
             "sampler": type(self).__name__,
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),

@@ -15,7 +15,7 @@ B = TypeVar("B")
 
 
 class BatchSource(Protocol[B]):
-    """What `Batches` needs of a sampler."""
+    """The methods of a sampler that `Batches` calls."""
 
     def batch(self, i: int, out: B | None = None) -> B:
         """Batch i, written into `out` if it is given."""
@@ -26,7 +26,7 @@ class BatchSource(Protocol[B]):
         ...
 
     def options(self) -> dict[str, Any]:
-        """What the batches are a function of, as JSON."""
+        """All options that determine the batches, as JSON."""
         ...
 
 
@@ -154,7 +154,7 @@ class Batches(Iterator[B], Generic[B]):
         self.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """The consumer's position, as JSON: the number of the next batch, and what the batches are a function of."""
+        """The consumer's position, as JSON: the number of the next batch, and the sampler's options."""
         return {"next": self.next, **self._sampler.options()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -20,7 +20,7 @@ CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
 
 
 class DPTBatch(NamedTuple):
-    """Queries with contexts (paper, table of the DPT batch).
+    """Queries with contexts (paper, App. D.4).
 
     With obs="state", observations are state records: uint8 (B, S) and (B, K, S) instead of (B, 5, 5, C) and
     (B, K, 5, 5, C).
@@ -145,13 +145,11 @@ class DPTSampler(Sampler[DPTBatch]):
             reads.append(ReadRequest("teammate_actions", context, rows, batch.context_teammate_actions))
         # An episode's last step is followed by the episode's end, never by the next episode's first step.
         episodes = steps // kept_steps
-        ends = np.nonzero(steps == episodes * kept_steps + kept_steps - 1) if self.dataset.has_states else ()
-        if ends:
-            end_records = np.empty((len(ends[0]), 1, next_records.shape[-1]), np.uint8)
-            reads.append(ReadRequest("episode_end_state", context[ends[0]], episodes[ends], end_records))
+        ends = np.nonzero((steps == episodes * kept_steps + kept_steps - 1) & self.dataset.has_states)
+        end_records = np.empty((len(ends[0]), 1, *next_records.shape[2:]), next_records.dtype)
+        reads.append(ReadRequest("episode_end_state", context[ends[0]], episodes[ends], end_records))
         self.dataset.storage.read(reads)
-        if ends:
-            next_records[ends] = end_records[:, 0]
+        next_records[ends] = end_records[:, 0]
 
         observer.observe(query, query_records, batch.query_obs)
         observer.observe(context, records, batch.context_obs)
@@ -200,7 +198,7 @@ class DPTSampler(Sampler[DPTBatch]):
     # episode's last in one without. They are drawn by number and mapped to steps.
 
     def _transitions(self, steps: np.ndarray) -> np.ndarray:
-        """How many of a history's first `steps` steps are transitions."""
+        """Number of transitions among a history's first `steps` steps."""
         return steps if self.dataset.has_states else steps - -(-steps // self._draws.kept_steps)
 
     def _step_of(self, transition: np.ndarray) -> np.ndarray:

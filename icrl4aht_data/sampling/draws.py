@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -174,21 +173,16 @@ def _episode_range(episodes: Episodes | None, counts: np.ndarray) -> tuple[np.nd
     Raises:
         OptionError: if the range is malformed, or some history has no episode in it.
     """
-    if episodes is None:
-        return np.zeros_like(counts), counts
-    if not isinstance(episodes, tuple) or len(episodes) != 2:
-        raise OptionError(f"episodes = {episodes!r}: expected a pair such as (0, 10), (None, 10) or (-10, None)")
-    edges = []
-    for edge, default in zip(episodes, (np.zeros_like(counts), counts), strict=True):
-        try:
-            number = None if edge is None else operator.index(edge)
-        except TypeError as error:
-            raise OptionError(f"episodes = {episodes!r}: expected integers or None") from error
-        if number is None:
-            edges.append(default)
-        else:
-            edges.append(np.clip(number + counts if number < 0 else np.full_like(counts, number), 0, counts))
-    first, stop = edges
+    try:
+        if not isinstance(episodes, tuple | None):
+            raise TypeError
+        bounds = slice(*(episodes or (None, None)))
+        distinct, number = np.unique(counts, return_inverse=True)
+        first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
+    except TypeError as error:
+        raise OptionError(
+            f"episodes = {episodes!r}: expected a pair of integers or None such as (0, 10), (None, 10) or (-10, None)"
+        ) from error
     if (first >= stop).any():
         fewest = int(counts[first >= stop].min())
         raise OptionError(f"episodes = {episodes!r}: a history of {fewest} episodes has none of them")

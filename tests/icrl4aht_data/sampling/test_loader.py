@@ -335,7 +335,7 @@ class TestPrefetch:
         sampler = load_icrl4aht(lite[0], layout="demo_wide", obs="state").ad(batch_size=3, length=9)
 
         def workers() -> int:
-            return sum(thread.name == "icrl4aht-prefetch" for thread in threading.enumerate())
+            return sum(thread.name.startswith("icrl4aht-prefetch") for thread in threading.enumerate())
 
         with sampler.batches(prefetch=1) as batches:
             next(batches)
