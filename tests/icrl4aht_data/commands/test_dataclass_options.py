@@ -31,7 +31,7 @@ class Options:
     teammate_actions: bool = option_field(False, "Also input actions.", flags=("--ta",))
     normalize: bool = option_field(True, "Normalize.")
     limit: int | None = option_field(None, "Most steps.", at_least=1, default_text="no limit")
-    folder: Path | None = option_field(None, "A folder.")  # noqa: RUF009
+    folder: Path | None = option_field(None, "A folder.")
     internal: int = 3
     widths: Widths = field(default_factory=Widths)
 
