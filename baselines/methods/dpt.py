@@ -74,7 +74,7 @@ class DPTMemory(NamedTuple):
 class DPT(nn.Module):
     """Transitions and queries to policies.
 
-    `whole_episodes` says whether an acting ego's context grows by complete episodes, as in the paper, or by steps.
+    `finished_episodes_only`: an acting ego's context grows by complete episodes, as in the paper; otherwise by steps.
     """
 
     tokens: TransitionTokens
@@ -82,7 +82,7 @@ class DPT(nn.Module):
     head: nn.Module
     obs_shape: tuple[int, ...]
     next_obs: nn.Module | None = None
-    whole_episodes: bool = True
+    finished_episodes_only: bool = True
 
     def __call__(self, context: Transition, query: Num[Array, "B ..."], deterministic: bool = True) -> DPTOutput:
         """Returns the answers to a query (B, ..) after every part of a context (B, K)."""
@@ -118,7 +118,7 @@ class DPT(nn.Module):
         transition = Transition(memory.last_obs, step.prev_action, step.prev_reward, obs, step.prev_teammate_action)
         token, query = self.tokens.context(transition), self.tokens.query(obs)
         written = memory.written + (memory.started & ~done)
-        complete = jnp.where(done, written, memory.complete) if self.whole_episodes else written
+        complete = jnp.where(done, written, memory.complete) if self.finished_episodes_only else written
         answer = self._answer_from_tokens if isinstance(memory.stored, RingBuffer) else self._answer_from_caches
         feature, stored = answer(token, query, memory, written, complete)
         return self.head(feature), DPTMemory(stored, written, complete, obs, jnp.bool_(True))
@@ -145,11 +145,11 @@ class DPT(nn.Module):
         return self.trunk.step(query, stored, jnp.int32(slots), complete, visible_to_query)
 
 
-def dpt(options: ModelOptions, world: World, whole_episodes: bool = True) -> Method:
+def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
     """Returns the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
     tokens = make_tokens(TransitionTokens, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
-    model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, whole_episodes)
+    model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)
 
     def loss(params: Any, slow: Any, batch: DPTBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         context, query = batch_transitions(batch, world.view)

@@ -29,7 +29,7 @@ TokensType = TypeVar("TokensType", bound=Tokens)
 
 
 class World(NamedTuple):
-    """What a model needs to know of where it acts.
+    """Description of the world that a model acts in.
 
     Attributes:
         encoder: dtype -> module from observations to features.

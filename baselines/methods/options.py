@@ -17,7 +17,7 @@ SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 76
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """How a model is built; the defaults are the paper's (App. E.5).
+    """Architecture of a model; the defaults are the paper's (App. E.5).
 
     Raises:
         OptionError: if a value is out of bounds, or the width is not a multiple of twice the heads.

@@ -27,7 +27,7 @@ BatchView = Callable[[Array, Array | None], Array]
 
 
 class StepInput(NamedTuple):
-    """What an ego knows before an action. Before a history's first step all of `prev_*` is zero (paper, App. E.2).
+    """Input of an ego before an action. Before a history's first step all of `prev_*` is zero (paper, App. E.2).
 
     Attributes:
         obs: (*B, ..), the ego's observation, uint8 or float.

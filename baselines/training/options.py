@@ -11,7 +11,7 @@ from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How a model is trained; the defaults are the paper's (App. E.5).
+    """Settings of a training run; the defaults are the paper's (App. E.5).
 
     Raises:
         OptionError: if a value is out of bounds.
@@ -37,7 +37,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class HistoryOptions:
-    """Which histories a run is trained on.
+    """Choice of the histories that a run is trained on.
 
     Attributes:
         layouts: names of training layouts, with observations of one shape.
