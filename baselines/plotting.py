@@ -33,7 +33,7 @@ class SweepPoint(NamedTuple):
 
 
 def plot_training_log(metrics: Path, path: Path, title: str) -> None:
-    """Plot every number of a run's metrics.jsonl over the training steps: one panel each, one line per part of the data."""
+    """Plot every number of a run's metrics.jsonl over the training steps: a panel each, a line per part of the data."""
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
     names = list(dict.fromkeys(name for line in lines for name in line if name not in ("step", "part")))
     parts = list(dict.fromkeys(line["part"] for line in lines))

@@ -25,12 +25,14 @@ import jax
 import numpy as np
 
 from baselines.agents.egos import Acting, learned
-from baselines.evaluate.evaluator import Game, evaluate, play, prepare_rollout
+from baselines.evaluate.evaluator import PreparedRollout, evaluate, play_episodes, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
-from baselines.methods.method import Method, ModelOptions
+from baselines.methods.method import Method
+from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
-from baselines.training.trainer import Trainer, TrainOptions
+from baselines.training.options import TrainOptions
+from baselines.training.trainer import Trainer
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
@@ -158,9 +160,9 @@ def _ego(method: Method, params: Any, context: int, acting: Acting) -> Any:
     return lambda layout: policy
 
 
-def _seconds_per_episode(game: Game, episodes: int) -> float:
+def _seconds_per_episode(game: PreparedRollout, episodes: int) -> float:
     started = time.perf_counter()
-    for played in play(game, episodes):
+    for played in play_episodes(game, episodes):
         jax.block_until_ready(played)
     return (time.perf_counter() - started) / episodes
 

@@ -1,8 +1,8 @@
 """The positive control: in two small worlds where adaptation in context is possible, these models adapt.
 
 Methods, tokens, trainer and acting are those of the benchmark. DPT is compared with Thompson sampling and AD with the
-algorithm that it distils on Bernoulli bandits; AD also plays Dark Room with goals that it was not trained on. Each model
-must fail with its context cut off, which shows that the world requires adaptation.
+algorithm that it distils on Bernoulli bandits; AD also plays Dark Room with goals that it was not trained on. Each
+model must fail with its context cut off, which shows that the world requires adaptation.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ def play_bandits(
 
 
 def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns learning histories of a model-based learner in Dark Rooms: cells and actions int32, rewards float32 (N, T).
+    """Returns histories of a model-based learner in Dark Rooms: cells and actions int32, rewards float32 (N, T).
 
     The learner knows how it moves but not where the goal is. It walks from one random cell to the next until it is
     rewarded, and from then on straight to the cell of that reward. Half of its moves are random at first, linearly

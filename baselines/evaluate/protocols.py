@@ -14,7 +14,7 @@ from icrl4aht_data.errors import OptionError, unknown
 
 @dataclass(frozen=True)
 class Protocol:
-    """How tasks are evaluated.
+    """Rules of an evaluation.
 
     Attributes:
         name: as in `PROTOCOLS`.

@@ -17,7 +17,7 @@ FORBIDDEN = {
     "generation": {"baselines"},
     "baselines": set(),
 }
-BASELINES_MAY_USE = ("generation.env", "generation.teammates", "generation.learners.network")
+BASELINES_MAY_USE = ("generation.env", "generation.teammates", "generation.learners", "generation.policy")
 HEAVY = ("jax", "flax", "optax", "matplotlib", "PIL", "torch", "datasets", "huggingface_hub", "grain", "pyarrow")
 
 
