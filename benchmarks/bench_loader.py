@@ -155,7 +155,7 @@ class Ours:
     """Our samplers, opened once, and the buffer that they write into: one at a time, since a float32 batch is large."""
 
     def __init__(self, folder: Path, batch: int, length: int, threads: int) -> None:
-        self._folder, self._threads = folder, threads
+        self._dataset, self._threads = load_icrl4aht(folder / "lite", threads=threads), threads
         self._batch, self._length = batch, length
         self._samplers: dict[tuple[str, str], ADSampler] = {}
         self._obs, self._buffer = "", None
@@ -165,7 +165,7 @@ class Ours:
         sampler = self._samplers.get((cache, obs))
         if sampler is None:
             held: Any = cache.split(",")[0]
-            dataset = load_icrl4aht(self._folder / "lite", cache=held, obs=obs, threads=self._threads)
+            dataset = self._dataset.with_options(cache=held, obs=obs)
             sampler = self._samplers[cache, obs] = dataset.ad(batch_size=self._batch, length=self._length, seed=1)
         if obs != self._obs:
             self._buffer = None
@@ -327,7 +327,7 @@ def write_long_index(root: Path, lines: int) -> None:
                 **dict(zip(scores, rng.normal(30, 10, 4).tolist(), strict=True)),
             }
             stream.write(json.dumps(line) + "\n")
-    info = source.info | {"histories": lines}
+    info = source.info.to_json() | {"histories": lines}
     (root / "meta" / "info.json").write_text(json.dumps(info))
 
 

@@ -87,9 +87,7 @@ def _load(histories: HistoryOptions) -> Dataset:
     """Opens the release, with state records if there are any and nothing else is required."""
     names = [get_layout(name).name for name in histories.layouts]
     found = load_icrl4aht(histories.root, split=histories.split, layout=names, obs=histories.obs or "uint8")
-    if histories.obs or not found.has_states:
-        return found
-    return load_icrl4aht(histories.root, split=histories.split, layout=names, obs="state")
+    return found if histories.obs or not found.has_states else found.with_options(obs="state")
 
 
 def _sampler(

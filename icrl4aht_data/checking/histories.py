@@ -50,7 +50,7 @@ def _check_history(history: History, index: Index, seen: dict[tuple[str, bytes],
 def _check_chunks(shard: Shard, report: Report) -> set[int]:
     """Decode every chunk; the histories that have a damaged one."""
     damaged = set()
-    for row, history_id, field_ in shard.chunk_rows():
+    for row, history_id, field_ in shard.chunks():
         try:
             shard.decode(row, history_id, field_)
         except Icrl4ahtError as error:

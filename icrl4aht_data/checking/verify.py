@@ -16,6 +16,7 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.checking.histories import _check_chunks, _check_history
 from icrl4aht_data.checking.report import NamedProgress, Report
+from icrl4aht_data.checking.structure import check_bytes_between, check_structure
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError
 from icrl4aht_data.format.checkpoints import checkpoint_files
@@ -310,7 +311,7 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue
-        for fault in shard.check_between() + shard.check_structure(values=report.deep):
+        for fault in check_bytes_between(shard) + check_structure(shard, values=report.deep):
             report.add(name, fault)
         damaged = _check_chunks(shard, report)
         seen: dict[tuple[str, bytes], int] = {}
