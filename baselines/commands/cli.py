@@ -10,10 +10,9 @@ import click
 from rich.console import Console
 
 from baselines.commands.options import (
-    COUNT,
-    EGO,
-    METHOD,
-    PROTOCOL,
+    EGO_NAME,
+    METHOD_NAME,
+    PROTOCOL_NAME,
     HostPort,
     acting_option,
     default_batch_size,
@@ -33,10 +32,15 @@ from baselines.commands.options import (
 )
 from baselines.methods.options import SIZES, ModelOptions
 from baselines.training.options import HistoryOptions, TrainOptions
+from generation.teammates.instances import INSTANCES, named_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
+    COUNT,
+    COUNT_OR_NONE,
     LAYOUT,
+    SEED,
     SETTINGS,
     TRACK,
     Folder,
@@ -52,7 +56,7 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
 
-console = Console(soft_wrap=True)
+_console = Console(soft_wrap=True)
 
 
 _SECTIONS = {
@@ -89,7 +93,7 @@ def cli() -> None:
         "python -m baselines evaluate --agent oracle --layout demo_wide --tasks 1 --episodes 5 --out runs/oracle",
     ),
 )
-@click.option("--agent", type=EGO, required=True, help="stay, random, oracle, or a folder that `train` made.")
+@click.option("--agent", type=EGO_NAME, required=True, help="stay, random, oracle, or a folder that `train` made.")
 @acting_option
 @protocol_option
 @click.option(
@@ -127,7 +131,6 @@ def evaluate_command(
     from baselines.evaluate.evaluator import evaluate
     from baselines.evaluate.protocols import get_protocol, limit_tasks
     from baselines.report.results import note_results
-    from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 
     paths = [manifest] if manifest else [manifest_path(name, "test") for name in track]
     ego = find_ego("--agent", agent, acting)
@@ -155,7 +158,7 @@ def evaluate_command(
         )
     note_results(out, Path(agent) if ego.details else None, chosen if manifest else ())
     noun = "result" if len(chosen) == 1 else "results"
-    console.print(f"{len(chosen)} {noun} in {out}; `python -m baselines report {out}` shows them")
+    _console.print(f"{len(chosen)} {noun} in {out}; `python -m baselines report {out}` shows them")
 
 
 @cli.command("report")
@@ -197,28 +200,27 @@ def report_command(runs: tuple[Path, ...], out: Path | None, html: Path | None, 
 @click.option(
     "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate: its family, H1 to H4, and number."
 )
-@click.option("--ego", type=EGO, default="random", help="stay, random, oracle, or a folder that `train` made.")
+@click.option("--ego", type=EGO_NAME, default="random", help="stay, random, oracle, or a folder that `train` made.")
 @protocol_option
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Seed of the episode.")
+@click.option("--seed", type=SEED, default=0, help="Seed of the episode.")
 @click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
 def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
     """Play an episode and draw it as a GIF."""
     from baselines.evaluate.protocols import get_protocol
     from baselines.report.episode_gifs import episode_gif
-    from generation.teammates.instances import named_task
 
     task = named_task(layout, teammate)
     earned = episode_gif(out, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
-    console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
+    _console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
 
 
 @cli.command("headroom")
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/headroom", help="Write the results here.")
 @click.option(
     "--protocol",
-    type=PROTOCOL,
+    type=PROTOCOL_NAME,
     multiple=True,
-    default=lambda: tuple(PROTOCOL.valid()),
+    default=lambda: tuple(PROTOCOL_NAME.valid()),
     show_default="all",
     help="published or seeded; repeat for several.",
 )
@@ -232,7 +234,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...]) -> None:
     with bars() as show:
         runs = measure_headroom(out, protocol, show)
     for path in write_headroom_cards(runs):
-        console.print(f"wrote {path}")
+        _console.print(f"wrote {path}")
 
 
 @cli.command("drift")
@@ -253,7 +255,6 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     from baselines.evaluate.drift import measure_drift
     from baselines.evaluate.protocols import get_protocol
     from baselines.training.histories import read_trained
-    from generation.teammates.instances import INSTANCES, named_task
 
     trained = read_trained(run)
     fill_window = -(-trained.context // get_protocol(protocol).steps)
@@ -280,7 +281,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
         "python -m baselines train ad --layout demo_wide --steps 20 --context 50 --out runs/small",
     ),
 )
-@click.argument("method", type=METHOD)
+@click.argument("method", type=METHOD_NAME)
 @click.option(
     "--layout",
     "layouts",
@@ -303,7 +304,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @tensorboard_option
 @click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines.")
 @click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes.")
-@click.option("--process", type=click.IntRange(min=0), default=0, help="With --coordinator: number of this process.")
+@click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process.")
 def train_command(
     method: str,
     layouts: tuple[str, ...],
@@ -349,7 +350,7 @@ def train_command(
 
         run_training(job.method, job.data, job.options, folder, job.about, tensorboard=tensorboard, done=done)
     noun = "step" if options.steps == 1 else "steps"
-    console.print(
+    _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
 
@@ -454,7 +455,7 @@ def demo_command(out: Path) -> None:
     """
     from baselines.demo import run_demo
 
-    run_demo(out, console)
+    run_demo(out, _console)
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ import click
 from baselines.methods.options import ModelOptions
 from baselines.training.options import TrainOptions
 from icrl4aht_data.commands.dataclass_options import dataclass_options
-from icrl4aht_data.commands.options import FAMILY, LAYOUT, Folder, Names, Root
+from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
 
 
@@ -57,16 +57,13 @@ class HostPort(click.ParamType):
         return value
 
 
-COUNT = click.IntRange(min=1)
-"""Integers of at least 1."""
-
-EGO = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
-METHOD = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
-PROTOCOL = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
+EGO_NAME = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
+METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
+PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
 protocol_option = click.option(
     "--protocol",
-    type=PROTOCOL,
+    type=PROTOCOL_NAME,
     default="seeded",
     help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
 )
@@ -117,7 +114,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         click.option(
             "--method",
             "methods",
-            type=METHOD,
+            type=METHOD_NAME,
             multiple=True,
             default=("ad", "dpt"),
             help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",

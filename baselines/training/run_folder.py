@@ -18,7 +18,7 @@ from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write
 RUN_FORMAT = 2
 """Version of the layout of run folders: 2 since checkpoints are safetensors files."""
 
-CONFIG, CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
+CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
 
 
 def format_versions() -> dict[str, Any]:

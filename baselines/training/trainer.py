@@ -23,7 +23,7 @@ from jaxtyping import Array, Int
 from baselines.methods.method import Method
 from baselines.plotting import plot_training_log
 from baselines.training.options import TrainOptions
-from baselines.training.run_folder import CHECKPOINTS, CURVES, TENSORBOARD, format_versions, open_run
+from baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
 from baselines.training.tensorboard import TensorBoardLog, check_installed
 from generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock
 from icrl4aht_data.errors import OptionError
@@ -242,7 +242,7 @@ def train(
                 log.sync()
                 checkpoints.save(state, step)
         if writes:
-            plot_training_log(folder / METRICS, folder / CURVES, method.name)
+            plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
     return state
 
 
