@@ -25,12 +25,14 @@ import jax
 import numpy as np
 
 from baselines.agents.egos import Acting, learned
-from baselines.evaluate.evaluator import Game, evaluate, play, prepare_rollout
+from baselines.evaluate.evaluator import PreparedRollout, evaluate, play_episodes, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
-from baselines.methods.method import Method, ModelOptions
+from baselines.methods.method import Method
+from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
-from baselines.training.trainer import Trainer, TrainOptions
+from baselines.training.options import TrainOptions
+from baselines.training.trainer import Trainer
 from benchmarks.common import COUNT, elapsed, print_line
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
@@ -131,26 +133,22 @@ def compare_acting(layout: Layout, model: ModelOptions, context: int, steps: int
     method, params = untrained(layout, model)
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
     ways: dict[Acting, int] = {"cached": 10 * steps, "exact": steps}  # so that the start of an episode weighs little
-    games = [
-        prepare_rollout(
-            _ego(method, params, context, acting), tasks, dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=n)
-        )
-        for acting, n in ways.items()
-    ]
-    seconds: list[list[float]] = [[], []]
-    for number in range(rounds + 1):
-        for way, (game, n) in enumerate(zip(games, ways.values(), strict=True)):
-            taken = _seconds_per_episode(game, 1) / n
-            if number:
-                seconds[way].append(taken)
-    rates = [len(tasks) / statistics.median(taken) for taken in seconds]
+    seconds: dict[Acting, list[float]] = {"cached": [], "exact": []}
+    prepared = {}
+    for acting, n in ways.items():
+        protocol = dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=n)
+        prepared[acting] = prepare_rollout(_ego(method, params, context, acting), tasks, protocol)
+        elapsed(lambda acting=acting: _play_episode(prepared[acting]))  # compiles
+    for acting, n in list(ways.items()) * rounds:
+        seconds[acting].append(elapsed(lambda acting=acting: _play_episode(prepared[acting])) / n)
+    cached, exact = (len(tasks) / statistics.median(taken) for taken in seconds.values())
     _print(
         part="act",
         context=context,
         tasks=len(tasks),
-        cached_steps_per_second=round(rates[0], 1),
-        exact_steps_per_second=round(rates[1], 2),
-        ratio=round(statistics.median(e / c for c, e in zip(*seconds, strict=True)), 1),
+        cached_steps_per_second=round(cached, 1),
+        exact_steps_per_second=round(exact, 2),
+        ratio=round(statistics.median(e / c for c, e in zip(*seconds.values(), strict=True)), 1),
         target=_TARGET_RATIO,
     )
 
@@ -160,11 +158,9 @@ def _ego(method: Method, params: Any, context: int, acting: Acting) -> Any:
     return lambda layout: policy
 
 
-def _seconds_per_episode(game: Game, episodes: int) -> float:
-    started = time.perf_counter()
-    for played in play(game, episodes):
+def _play_episode(prepared: PreparedRollout) -> None:
+    for played in play_episodes(prepared, 1):
         jax.block_until_ready(played)
-    return (time.perf_counter() - started) / episodes
 
 
 def evaluate_all_tasks(model: ModelOptions, context: int, protocol: Protocol) -> None:

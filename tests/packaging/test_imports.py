@@ -23,11 +23,11 @@ ORDER = {
     "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling dataset interop plotting "
     "writing checking publishing commands",
     "generation": "progress env policy learners teammates profiles collection populations releases planning cli",
-    "baselines": "methods training agents evaluate control report experiments demo commands",
+    "baselines": "plotting methods training agents evaluate control report experiments demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
 
-BASELINES_MAY_USE = ("generation.env", "generation.policy", "generation.teammates", "generation.learners.network")
+BASELINES_MAY_USE = ("generation.env", "generation.policy", "generation.teammates", "generation.learners")
 JAX = {"jax", "jaxlib", "flax", "optax"}
 JAX_ON_DEMAND = {"icrl4aht_data.sampling.batches"}
 """The modules of the reader with functions that import JAX: they put batches on a device if the caller has one."""
