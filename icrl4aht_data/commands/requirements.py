@@ -17,7 +17,7 @@ PACKAGE = "icrl4aht-data"
 _FOR_DEVELOPERS = ("dev", "peers", "all")
 """Extras that bring what work on this project needs, not what its use needs."""
 
-_MODULES = {"PIL": "pillow", "orbax": "orbax-checkpoint"}
+_MODULES = {"PIL": "pillow"}
 """Modules that are not named after what is installed."""
 
 

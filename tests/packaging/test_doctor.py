@@ -241,10 +241,9 @@ def test_requirements_come_from_the_metadata(monkeypatch):
 def test_every_extra_for_users_brings_something():
     assert {need.extra for need in needs()} == {
         None,
-        *("plot", "generation", "baselines", "tensorboard", "hf", "s3", "grain", "torch", "cluster"),
+        *("plot", "generation", "tensorboard", "hf", "s3", "grain", "torch", "cluster"),
     }
     assert extra_with("PIL.Image") == "plot"
-    assert extra_with("orbax.checkpoint") == "baselines"
 
 
 def test_a_package_that_is_not_installed(elsewhere, monkeypatch):

@@ -23,7 +23,7 @@ ORDER = {
     "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling dataset interop plotting "
     "writing checking publishing commands",
     "generation": "progress env policy learners teammates profiles collection populations releases planning cli",
-    "baselines": "methods training agents evaluate control report experiments demo commands",
+    "baselines": "plotting methods training agents evaluate control report experiments demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
 

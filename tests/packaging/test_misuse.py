@@ -91,9 +91,9 @@ MISUSED = [
     ),
     ("baselines", "train da --layout demo_wide", "unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline."),
     ("baselines", "train ad --layout demo_wide --size smal", "unknown size 'smal'; valid: small, medium, large."),
-    ("baselines", "train ad --layout demo_wide --order rnd", "unknown order 'rnd'; valid: contiguous, random."),
-    ("baselines", "train ad --layout demo_wide --batch-size 0", "0: expected a whole number from 1 on"),
-    ("baselines", "train ad --layout demo_wide --learning-rate nan", "nan: expected a number above 0"),
+    ("baselines", "train ad --layout demo_wide --order rnd", "'rnd' is not one of 'contiguous', 'random'."),
+    ("baselines", "train ad --layout demo_wide --batch-size 0", "0 is not in the range x>=1"),
+    ("baselines", "train ad --layout demo_wide --learning-rate nan", "nan is not a finite number"),
     ("baselines", "train ad --layout demo_wide --coordinator x", "x: expected HOST:PORT, such as 10.0.0.1:6000"),
     ("baselines", "train ad --layout demo_wide --process 1", "expected a --coordinator HOST:PORT as well"),
     (
