@@ -84,7 +84,7 @@ class Tree:
             if name not in seen:
                 seen.add(name)
                 todo += self._top.get(name, ())
-                todo += [name.rpartition(".")[0]] if name in self.modules and "." in name else []
+                todo += {name.rpartition(".")[0]} & self.modules  # a package is imported before its modules
         return {name.split(".")[0] for name in seen - self.modules} - self._installed
 
     def _read(self, importer: str, node: ast.AST, how: str = "") -> Iterator[Import]:
