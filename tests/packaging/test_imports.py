@@ -22,7 +22,7 @@ ORDER = {
     "": "icrl4aht_data generation baselines benchmarks tests",
     "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling dataset interop plotting "
     "writing checking publishing commands",
-    "generation": "progress env policy learners teammates profiles collection populations releases planning cli",
+    "generation": "progress plotting env policy learners teammates profiles collection populations releases planning cli",
     "baselines": "plotting methods training agents evaluate control report experiments demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
@@ -137,16 +137,16 @@ def downwards(tree: Tree) -> Iterator[str]:
 
 def acyclic(tree: Tree) -> Iterator[str]:
     """Cycles between files, also those hidden in functions and under TYPE_CHECKING."""
-    graph: dict[str, set[str]] = {name: set() for name in tree.modules}
+    graph: dict[str, dict[str, None]] = {name: {} for name in sorted(tree.modules)}  # ordered, unlike sets
     for found in tree.own:
-        graph[found.importer].add(found.imported)
+        graph[found.importer][found.imported] = None
     while True:
         try:
             return TopologicalSorter(graph).prepare()
         except CycleError as error:
             cycle = error.args[1]
             yield " is imported by ".join(cycle) + ": a cycle"
-            graph[cycle[1]].discard(cycle[0])
+            graph[cycle[1]].pop(cycle[0])
 
 
 def at_the_top(tree: Tree) -> Iterator[str]:
