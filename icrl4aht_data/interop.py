@@ -1,11 +1,11 @@
-"""Samplers and histories for other libraries' loaders.
+"""Samplers and histories for the data loaders of other libraries.
 
-A sampler is a sequence of batches that are functions of their number alone, so most loaders take it as it is:
+A sampler is a sequence of batches, each a pure function of its number, so most loaders accept it directly:
 
-    plain loop   for batch in sampler.batches(): ...
-    Grain        grain.MapDataset.source(sampler); shuffling is the sampler's own
-    PyTorch      torch_loader(sampler, workers=4); extra `torch`
-    Hugging Face hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); extra `hf`
+    plain loop     for batch in sampler.batches(): ...
+    Grain          grain.MapDataset.source(sampler); the sampler itself shuffles
+    PyTorch        torch_loader(sampler, workers=4); needs the extra `torch`
+    Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import NotStoredError, OptionError
+from icrl4aht_data.reading.selection import Selection
+from icrl4aht_data.sampling.base import Sampler
 from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import datasets
     from torch.utils.data import DataLoader
-
-    from icrl4aht_data.dataset import Dataset
-    from icrl4aht_data.sampling.base import Sampler
 
 
 def torch_loader(
@@ -35,20 +34,21 @@ def torch_loader(
     context: str = "spawn",
     **options: Any,
 ) -> DataLoader:
-    """A DataLoader over batches start..stop, as tensors, in order on any number of workers.
+    """A DataLoader over batches start..stop as named tuples of tensors, in order for any number of workers.
 
-    With workers, hold the data with cache="mmap" or "stream": each spawned worker would decode its own copy for "ram".
-    Shuffling is the sampler's own; to resume, give the next number as `start`.
+    With workers, load the dataset with cache="mmap" or "stream": for "ram" each spawned worker decodes its own copy.
+    The sampler itself shuffles; to resume, give the number of the next batch as `start`.
 
     Args:
-        sampler: of batches.
-        start, stop: numbers; `stop` is `len(sampler)` by default.
-        workers: processes; they are kept between epochs.
-        context: "spawn", "forkserver" or "fork". Fork only while the process runs no threads, JAX's included.
-        options: more of DataLoader's, such as prefetch_factor or pin_memory.
+        sampler: makes the batches.
+        start: number of the first batch.
+        stop: number after the last batch; `len(sampler)` by default.
+        workers: number of processes, which are kept between epochs; 0 makes batches in this process.
+        context: "spawn", "forkserver" or "fork". Fork only while the process runs no threads, including JAX's.
+        options: further options of DataLoader, such as prefetch_factor or pin_memory.
 
     Raises:
-        OptionError: if PyTorch is not installed.
+        OptionError: if PyTorch is not installed, or for numbers that are not integers from 0.
     """
     try:
         from torch.utils.data import DataLoader
@@ -56,7 +56,7 @@ def torch_loader(
         raise OptionError("a DataLoader needs PyTorch: pip install 'icrl4aht-data[torch]'") from error
     numbers = range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0))
     if workers and sampler.dataset.cache.cache != "stream":
-        _ = sampler.dataset.holding  # decoded here once: mapped by the workers, or inherited by forked ones
+        _ = sampler.dataset.storage  # decoded here once: mapped by the workers, or inherited by forked ones
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
     return DataLoader(
         sampler,  # type: ignore[arg-type]
@@ -68,19 +68,25 @@ def torch_loader(
     )
 
 
-def hf_index(dataset: Dataset) -> datasets.Dataset:
-    """The selection's index as a `datasets.Dataset`, one row a history."""
+def hf_index(dataset: Selection) -> datasets.Dataset:
+    """The selection's index entries as a `datasets.Dataset`, one row for each history, with the columns of `Entry`.
+
+    Raises:
+        OptionError: if `datasets` is not installed.
+    """
     return _datasets().Dataset.from_list([entry.to_json() for entry in dataset.entries])
 
 
-def hf_episodes(dataset: Dataset) -> datasets.Dataset:
-    """The selection's episodes as a `datasets.Dataset`, one row each, in order.
+def hf_episodes(dataset: Selection) -> datasets.Dataset:
+    """The selection's episodes as a `datasets.Dataset`, one row for each episode, in order.
 
-    Columns: history_id, task_id, layout, episode (number in its history), return, and for each step actions, rewards,
-    teammate_actions, expert_actions where the history has them, and state (bytes; see `overcooked.state`).
+    Columns: history_id, task_id, layout, episode (number in its history, from 0), return, and lists with one element
+    for each step: actions, teammate_actions, rewards, expert_actions (null if the history has none) and state (bytes of
+    the state record; see `overcooked.state`).
 
     Raises:
         NotStoredError: for a release of observations.
+        OptionError: if `datasets` is not installed.
     """
     if not dataset.has_states:
         raise NotStoredError(f"{dataset.root}: has observations only, no state records; take hf_windows")
@@ -101,7 +107,7 @@ def hf_episodes(dataset: Dataset) -> datasets.Dataset:
     return library.Dataset.from_generator(_episodes, features=features, gen_kwargs={"dataset": dataset})
 
 
-def _episodes(dataset: Dataset) -> Iterator[dict[str, Any]]:
+def _episodes(dataset: Selection) -> Iterator[dict[str, Any]]:
     for history in dataset:
         entry = history.entry
         names = ["actions", "teammate_actions", "rewards", "dones", "state"]
@@ -122,9 +128,17 @@ def _episodes(dataset: Dataset) -> Iterator[dict[str, Any]]:
 
 
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
-    """The windows of batches start..stop, one a row, as a `datasets.IterableDataset`.
+    """The rows of batches start..stop as a `datasets.IterableDataset`, with the columns of the batch.
 
-    Its `state_dict` resumes after the last window taken.
+    The `state_dict` of the result resumes after the last row taken.
+
+    Args:
+        sampler: makes the batches.
+        start: number of the first batch.
+        stop: number after the last batch; `len(sampler)` by default.
+
+    Raises:
+        OptionError: if `datasets` is not installed, or for numbers that are not integers from 0.
     """
     numbers = list(range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0)))
     library = _datasets()

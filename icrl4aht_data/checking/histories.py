@@ -34,7 +34,7 @@ _COPIES = 4  # of a history's arrays that checking it holds in memory
 def check_chunks(shard: Shard, report: Report) -> set[int]:
     """Decode every chunk of a shard; returns the ids of histories with a damaged chunk."""
     damaged = set()
-    for row, history_id, field in shard.chunk_rows():
+    for row, history_id, field in shard.chunks():
         try:
             shard.decode(row, history_id, field)
         except Icrl4ahtError as error:

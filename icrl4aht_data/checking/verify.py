@@ -14,6 +14,7 @@ from icrl4aht_data.checking.files import check_checkpoints, check_files, check_s
 from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
+from icrl4aht_data.checking.structure import check_bytes_between, check_structure
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index, read_index
@@ -132,7 +133,7 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue
-        for fault in shard.check_between() + shard.check_structure(values=report.level == "deep"):
+        for fault in check_bytes_between(shard) + check_structure(shard, values=report.level == "deep"):
             report.add(name, fault)
         damaged = check_chunks(shard, report)
         contents: dict[tuple[str, bytes], int] = {}

@@ -14,7 +14,7 @@ PACKAGE = "icrl4aht-data"
 _DEVELOPER_EXTRAS = ("dev", "peers", "all")
 """Extras that install what work on this project needs, not what its use needs."""
 
-_DISTRIBUTIONS = {"PIL": "pillow", "orbax": "orbax-checkpoint"}
+_DISTRIBUTIONS = {"PIL": "pillow"}
 """Module -> distribution, where the names differ."""
 
 

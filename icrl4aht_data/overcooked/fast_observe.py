@@ -1,8 +1,11 @@
-"""State records -> the ego's observations at the speed of memory, for NumPy, into buffers that may be reused.
+"""Renders the ego's observations from state records at the speed of memory, with NumPy into reusable buffers.
 
-`observe` says what an observation is, for NumPy and JAX alike. Here its answers for one thing at a time become tables:
-what stands still and what a recipe or a delivery shows, by position; an agent, by facing and item; what lies on a
-counter, cooks in a pot or glows on a button. A step is then one copy of a background and a few small patches.
+`observe` defines what an observation is, for NumPy and JAX. This module asks `observe` once for every value that one
+element of a record can have, keeps the answers as lookup tables, and renders a step as a copy of a background and a few
+small patches: the background by the ego's cell, recipe and delivery; both agents by facing and item; and what is on
+counters, in pots and on lit buttons.
+
+`n` denotes the number of steps, `S` the bytes of a state record, `A` the channels of one agent, `C` all channels.
 """
 
 from __future__ import annotations
@@ -17,22 +20,25 @@ from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.utils.threads import in_slices
 
-_SLAB = 8192  # steps painted at a time: fewer cost more in calls than they save in cache misses
-_IMPOSSIBLE = -(2**40)
-_TIMERS = 32  # what a timer's five bits hold
+_SLAB = 8192  # steps rendered at a time: fewer cost more in calls than they save in cache misses
+_IMPOSSIBLE = -(2**40)  # makes every sum of lookups negative
+_TIMERS = 32  # values of a timer's five bits
 
 
 def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1) -> np.ndarray:
-    """Write the ego's observations into `out`.
+    """Render the ego's observations into `out`.
 
     Args:
-        layout: the kitchen.
+        layout: the layout that was played.
         record: uint8 (..., S), state records.
         out: uint8 or float32 (..., 5, 5, C), C-contiguous.
-        threads: how many share the work.
+        threads: how many threads share the work.
 
     Returns:
         `out`, equal to `observe(layout, record, 0)`.
+
+    Raises:
+        ValueError: if `out` is not C-contiguous.
     """
     if not out.flags.c_contiguous:
         raise ValueError("expected out to be C-contiguous")
@@ -50,81 +56,86 @@ def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: i
 
 
 class _Renderer:
-    """The tables of one layout and dtype."""
+    """Lookup tables of one layout and dtype, and the rendering with them."""
 
     def __init__(self, layout: Layout, dtype: str) -> None:
         self._layout, self._dtype = layout, np.dtype(dtype)
         self._columns = columns(layout)
         fixed = fixed_channels(layout)
-        self._agent: int = fixed.start // 2  # channels of one agent: two agents come before what is fixed
-        self._first: int = fixed.stop  # of the channels of what changes on a cell
+        self._agent: int = fixed.start // 2  # A: the channels of two agents precede the fixed ones
+        self._first: int = fixed.stop  # first channel of what changes on a cell
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.unique(np.array([0, *layout.recipe_items], np.uint8))
-        self._relative = layout.place_in_window.astype(np.intp)
+        self._in_window = layout.place_in_window.astype(np.intp)
         self._background = self._make_background()
-        self._bodies = _as_items(self._make_bodies())
+        self._agents = _as_items(self._make_agents())
         self._patches = _as_items(self._make_patches())
-        self._make_lookups()
+        self._make_pair_lookups()
+        self._make_cell_lookups()
 
     def render(self, record: np.ndarray, out: np.ndarray) -> None:
-        """uint8 (n, S) -> (n, 25, C), in place."""
-        # The first eight columns as pairs of bytes: positions, facings, hands, recipe and delivery.
-        pairs = record[:, :8].copy().view("<u2").T.astype(np.intp)
-        positions, facings, hands, recipe = pairs
-        scene = self._scene.take(positions)
-        scene += self._recipe.take(recipe)
-        if scene.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._timers] >= _TIMERS).any():
+        """Render uint8 (n, S) into (n, 25, C)."""
+        # The first eight columns as pairs of bytes: positions, facings, hands, and recipe with delivery.
+        positions, facings, hands, recipe = record[:, :8].copy().view("<u2").T.astype(np.intp)
+        background = self._by_positions.take(positions)
+        background += self._by_recipe.take(recipe)
+        if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
+            # The rules make no such record, so the lookup tables do not have it.
             out.reshape(len(out), *self._layout.obs_shape)[...] = observe(self._layout, record, EGO)
-            return  # not a record that the rules make
-        np.take(self._background, scene, axis=0, out=out.reshape(len(out), -1), mode="clip")
+            return
+        np.take(self._background, background, axis=0, out=out.reshape(len(out), -1), mode="clip")
         cells = out.reshape(-1, self._layout.channels)
-        self._paint_agents(positions, facings, hands, cells)
-        self._paint_things(record, positions, cells)
+        self._render_agents(positions, facings, hands, cells)
+        self._render_cells(record, positions, cells)
 
-    def _paint_agents(self, positions: np.ndarray, facings: np.ndarray, hands: np.ndarray, cells: np.ndarray) -> None:
-        mine = _as_items(cells[:, : self._agent])
-        mine[CENTRE::VISIBLE] = self._bodies.take(((facings & 255) << 8) + (hands & 255))
-        place = self._place.take(positions)
-        seen = np.flatnonzero(place != NOWHERE)
-        theirs = _as_items(cells[:, self._agent : 2 * self._agent])
-        theirs[seen * VISIBLE + place[seen]] = self._bodies.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
+    def _render_agents(self, positions: np.ndarray, facings: np.ndarray, hands: np.ndarray, cells: np.ndarray) -> None:
+        ego = _as_items(cells[:, : self._agent])
+        ego[CENTRE::VISIBLE] = self._agents.take(((facings & 255) << 8) + (hands & 255))
+        where = self._teammate_in_window.take(positions)
+        seen = np.flatnonzero(where != NOWHERE)
+        teammate = _as_items(cells[:, self._agent : 2 * self._agent])
+        teammate[seen * VISIBLE + where[seen]] = self._agents.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
 
-    def _paint_things(self, record: np.ndarray, positions: np.ndarray, cells: np.ndarray) -> None:
-        """What lies on counters, glows on buttons and is in pots, where there is anything and it is in view."""
-        there = record[:, self._thing].copy()
-        there[:, self._pots] |= record[:, self._timers]
-        row, thing = np.divmod(np.flatnonzero(there), there.shape[1])
-        place = self._places.take((positions[row] & 255) * there.shape[1] + thing)
-        seen = np.flatnonzero(place != NOWHERE)
-        row, thing, place = row[seen], thing[seen], place[seen]
+    def _render_cells(self, record: np.ndarray, positions: np.ndarray, cells: np.ndarray) -> None:
+        """Render pots, lit buttons and items on counters that are in view; most cells are empty and need nothing."""
+        filled = record[:, self._cell_columns].copy()
+        filled[:, : self._pots] |= record[:, self._columns.pot_timers]
+        row, cell = np.divmod(np.flatnonzero(filled), filled.shape[1])
+        where = self._cell_in_window.take((positions[row] & 255) * filled.shape[1] + cell)
+        seen = np.flatnonzero(where != NOWHERE)
+        row, cell, where = row[seen], cell[seen], where[seen]
         flat, start = np.ascontiguousarray(record).reshape(-1), row * record.shape[1]
-        patch = self._kind.take(thing) + flat.take(start + self._low.take(thing))
-        pots = np.flatnonzero(self._is_pot.take(thing))
-        patch[pots] += flat.take(start[pots] + self._high.take(thing[pots])).astype(np.intp) << 8
-        _as_items(cells[:, self._first :])[row * VISIBLE + place] = self._patches.take(patch)
+        patch = self._first_patch.take(cell) + flat.take(start + self._patch_column.take(cell))
+        pots = np.flatnonzero(cell < self._pots)
+        patch[pots] += flat.take(start[pots] + self._columns.pot_timers.start + cell[pots]).astype(np.intp) << 8
+        _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
-    def _make_lookups(self) -> None:
-        """Tables by a pair of bytes, negative for one that the rules do not make; and what each thing's patch is."""
-        layout, where = self._layout, self._columns
+    def _make_pair_lookups(self) -> None:
+        """Lookup tables by a pair of bytes, low byte first: intp (2**16,), negative where the rules exclude the pair.
+
+        The first two sum up to a row of the background.
+        """
         low, high = np.arange(2**16) & 255, np.arange(2**16) >> 8
-        inside = np.maximum(low, high) < layout.cells
-        seat = _lookup(self._floor)[low] * 2 * len(self._recipes)
-        self._scene = np.where(inside, seat, _IMPOSSIBLE)
-        self._recipe = np.where(high < 2, _lookup(self._recipes)[low] * 2 + high, _IMPOSSIBLE)
-        self._place = np.where(inside, self._relative[low % layout.cells, high % layout.cells], NOWHERE)
+        cells = self._layout.cells
+        on_map = np.maximum(low, high) < cells
+        self._by_positions = np.where(on_map, _index_of(self._floor)[low] * 2 * len(self._recipes), _IMPOSSIBLE)
+        self._by_recipe = np.where(high < 2, _index_of(self._recipes)[low] * 2 + high, _IMPOSSIBLE)
+        self._teammate_in_window = np.where(on_map, self._in_window[low % cells, high % cells], NOWHERE)
 
-        pots, buttons, counters = (len(cells) for cells in (layout.pots, layout.buttons, layout.counters))
-        self._thing = np.r_[where.pot_items, where.buttons, where.counters]
-        self._pots, self._timers = slice(0, pots), where.pot_timers
-        self._places = self._relative[:, [*layout.pots, *layout.buttons, *layout.counters]].reshape(-1)
-        self._kind = np.repeat([512, 256, 0], (pots, buttons, counters))
-        self._low = np.concatenate([self._thing[:pots], np.full(buttons, where.recipe), self._thing[pots + buttons :]])
-        self._high = self._low + pots
-        self._is_pot = np.arange(len(self._thing)) < pots
+    def _make_cell_lookups(self) -> None:
+        """Lookup tables by the number of a cell that changes: pots first, then buttons, then counters."""
+        layout, where = self._layout, self._columns
+        pots, buttons, counters = map(len, (layout.pots, layout.buttons, layout.counters))
+        self._pots = pots
+        self._cell_columns = np.r_[where.pot_items, where.buttons, where.counters]
+        self._cell_in_window = self._in_window[:, [*layout.pots, *layout.buttons, *layout.counters]].reshape(-1)
+        self._first_patch = np.repeat([512, 256, 0], (pots, buttons, counters))
+        # A lit button shows the recipe, whatever its own timer says.
+        self._patch_column = np.where(self._first_patch == 256, where.recipe, self._cell_columns)
 
     def _make_background(self) -> np.ndarray:
-        """(floor * recipes * 2, 25 * C): everything but agents and items, by position, recipe and delivery."""
-        shape = (len(self._floor), len(self._recipes), 2)
+        """(floor * recipes * 2, 25 * C): all but agents and items, by the ego's cell, recipe and delivery."""
+        shape = len(self._floor), len(self._recipes), 2
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]
         record[..., 1, self._columns.delivered] = 1
@@ -132,8 +143,8 @@ class _Renderer:
         obs[..., : 2 * self._agent] = 0
         return obs.reshape(np.prod(shape), -1).astype(self._dtype)
 
-    def _make_bodies(self) -> np.ndarray:
-        """(4 * 256, A): an agent's channels by facing and hand."""
+    def _make_agents(self) -> np.ndarray:
+        """(4 * 256, A): an agent's channels by facing and item byte."""
         record = np.zeros((4, 256, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., 1] = self._floor[0], self._floor[-1]
         record[..., self._columns.facings] = np.arange(4)[:, None, None]
@@ -142,37 +153,39 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """(512 + 32 * 256, C - first): what changes on a cell, by counter item, by glowing recipe, by pot content."""
+        """(512 + 32 * 256, C - first): what changes on a cell.
+
+        By the item byte on a counter, then by the recipe on a lit button, then by timer and item byte of a pot.
+        """
         layout, where = self._layout, self._columns
-        anything = np.arange(256, dtype=np.uint8)
+        every_byte = np.arange(256, dtype=np.uint8)
         record = np.zeros((2 + _TIMERS, 256, record_size(layout)), np.uint8)
-        record[0, :, where.counters] = anything[:, None]
-        record[1, :, where.buttons], record[1, :, where.recipe] = 1, anything
-        record[2:, :, where.pot_items] = anything[:, None]
+        record[0, :, where.counters] = every_byte[:, None]
+        record[1, :, where.buttons], record[1, :, where.recipe] = 1, every_byte
+        record[2:, :, where.pot_items] = every_byte[:, None]
         record[2:, :, where.pot_timers] = np.arange(_TIMERS)[:, None, None]
-        kinds = ((slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots))
-        table = np.zeros((*record.shape[:2], layout.channels - self._first), self._dtype)
+        patches = np.zeros((*record.shape[:2], layout.channels - self._first), self._dtype)
+        kinds = (slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots)
         for rows, cells in kinds:
-            for cell in cells:
-                seats = [seat for seat in self._floor if self._relative[seat, cell] != NOWHERE]
-                if seats:
-                    record[rows, :, 0] = seats[0]
-                    obs = observe(layout, record[rows], EGO).reshape(-1, 256, VISIBLE, layout.channels)
-                    table[rows] = obs[:, :, self._relative[seats[0], cell], self._first :]
-                    break
-        return table.reshape(-1, table.shape[-1])
+            # Any cell of the kind will do, seen from any cell of the floor.
+            views = [(ego, cell) for cell in cells for ego in self._floor if self._in_window[ego, cell] != NOWHERE]
+            if views:
+                record[rows, :, 0] = views[0][0]
+                obs = observe(layout, record[rows], EGO).reshape(-1, 256, VISIBLE, layout.channels)
+                patches[rows] = obs[:, :, self._in_window[views[0]], self._first :]
+        return patches.reshape(-1, patches.shape[-1])
 
 
 def _as_items(rows: np.ndarray) -> np.ndarray:
-    """(n, k) -> (n,): a row as one opaque item, so that NumPy copies it whole."""
+    """(n, k) -> (n,): each row as one opaque item, which NumPy copies at once."""
     return rows.view(np.dtype((np.void, rows.shape[-1] * rows.itemsize)))[..., 0]
 
 
-def _lookup(values: np.ndarray) -> np.ndarray:
-    """intp (256,): the place of a byte among the values, or a large negative number."""
-    table = np.full(256, _IMPOSSIBLE, np.intp)
-    table[values] = np.arange(len(values))
-    return table
+def _index_of(values: np.ndarray) -> np.ndarray:
+    """intp (256,): the position of each byte among the values, or a large negative number."""
+    lookup = np.full(256, _IMPOSSIBLE, np.intp)
+    lookup[values] = np.arange(len(values))
+    return lookup
 
 
 @lru_cache(maxsize=64)

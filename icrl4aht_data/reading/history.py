@@ -1,4 +1,4 @@
-"""One learning history, and its fields as lazy arrays: what is not asked for is not read."""
+"""One learning history with its fields as lazy arrays, which read only the rows that are indexed."""
 
 from __future__ import annotations
 
@@ -11,20 +11,24 @@ from icrl4aht_data.errors import LabelsMissingError, NotStoredError, unknown
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.reading.shard import Shard
-from icrl4aht_data.remote.partial_file import fetch_chunks
+from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.memory import new_array
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
-"""How observations are presented: float32 (the paper's contract), uint8 (the same integers), or the state records
-from which `icrl4aht_data.overcooked.observe` renders them, where a release has any."""
+"""How observations are presented: as float32 (the paper's interface), as uint8 (the same integers), or as the state
+records that `icrl4aht_data.overcooked.observe` renders, if the release has them."""
 
 
 class History:
-    """One learning history: an ego that learns beside one teammate, T steps of E episodes.
+    """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
-    `history.actions`, `.rewards`, `.obs`, ... are lazy arrays: slicing reads only the chunks it needs.
+    `history.actions`, `.rewards`, `.obs` and so on are lazy arrays: slicing reads only the chunks it needs.
+
+    Args:
+        entry: the history's line of the index.
+        shard: the shard that stores it.
+        obs: how `History.obs` presents observations; see `OBS`.
     """
 
     def __init__(self, entry: Entry, shard: Shard, obs: Obs) -> None:
@@ -44,15 +48,20 @@ class History:
 
     @property
     def kind(self) -> Kind:
-        """Of the release: "full", "lite" or "observations"."""
+        """The release's kind: "full", "lite" or "observations"."""
         return self._shard.kind
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
 
+        Args:
+            name: the field.
+            start, stop: steps (episodes for `episode_end_state`), as in a slice; all rows by default.
+
         Raises:
-            LabelsMissingError: if expert or teammate actions are asked of a history without them.
-            NotStoredError: if states are asked of a release without state records.
+            UnknownNameError: for a name that is not a field.
+            LabelsMissingError: for expert or teammate actions of a history without them.
+            NotStoredError: for states of a release without state records.
             ShardCorruptError: names the chunk whose checksum is wrong.
         """
         field = self._field(name)
@@ -60,12 +69,12 @@ class History:
         start, stop, _ = slice(start, stop).indices(rows)
         stop = max(start, stop)
         if self.kind in field.absent:
-            return self._painted(start, stop, np.uint8)
-        if self._shard.is_remote:
-            fetch_chunks(self._shard.lacking(self._shard.needed(self.entry.history_id, field, start, stop)))
+            return self._rendered(start, stop, np.uint8)
+        fetch_rows([RowRange(self._shard, self.entry.history_id, field, start, stop)])
         return self._shard.read(self.entry.history_id, field, start, stop)
 
-    def _painted(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
+    def _rendered(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
+        """Observations (stop - start, 5, 5, C) of a release that stores states only."""
         what = f"{self._shard.path}: history {self.entry.history_id}: obs"
         out = new_array((stop - start, *self.entry.obs_shape), dtype, what)
         return fast_observe(self._shard.layout, self.read("state", start, stop), out)
@@ -77,7 +86,7 @@ class History:
         if field.row == "state" and self.kind in field.absent:
             raise NotStoredError(
                 f"{self._shard.path}: no {name}: this release has observations only, which do not determine the state; "
-                f"what needs states, such as replay and drawing, needs a full or lite release"
+                f"use a full or lite release for what needs states, such as replay and drawing"
             )
         if not self.entry.has(field):
             raise LabelsMissingError(
@@ -88,7 +97,7 @@ class History:
 
     @property
     def obs(self) -> LazyArray:
-        """(T, 5, 5, C) float32 or uint8, or the state records (T, S) uint8, as the dataset's `obs` says."""
+        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state"."""
         return LazyArray(self, "state" if self._obs == "state" else "obs", self._obs)
 
     @property
@@ -103,12 +112,12 @@ class History:
 
     @property
     def rewards(self) -> LazyArray:
-        """(T,) float32: the team's reward, unshaped."""
+        """(T,) float32: the team's reward without shaping."""
         return LazyArray(self, "rewards")
 
     @property
     def dones(self) -> LazyArray:
-        """(T,) bool: the last kept step of each episode."""
+        """(T,) bool: True at the last kept step of each episode."""
         return LazyArray(self, "dones")
 
     @property
@@ -118,7 +127,7 @@ class History:
 
     @property
     def expert_actions(self) -> LazyArray:
-        """(T,) int32: what the converged ego would do (paper, App. D.1)."""
+        """(T,) int32: the actions of the converged ego at the same steps (paper, App. D.1)."""
         return LazyArray(self, "expert_actions")
 
     @property
@@ -127,12 +136,22 @@ class History:
         return LazyArray(self, "episode_end_state")
 
     def returns(self) -> np.ndarray:
-        """float64 (E,): return of each episode over its kept steps: the learning curve."""
+        """float64 (E,): the return of each episode over its kept steps, which is the learning curve."""
         return episode_returns(self.read("rewards"), self.read("dones"))
 
 
 class LazyArray:
-    """One field of one history, read on indexing. Takes what a NumPy array's first axis takes."""
+    """One field of one history, read when it is indexed, with the indices that a NumPy array takes.
+
+    Args:
+        history: the history.
+        name: the field, one of `schema.FIELDS`.
+        obs: for the field `obs`, whether rows are float32 or uint8.
+
+    Attributes:
+        dtype: the rows' dtype.
+        shape: (T, ...), or (E, ...) for `episode_end_state`.
+    """
 
     def __init__(self, history: History, name: str, obs: Obs | None = None) -> None:
         self._history, self._name = history, name
@@ -152,27 +171,20 @@ class LazyArray:
         return f"LazyArray({self._name}, shape={self.shape}, dtype={self.dtype})"
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
+        first, *rest = key if isinstance(key, tuple) else (key,)
         if isinstance(first, slice):
-            start, stop, step = first.indices(len(self))
-            low, high = (start, stop) if step > 0 else (stop + 1, start + 1)
-            rows = self._read(max(low, 0), max(high, low, 0))
-            rows = rows[::step] if step > 0 else rows[::-1][::-step]
-        elif isinstance(first, (int, np.integer)):
-            position = range(len(self))[first]
-            rows = self._read(position, position + 1)[0]
-        elif first is None or first is Ellipsis:
-            return self._read(0, len(self))[key]
-        else:
-            rows = self._read(0, len(self))[np.asarray(first)]
-        if not rest:
-            return rows
-        return rows[rest] if isinstance(first, (int, np.integer)) else rows[(slice(None), *rest)]
+            rows = range(len(self))[first]
+            low, high = sorted((rows[0], rows[-1])) if rows else (0, -1)
+            return self._read(low, high + 1)[:: rows.step][(slice(None), *rest)]
+        if isinstance(first, (int, np.integer)):
+            row = range(len(self))[first]
+            return self._read(row, row + 1)[(0, *rest)]
+        return self._read(0, len(self))[key]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return self[:].astype(dtype or self.dtype, copy=False)
 
     def _read(self, start: int, stop: int) -> np.ndarray:
         if self._name == "obs" and self._history.kind in FIELDS["obs"].absent:
-            return self._history._painted(start, max(start, stop), self.dtype)
+            return self._history._rendered(start, stop, self.dtype)
         return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)

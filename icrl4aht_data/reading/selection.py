@@ -1,29 +1,274 @@
-"""TODO."""
+"""A selection of a release's learning histories, and how they are read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import operator
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self, overload
 
 import numpy as np
 
-from icrl4aht_data.reading.history import Obs
-from icrl4aht_data.reading.sources import CacheMode, HistorySource
+from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.info import ReleaseInfo
+from icrl4aht_data.format.schema import KINDS, Entry
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.reading.history import OBS, History, Obs
+from icrl4aht_data.reading.shard import Shards
+from icrl4aht_data.reading.sources import (
+    CACHE_MODES,
+    CacheChoice,
+    CacheMode,
+    HistorySource,
+    choose_cache,
+    decoded_size,
+    open_source,
+)
+from icrl4aht_data.remote.remote_release import ReleaseLocation
+from icrl4aht_data.remote.store import Traffic
+from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.validation import check_int
 
 Names = str | Sequence[str] | None
+"""One value of an index field, several, or None for any."""
 
 
-class ReadOptions(NamedTuple):
-    """How a dataset gives its data; see `load_icrl4aht`."""
+@dataclass(frozen=True)
+class ReadOptions:
+    """Options of reading histories.
 
-    obs: Obs
-    cache: CacheMode
-    threads: int
+    Args:
+        obs: how observations are presented; see `history.OBS`.
+        cache: how samplers hold a selection; see `sources.CACHE_MODES`.
+        threads: how many threads decode and render; by default one for each usable core.
+
+    Raises:
+        UnknownNameError, OptionError: for values that do not exist.
+    """
+
+    obs: Obs = "float32"
+    cache: CacheMode = "auto"
+    threads: int = field(default_factory=usable_cores)
+
+    def __post_init__(self) -> None:
+        if self.obs not in OBS:
+            raise unknown("obs", self.obs, OBS)
+        if self.cache not in CACHE_MODES:
+            raise unknown("cache", self.cache, CACHE_MODES)
+        check_int("threads", self.threads, 1)
 
 
-class Storage(NamedTuple):
-    """Where a selection's rows come from: one source a layout, and each history's place."""
+class Selection:
+    """Histories of a release in some order. Only the index has been read; arrays are read when they are needed.
 
-    sources: list[HistorySource]
-    layout: np.ndarray  # intp (H,), which source
-    place: np.ndarray  # intp (H,), position in it
+    `len(selection)` counts histories, `selection[i]` is the i-th, `selection[a:b]` a part, iteration yields them in
+    order. Selections of one release share its index and opened shards.
+
+    Args:
+        location: the release.
+        index: its index.
+        shards: its shards.
+        options: how histories are read.
+        ids: int (H,), the histories' ids; all of the release by default.
+
+    Raises:
+        OptionError: for obs="state" of a release without state records.
+    """
+
+    def __init__(
+        self,
+        location: ReleaseLocation,
+        index: Index,
+        shards: Shards,
+        options: ReadOptions,
+        ids: np.ndarray | None = None,
+    ) -> None:
+        self.origin, self.index, self._shards = location, index, shards
+        self.options = options
+        self.ids = np.arange(len(index.entries)) if ids is None else ids
+        self._lock = threading.Lock()
+        if self.obs == "state" and not self.has_states:
+            raise OptionError(
+                f'obs = "state": {location} has observations only, no state records; take float32 or uint8'
+            )
+
+    def __getstate__(self) -> tuple:
+        return self.origin, self.index, self._shards, self.options, self.ids
+
+    def __setstate__(self, state: tuple) -> None:
+        self.__init__(*state)
+
+    @property
+    def obs(self) -> Obs:
+        """The presentation of observations; see `history.OBS`."""
+        return self.options.obs
+
+    @property
+    def threads(self) -> int:
+        """Number of threads that decode and render."""
+        return self.options.threads
+
+    @property
+    def root(self) -> Path:
+        """The release's folder on this machine; for a remote release the folder of downloaded files."""
+        return self.origin.folder
+
+    @property
+    def traffic(self) -> Traffic:
+        """Requests sent to the release's remote and bytes received from it so far; zero for a local release."""
+        remote = self.origin.remote
+        return Traffic() if remote is None else remote.store.traffic
+
+    @property
+    def info(self) -> ReleaseInfo:
+        """The release's versions, kind, environment and totals, as in meta/info.json."""
+        return self.index.info
+
+    @property
+    def has_states(self) -> bool:
+        """Whether the release has state records; a release of observations has none."""
+        return self.info.kind in KINDS
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @overload
+    def __getitem__(self, position: int) -> History: ...
+
+    @overload
+    def __getitem__(self, position: slice) -> Self: ...
+
+    def __getitem__(self, position: int | slice) -> History | Self:
+        if isinstance(position, slice):
+            return self.select(self.ids[position])
+        return self.history(int(self.ids[position]))
+
+    def __iter__(self) -> Iterator[History]:
+        return (self.history(int(i)) for i in self.ids)
+
+    def __repr__(self) -> str:
+        layouts = [layout.name for layout in self.layouts]
+        tasks = len(np.unique(self.column("task_id")))
+        return (
+            f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
+            f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
+            f"{self.info.kind} release {self.info.data_version} at {self.origin})"
+        )
+
+    def history(self, history_id: int) -> History:
+        """One history of the release, whether selected or not.
+
+        Raises:
+            UnknownNameError: if the release has no history with that id.
+        """
+        entry = self.index.entry(history_id)
+        return History(entry, self._shards.open(entry.shard), self.obs)
+
+    def column(self, name: str) -> np.ndarray:
+        """(H,): a field of every selected history's index entry; for names, their codes (see `Index.values`)."""
+        return self.index.entries.column(name)[self.ids]
+
+    @cached_property
+    def layouts(self) -> list[Layout]:
+        """The layouts of the selection, in order of appearance."""
+        codes, first = np.unique(self.column("layout"), return_index=True)
+        names = self.index.values("layout")
+        return [get_layout(names[code]) for code in codes[np.argsort(first)].tolist()]
+
+    @cached_property
+    def layout_numbers(self) -> np.ndarray:
+        """int32 (H,): the position of each history's layout in `layouts`."""
+        names = self.index.values("layout")
+        number = np.zeros(len(names), np.int32)
+        number[[names.index(layout.name) for layout in self.layouts]] = np.arange(len(self.layouts))
+        return number[self.column("layout")]
+
+    @cached_property
+    def entries(self) -> list[Entry]:
+        """The index entries of the selection."""
+        return [self.index.entry(int(i)) for i in self.ids]
+
+    @cached_property
+    def shards(self) -> list[str]:
+        """Paths in the release of the shards that store the selection."""
+        names = self.index.values("shard")
+        return [names[code] for code in np.unique(self.column("shard")).tolist()]
+
+    @cached_property
+    def cache(self) -> CacheChoice:
+        """The way in which samplers hold the selection, and the reason; see `sources.CACHE_MODES`."""
+        absent = [name for name in self.shards if not self.origin.is_here(name)]
+        if self.options.cache == "auto" and absent:
+            return CacheChoice("stream", f"{len(absent)} of {len(self.shards)} shards are not downloaded")
+        size = 0
+        for number, layout in enumerate(self.layouts):
+            members = self.layout_numbers == number
+            steps, episodes = (int(self.column(name)[members].sum()) for name in ("T", "episodes"))
+            size += decoded_size(layout, self.info.kind, steps, int(members.sum()), episodes)
+        return choose_cache(self.options.cache, size)
+
+    @property
+    def storage(self) -> HistorySource:
+        """The selection's rows, held as `cache` says; `ram` and `mmap` decode them at the first access."""
+        with self._lock:
+            return self._storage
+
+    @cached_property
+    def _storage(self) -> HistorySource:
+        if self.origin.remote is not None and self.cache.cache != "stream":
+            self.origin.remote.fetch(self.shards)
+        return open_source(self.cache.cache, self.entries, self._shards.open, self.threads)
+
+    def forget_chunks(self) -> None:
+        """Drop the decoded chunks that reading has kept, for all selections of this release."""
+        self._shards.cache.clear()
+
+    def with_options(
+        self, *, obs: Obs | None = None, cache: CacheMode | None = None, threads: int | None = None
+    ) -> Self:
+        """This selection read with other options; None keeps an option. Index and shards are not opened again.
+
+        Raises:
+            UnknownNameError, OptionError: for impossible options, such as obs="state" for a release of observations.
+        """
+        changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads}
+        options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
+        return type(self)(self.origin, self.index, self._shards, options, self.ids)
+
+    def filter(self, **wanted: Names) -> Self:
+        """The histories of this selection whose index fields have one of the wanted values.
+
+        Args:
+            wanted: field -> value, several values or None for any; the fields are those of `load_icrl4aht`.
+
+        Raises:
+            UnknownNameError: for a field or value that does not exist.
+            EmptySelectionError: if no history is left.
+        """
+        matching = self.index.query(**wanted)
+        ids = self.ids[np.isin(self.ids, matching)]
+        if not len(ids):
+            raise EmptySelectionError(f"{self.root}: no history of this selection has {wanted}; it is {self!r}")
+        return type(self)(self.origin, self.index, self._shards, self.options, ids)
+
+    def select(self, ids: Sequence[int] | np.ndarray) -> Self:
+        """The histories of this selection with these ids, in this order.
+
+        Raises:
+            EmptySelectionError: if no id is given.
+            UnknownNameError: for an id that this selection does not have.
+        """
+        if not len(ids):
+            raise EmptySelectionError(f"{self.root}: select was given no history id")
+        chosen = np.array([operator.index(i) for i in ids])
+        absent = chosen[~np.isin(chosen, self.ids)]
+        if len(absent):
+            within = f"{self.ids.min()}..{self.ids.max()}"
+            raise UnknownNameError(
+                f"{self.root}: this selection has no history {absent.tolist()}, ids are within {within}; it is {self!r}"
+            )
+        return type(self)(self.origin, self.index, self._shards, self.options, chosen)

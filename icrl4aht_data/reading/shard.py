@@ -1,106 +1,92 @@
-"""One HDF5 shard, read by stored offsets with a checksum on every chunk; `shard_writer` writes it.
+"""Reading of one HDF5 shard by stored offsets, with a checksum on every chunk; `writing.shard_writer` writes shards.
 
-Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. Our own reads do not go through libhdf5:
-they take a chunk's bytes at the offset in the chunk table, check its crc32 and inflate it, which needs no global lock.
+Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. This reader does not use libhdf5: it
+reads a chunk's bytes at the offset in the chunk table, checks their CRC-32 and inflates them, without a global lock.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.errors import (
-    ShardCorruptError,
-    ShardMismatchError,
-    ShardMissingError,
-    ShardTruncatedError,
-)
-from icrl4aht_data.format.chunks import (
-    BETWEEN,
-    DEFLATE_RATIO,
-    chunk_locations,
-    chunk_table_name,
-    decode_chunk,
-    read_table,
-)
-from icrl4aht_data.format.schema import FORMAT_VERSION, Entry, Field, Kind
+from icrl4aht_data.errors import ShardCorruptError, ShardMismatchError, ShardMissingError, ShardTruncatedError
+from icrl4aht_data.format.chunks import DEFLATE_RATIO, chunk_table_name, decode_chunk, read_table
+from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
+from icrl4aht_data.remote.partial_file import PartialFile, fetch_chunks
+from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.memory import new_array
 from icrl4aht_data.utils.paths import resolve_inside
 
-if TYPE_CHECKING:
-    import h5py  # libhdf5 is needed to check, not to read
-
-    from icrl4aht_data.format.index import Index
-    from icrl4aht_data.remote.partial_file import PartialFile
-    from icrl4aht_data.remote.remote_release import ReleaseLocation
-
 
 class Shard:
-    """Reads one shard's histories by offset. May be shared between threads and pickled.
+    """One shard of a release: reads rows of its histories. May be shared between threads and pickled.
 
     Args:
-        root: the release; of a remote one the chunk table comes here, and of the shard what is read.
-        name: path of the shard below it.
-        kind: of the release.
-        entries: all histories of this shard, in index order.
-        cache: of decoded chunks.
+        location: the release. If it is remote, opening downloads the chunk table, and reading the chunks it needs.
+        name: path of the shard in the release.
+        kind: the release's kind.
+        entries: all histories of the shard, in index order.
+        cache: decoded chunks, shared with other shards; a new cache by default.
+
+    Attributes:
+        entries: history id -> index entry.
+        table: CHUNK_DTYPE (N,), the chunk table.
 
     Raises:
-        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError: at once, if shard and chunk table
-            do not fit the index.
+        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError: if shard and chunk table do not fit
+            the index.
     """
 
     def __init__(
-        self, root: ReleaseLocation, name: str, kind: Kind, entries: Sequence[Entry], cache: ChunkCache | None = None
+        self,
+        location: ReleaseLocation,
+        name: str,
+        kind: Kind,
+        entries: Sequence[Entry],
+        cache: ChunkCache | None = None,
     ) -> None:
-        self.path, self.name = resolve_inside(root.folder, name), name
-        self._remote = root.remote
+        self.path, self.name = resolve_inside(location.folder, name), name
         self.kind: Kind = kind
         self.layout = get_layout(entries[0].layout)
-        self._entries = {entry.history_id: entry for entry in entries}
+        self.entries = {entry.history_id: entry for entry in entries}
+        self._remote = location.remote
         self._cache = cache or ChunkCache()
-        self._first: dict[tuple[int, str], int] = {}
-        self._elements: dict[str, tuple[np.dtype, tuple[int, ...], int]] = {}
-        self._table = self._read_table(
-            root, sum(entry.chunks(f) for entry in entries for f in entry.stored_fields(kind))
-        )
-        self._check_rows(entries)
+        self._elements = {field.name: field.element(self.layout, kind) for field in FIELDS.values()}
+        self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
+        self.table = read_table(location.file(chunk_table_name(name)))
+        self._check_table()
+        self.table = np.array(self.table)  # only now: before the check the file might be far too large for memory
         self._check_size()
 
-    def _read_table(self, root: ReleaseLocation, expected: int) -> np.ndarray:
-        table = read_table(root.file(chunk_table_name(self.name)))
+    def _check_table(self) -> None:
+        """Check that the chunk table has the chunks and rows that the index implies, in sizes that can be true."""
+        table = self.table
+        members = [(entry, field) for entry in self.entries.values() for field in entry.stored_fields(self.kind)]
+        chunks = [entry.chunks(field) for entry, field in members]
+        *firsts, total = np.cumsum([0, *chunks]).tolist()
         found = int(np.count_nonzero(table["rows"]))
-        if found != expected or not table["rows"][:expected].all():
+        if found != total or not table["rows"][:total].all():
             raise ShardMismatchError(
-                f"{self.path}: the index implies {expected} chunks, the chunk table has {found}; "
+                f"{self.path}: the index implies {total} chunks, the chunk table has {found}; "
                 f"fetch meta/ and the shard again"
             )
-        return np.array(table)
-
-    def _check_rows(self, entries: Sequence[Entry]) -> None:
-        """Whether the chunk table has the rows that the index says."""
-        total = 0
-        counts, sizes = [], []
-        for entry in entries:
-            for field in entry.stored_fields(self.kind):
-                self._first[entry.history_id, field.name] = total
-                expected, chunks = entry.rows(field), entry.chunks(field)
-                found = int(self._table["rows"][total : total + chunks].sum())
-                if found != expected:
-                    raise ShardMismatchError(
-                        f"{self.path}: history {entry.history_id}: the index says {expected} rows of {field.name}, the "
-                        f"chunk table says {found}; fetch meta/ and the shard again"
-                    )
-                total += chunks
-                counts.append(chunks)
-                sizes.append(min(field.chunk, expected) * self._element(field)[2])
-        raw, stored = np.repeat(sizes, counts), self._table["size"][:total].astype(np.int64)
+        sums = np.add.reduceat(table["rows"][:total].astype(np.int64), firsts).tolist()
+        sizes = []
+        for (entry, field), first, rows in zip(members, firsts, sums, strict=True):
+            self._first[entry.history_id, field.name] = first
+            if rows != entry.rows(field):
+                raise ShardMismatchError(
+                    f"{self.path}: history {entry.history_id}: the index says {entry.rows(field)} rows of "
+                    f"{field.name}, the chunk table says {rows}; fetch meta/ and the shard again"
+                )
+            sizes.append(self._chunk_rows(entry.history_id, field) * self._elements[field.name].itemsize)
+        raw, stored = np.repeat(sizes, chunks), table["size"][:total].astype(np.int64)
         wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))
         if len(wrong):
             raise ShardMismatchError(
@@ -109,14 +95,14 @@ class Shard:
             )
 
     def _check_size(self) -> None:
-        """Whether the file is long enough for every chunk."""
+        """Check that the file is long enough for every chunk."""
         try:
             size = self.path.stat().st_size
         except FileNotFoundError as error:
             if self._remote is None:
                 raise self._missing() from error
             size = self._remote.size(self.name)
-        offset, length = self._table["offset"], self._table["size"]
+        offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
             raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
@@ -131,20 +117,8 @@ class Shard:
 
     @property
     def is_remote(self) -> bool:
-        """Whether the shard may have to be fetched."""
+        """Whether reading may download chunks."""
         return self._remote is not None
-
-    def needed(self, history_id: int, field: Field, start: int, stop: int) -> range:
-        """The rows of the chunk table with rows start..stop of a field."""
-        first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
-        return range(first + start // chunk, first + -(-stop // chunk))
-
-    def lacking(self, rows: Iterable[int]) -> list[tuple[PartialFile, np.ndarray]]:
-        """What `blocks.bring` takes, to make chunks ready to be read; nothing where they are on this machine's disk."""
-        if self._remote is None or self.path.exists():
-            return []
-        wanted = [row for row in sorted(set(rows)) if self._cache.get((self.name, row)) is None]
-        return [(self._remote.part(self.name), self._table[wanted])] if wanted else []
 
     def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
         """Rows start..stop of a field, in the field's dtype. The range must lie within the history.
@@ -153,32 +127,34 @@ class Shard:
             ShardCorruptError: names the chunk whose checksum or size is wrong.
         """
         what = f"{self.path}: history {history_id}: {field.name}"
-        rows = new_array((stop - start, *self._element(field)[1]), field.dtype, what)
+        rows = new_array((stop - start, *self._elements[field.name].shape), field.dtype, what)
         self.read_into(history_id, field, start, rows)
         return rows
 
     def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray) -> None:
-        """The same for the rows from `start` that fill `out`, cast to its dtype."""
-        first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        """Read the rows from `start` that fill `out`, cast to its dtype; see `read`."""
+        first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
         stop = start + len(out)
-        for number in range(start // chunk, -(-stop // chunk)):
-            rows = self._cache.get((self.name, first + number))
+        for number in range(start // length, -(-stop // length)):
+            key = self.name, first + number
+            rows = self._cache.get(key)
             if rows is None:
                 rows = self.decode(first + number, history_id, field)
-                self._cache.put((self.name, first + number), rows)
-            begin = number * chunk
-            low, high = max(start, begin), min(stop, begin + chunk)
+                self._cache.put(key, rows)
+            begin = number * length
+            low, high = max(start, begin), min(stop, begin + length)
             out[low - start : high - start] = rows[low - begin : high - begin]
 
     def decode_into(self, history_id: int, field: Field, out: np.ndarray) -> None:
-        """All rows of a history's field into `out`, past the cache.
+        """Read all rows of a history's field into `out` without adding them to the cache.
 
         Raises:
-            ShardMismatchError: if a value does not survive the dtype of `out`.
+            ShardCorruptError: names the chunk whose checksum or size is wrong.
+            ShardMismatchError: if the dtype of `out` cannot represent a value.
         """
-        first, chunk = self._first[history_id, field.name], self._chunk_rows(history_id, field)
-        for number in range(-(-len(out) // chunk)):
-            part = out[number * chunk : (number + 1) * chunk]
+        first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        for number in range(-(-len(out) // length)):
+            part = out[number * length : (number + 1) * length]
             rows = self.decode(first + number, history_id, field)[: len(part)]
             part[...] = rows
             if part.dtype != rows.dtype and not np.array_equal(part, rows):
@@ -187,22 +163,16 @@ class Shard:
                     f"run `icrl4aht-data verify`"
                 )
 
-    def fingerprint(self, history_id: int) -> bytes:
-        """What distinguishes a history's stored content: sizes and checksums of its chunks."""
-        entry = self._entries[history_id]
-        stored = entry.stored_fields(self.kind)
-        first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
-        return self._table[first : first + chunks][["size", "rows", "crc32"]].tobytes()
-
-    def _chunk_rows(self, history_id: int, field: Field) -> int:
-        return min(field.chunk, self._entries[history_id].rows(field))
-
     def decode(self, row: int, history_id: int, field: Field) -> np.ndarray:
-        """One chunk by its row in the chunk table, read from the file and checked; padding rows included."""
-        element, shape, size_of_row = self._element(field)
-        length = self._chunk_rows(history_id, field)
-        offset, size, _, expected = self._table[row].item()
-        data = self._bytes(offset, size, expected)
+        """The rows of one chunk, read from the file and checked; includes the padding rows of a last chunk.
+
+        Args:
+            row: the chunk's row in the chunk table.
+            history_id, field: what the chunk belongs to.
+        """
+        element, length = self._elements[field.name], self._chunk_rows(history_id, field)
+        offset, size, _, expected = self.table[row].item()
+        data = self.stored_bytes(offset, size, expected)
         found = zlib.crc32(data)
         if found != expected or len(data) != size:
             raise ShardCorruptError(
@@ -210,22 +180,15 @@ class Shard:
                 f"the file is damaged, fetch the shard again"
             )
         try:
-            raw = decode_chunk(data, length * size_of_row, element.itemsize)
+            raw = decode_chunk(data, length * element.itemsize, element.itemsize)
         except ValueError as error:
             raise ShardCorruptError(f"{self.path}: {self.describe(row)}: {error}") from error
-        rows = np.frombuffer(raw, element.base).reshape(length, *shape)
-        rows.flags.writeable = False
+        rows = np.frombuffer(raw, element.base).reshape(length, *element.shape)
+        rows.flags.writeable = False  # the cache hands it to several readers
         return rows
 
-    def _element(self, field: Field) -> tuple[np.dtype, tuple[int, ...], int]:
-        """A field's stored element, the shape of a row, and its bytes."""
-        known = self._elements.get(field.name)
-        if known is None:
-            element = field.element(self.layout, self.kind)
-            known = self._elements[field.name] = element, element.shape, element.itemsize
-        return known
-
-    def _bytes(self, offset: int, size: int, crc32: int) -> bytes:
+    def stored_bytes(self, offset: int, size: int, crc32: int) -> bytes:
+        """Bytes of the file; a remote's are downloaded if no bytes with that CRC-32 are here."""
         try:
             with self.path.open("rb", buffering=0) as stream:
                 stream.seek(offset)
@@ -235,127 +198,84 @@ class Shard:
                 raise self._missing() from error
             return self._remote.part(self.name).chunk(offset, size, crc32)
 
+    def _chunk_rows(self, history_id: int, field: Field) -> int:
+        return min(field.chunk, self.entries[history_id].rows(field))
+
+    def missing_chunks(self, ranges: Iterable[RowRange]) -> list[tuple[PartialFile, np.ndarray]]:
+        """The chunks of a remote shard with some rows that are not in memory, as `fetch_chunks` takes them.
+
+        Empty for a shard on this machine's disk.
+        """
+        if self._remote is None or self.path.exists():
+            return []
+        wanted = set()
+        for _, history_id, field, start, stop in ranges:
+            first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+            wanted.update(range(first + start // length, first + -(-stop // length)))
+        rows = [row for row in sorted(wanted) if self._cache.get((self.name, row)) is None]
+        return [(self._remote.part(self.name), self.table[rows])] if rows else []
+
+    def fingerprint(self, history_id: int) -> bytes:
+        """Sizes and checksums of a history's chunks, which differ where its stored content differs."""
+        entry = self.entries[history_id]
+        stored = entry.stored_fields(self.kind)
+        first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
+        return self.table[first : first + chunks][["size", "rows", "crc32"]].tobytes()
+
+    def chunks(self) -> Iterator[tuple[int, int, Field]]:
+        """Every chunk as (row in the chunk table, history id, field)."""
+        for (history_id, name), first in self._first.items():
+            for number in range(self.entries[history_id].chunks(FIELDS[name])):
+                yield first + number, history_id, FIELDS[name]
+
     def describe(self, row: int) -> str:
-        """A chunk in words: history, field, number, bytes."""
+        """A chunk for messages: its number, field, history and bytes."""
         (history_id, name), first = max(
             ((key, first) for key, first in self._first.items() if first <= row), key=lambda item: item[1]
         )
-        offset, size = int(self._table["offset"][row]), int(self._table["size"][row])
+        offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         return f"chunk {row - first} of {name} in history {history_id} (bytes {offset}..{offset + size})"
 
-    def chunk_rows(self) -> Iterator[tuple[int, int, Field]]:
-        """Every chunk as (table row, history id, field)."""
-        for history_id, entry in self._entries.items():
-            for field in entry.stored_fields(self.kind):
-                first = self._first[history_id, field.name]
-                for number in range(entry.chunks(field)):
-                    yield first + number, history_id, field
 
-    def check_between(self) -> list[str]:
-        """Whether every byte of the file stands in the table once, and what lies between the chunks is whole."""
-        ordered = np.sort(self._table, order="offset")
-        stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
-        size = self.path.stat().st_size
-        most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // BETWEEN  # lines that the writer would write
-        if len(ordered) > most or [0, *stops] != [*starts, size]:
-            return [f"the chunk table does not cover the file's {size} bytes, each once"]
-        faults = []
-        for offset, size, _, expected in self._table[self._table["rows"] == 0].tolist():
-            found = zlib.crc32(self._bytes(offset, size, expected))
-            if found != expected:
-                where = f"bytes {offset}..{offset + size}, between the chunks"
-                faults.append(f"{where}: expected crc32 {expected:08x}, found {found:08x}")
-        return faults
+class RowRange(NamedTuple):
+    """Rows start..stop of one field of a history."""
 
-    def check_structure(self, values: bool = False) -> list[str]:
-        """What another HDF5 reader would see otherwise than we do; empty if it sees the same.
+    shard: Shard
+    history_id: int
+    field: Field
+    start: int
+    stop: int
 
-        Args:
-            values: also compare every value.
-        """
-        import h5py
 
-        try:
-            with h5py.File(self.path, "r") as file:
-                faults = self._structure_faults(file)
-                if values and not faults:
-                    faults = self._value_faults(file)
-                return faults
-        except Exception as error:  # a damaged file makes h5py raise anything
-            return [f"not an HDF5 file as the index describes it: {error}"]
+def fetch_rows(ranges: Iterable[RowRange]) -> None:
+    """Download the chunks with these rows that are missing on this machine, from all shards in parallel.
 
-    def _structure_faults(self, file: h5py.File) -> list[str]:
-        from icrl4aht_data.format import safe_hdf5 as hdf5
-
-        faults = []
-        expected, found = {"format_version": FORMAT_VERSION, "layout": self.layout.name}, hdf5.attributes(file)
-        if found != expected:
-            faults.append(f"attributes: expected {expected}, found {found}")
-        groups = Counter(entry.h5_group for entry in self._entries.values())
-        if {f"/{name}" for name in file} != set(groups):
-            faults.append(f"groups: expected {sorted(groups)}, found {sorted(f'/{name}' for name in file)}")
-            return faults
-        for group, entry in {entry.h5_group: entry for entry in self._entries.values()}.items():
-            names = sorted(field.name for field in entry.stored_fields(self.kind))
-            if sorted(hdf5.member(file, group)) != names:
-                faults.append(f"{group}: expected {names}, found {sorted(hdf5.member(file, group))}")
-                return faults
-        places: list[tuple[int, int, int]] = []
-        for entry in self._entries.values():
-            for field in entry.stored_fields(self.kind):
-                dataset = hdf5.member(file, f"{entry.h5_group}/{field.name}")
-                used = hdf5.filters(dataset)
-                rows = entry.rows(field)
-                shape = (rows,) if entry.h5_row is None else (groups[entry.h5_group], rows)
-                element = field.element(self.layout, self.kind)
-                shuffled = [hdf5.SHUFFLE] if element.itemsize > 1 else []
-                if used != [*shuffled, hdf5.DEFLATE]:
-                    faults.append(f"{dataset.name}: filters {used}, expected {[*shuffled, hdf5.DEFLATE]}")
-                elif dataset.chunks != (*(1 for _ in shape[1:]), min(field.chunk, rows)):
-                    faults.append(f"{dataset.name}: chunks {dataset.chunks}, expected {min(field.chunk, rows)} rows")
-                if dataset.shape != shape or dataset.dtype != element:
-                    faults.append(
-                        f"{dataset.name}: expected {shape} of {element}, found {dataset.shape} of {dataset.dtype}"
-                    )
-            if not faults:
-                places += chunk_locations(file, self.kind, entry)
-        table = list(zip(*(self._table[name].tolist() for name in ("offset", "size", "rows")), strict=True))
-        wrong = [row for row, (a, b) in enumerate(zip(places, table, strict=False)) if a != b]
-        if wrong and not faults:
-            faults.append(f"the chunk table places {self.describe(wrong[0])} where HDF5 has {places[wrong[0]]}")
-        return faults
-
-    def _value_faults(self, file: h5py.File) -> list[str]:
-        faults = []
-        for entry in self._entries.values():
-            for field in entry.stored_fields(self.kind):
-                dataset: Any = file[f"{entry.h5_group}/{field.name}"]
-                try:
-                    ours = self.read(entry.history_id, field, 0, entry.rows(field))
-                except ShardCorruptError:
-                    continue  # reported chunk by chunk, and nothing for libhdf5 to inflate
-                theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
-                if not np.array_equal(theirs, ours):
-                    faults.append(f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do")
-        return faults
+    Raises:
+        RemoteError: if a chunk cannot be had.
+    """
+    of_shard: dict[Shard, list[RowRange]] = {}
+    for one in ranges:
+        of_shard.setdefault(one.shard, []).append(one)
+    fetch_chunks(part for shard, some in of_shard.items() for part in shard.missing_chunks(some))
 
 
 class Shards:
-    """The release's shards, opened when first read."""
+    """The shards of a release, each opened when it is first read.
 
-    def __init__(self, origin: ReleaseLocation, index: Index) -> None:
-        self.origin = origin
-        self._index = index
+    Args:
+        location: the release.
+        index: its index.
+    """
+
+    def __init__(self, location: ReleaseLocation, index: Index) -> None:
+        self._location, self._index = location, index
         self._open: dict[str, Shard] = {}
-        self._cache = ChunkCache()
-
-    def forget(self) -> None:
-        """Drop decoded chunks."""
-        self._cache.clear()
+        self.cache = ChunkCache()
 
     def open(self, name: str) -> Shard:
+        """The shard with that path in the release."""
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
-            self._open[name] = Shard(self.origin, name, self._index.info.kind, members, self._cache)
+            self._open[name] = Shard(self._location, name, self._index.info.kind, members, self.cache)
         return self._open[name]

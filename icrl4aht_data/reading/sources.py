@@ -1,26 +1,26 @@
-"""Where a sampler's rows come from: `ram`, `mmap` and `stream` behind one interface, the same rows from each.
+"""Three ways to hold the histories of a selection, `ram`, `mmap` and `stream`, which give the same rows.
 
-ram      records and scalars decoded once into flat arrays; a window is one copy
+ram      records and scalars decoded once into flat arrays in memory; reading a window is one copy
 mmap     the same arrays decoded once into the cache folder and memory-mapped, shared by processes
 stream   chunks read by their stored offsets, checked and inflated on threads when a window needs them
 
-A record is what is held of a step to show what the ego saw: its state record, or where a release has none the
-observation itself; see `schema.record_field`.
+A record is what is held of a step to present the ego's observation: the state record, or in a release without state
+records the observation itself; see `schema.record_field`.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.reading.shard import Shard
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.cache import cache_room, cached_arrays
 from icrl4aht_data.utils.memory import free_memory
 from icrl4aht_data.utils.threads import in_slices
@@ -30,47 +30,56 @@ CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
 
 _VERSION = 1  # of the memory-mapped arrays
-_COPIED = 2**20  # bytes at a time: the copies in between stay small, and the calls few
+_COPIED = 2**20  # bytes copied at a time, so that NumPy's intermediate copy fits into the processor's cache
+_STEPS = 8192  # for fewer steps another thread costs more than it saves
 
 
 class CacheChoice(NamedTuple):
-    """How a selection is held, and why."""
+    """The way in which a selection is held.
+
+    Attributes:
+        cache: "ram", "mmap" or "stream".
+        reason: why, in words.
+    """
 
     cache: CacheMode
     reason: str
 
 
+class ReadRequest(NamedTuple):
+    """Rows of one field in several histories, and the array to read them into. `n` denotes the number of histories.
+
+    Attributes:
+        field: a name in `schema.held_fields`.
+        histories: int (n,), positions in the selection.
+        rows: int (n,), the first row of a window in each history, -1 or more; or int (n, K), any rows of each history.
+        out: (n, K, ...), C-contiguous, of any dtype that represents the values. In windows, rows outside the history
+            are set to 0. State records may be wider than the history's layout needs; the rest is set to 0.
+    """
+
+    field: str
+    histories: np.ndarray
+    rows: np.ndarray
+    out: np.ndarray
+
+
 class HistorySource(Protocol):
-    """Rows of the histories of one layout, named by their position in the source. Values are in `Field.compact`."""
+    """Rows of the histories of a selection, which requests name by their positions in it."""
 
-    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
-        """Rows starts..starts + L of each history into out (n, L, ...), C-contiguous; rows outside a history are zero.
+    def read(self, requests: Sequence[ReadRequest]) -> None:
+        """Carry out requests, in parallel. Chunks of a remote release that they need are downloaded first, all at once.
 
-        Args:
-            field: one of `held_fields` with one row a step.
-            which: int (n,), positions.
-            starts: int (n,), -1 or more.
-            out: any dtype for scalars, uint8 (n, L, S) for states, uint8 (n, L, 5, 5, C) for observations.
+        Raises:
+            ShardCorruptError: names the chunk whose checksum is wrong.
+            RemoteError: if a chunk cannot be had.
         """
         ...
 
-    def steps(self, field: str, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """(n, K, ...): any steps int (n, K) within each history."""
-        ...
 
-    def ends(self, which: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-        """uint8 (m, S): the state after the last kept step of an episode (m,) of a history (m,). Of states only."""
-        ...
-
-    def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
-        """What `blocks.bring` takes so that rows low..high of some fields of histories (n,) are at hand."""
-        ...
-
-
-def choose(cache: CacheMode, size: int) -> CacheChoice:
-    """How to hold arrays of that many bytes."""
+def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
+    """The way to hold arrays of `size` bytes."""
     if cache != "auto":
-        return CacheChoice(cache, "as asked")
+        return CacheChoice(cache, "as the option says")
     memory = free_memory()
     if size <= memory // 2:
         return CacheChoice("ram", f"{_gigabytes(size)} decoded, {_gigabytes(memory)} of memory free")
@@ -87,7 +96,7 @@ def _gigabytes(size: int) -> str:
 
 
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
-    """Bytes of the flat arrays of histories of one layout."""
+    """Bytes of the flat arrays of histories of one layout, with so many steps and episodes in total."""
     rows = {"T": steps + histories + 1, "E": episodes}
     return sum(rows[field.axis] * field.held(layout).itemsize for field in held_fields(kind))
 
@@ -95,49 +104,59 @@ def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episode
 def open_source(
     cache: CacheMode, entries: Sequence[Entry], open_shard: Callable[[str], Shard], threads: int
 ) -> HistorySource:
-    """The source of histories of one layout.
+    """Open the histories of a selection; `ram` and `mmap` decode them.
 
     Args:
-        cache: not "auto".
-        entries: the histories; their positions are the source's.
+        cache: "ram", "mmap" or "stream".
+        entries: index entries, (H,), in the selection's order; a history may occur more than once.
         open_shard: shard name -> shard.
-        threads: for decoding.
+        threads: how many decode and copy.
     """
-    layout = get_layout(entries[0].layout)
-    shards = [open_shard(entry.shard) for entry in entries]
     if cache == "stream":
-        return Streamed(layout, entries, shards)
-    if cache == "ram":
-        return Flat(
-            entries, _decoded(layout, entries, shards, threads, lambda shape, dtype, name: np.zeros(shape, dtype))
-        )
+        return StreamedSource(entries, [open_shard(entry.shard) for entry in entries], threads)
+    hold = _arrays_in_memory if cache == "ram" else _mapped_arrays
+    source = FlatSource(entries, threads)
+    for name in dict.fromkeys(entry.layout for entry in entries):
+        by_id = {entry.history_id: entry for entry in entries if entry.layout == name}
+        members = [by_id[history_id] for history_id in sorted(by_id)]
+        shards = [open_shard(entry.shard) for entry in members]
+        source.add(members, hold(members, shards, threads))
+    return source
+
+
+def _arrays_in_memory(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
+    return _decode(entries, shards, threads, lambda shape, dtype, name: np.zeros(shape, dtype))
+
+
+def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
+    """Arrays of the cache folder whose key is the histories' content; decoded if they are not there."""
+    layout = shards[0].layout
     digest = hashlib.blake2b(f"{_VERSION} {layout.name} {layout.rows}".encode(), digest_size=16)
     for entry, shard in zip(entries, shards, strict=True):
         digest.update(f" {entry.T} {entry.episodes} ".encode() + shard.fingerprint(entry.history_id))
 
     def build(folder: Path) -> None:
-        def make(shape: tuple[int, ...], dtype: np.dtype, name: str) -> np.ndarray:
+        def make(shape: tuple[int, ...], dtype: np.dtype, name: str) -> np.memmap:
             return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape)
 
-        for array in _decoded(layout, entries, shards, threads, make).values():
+        for array in _decode(entries, shards, threads, make).values():
             array.flush()  # type: ignore[attr-defined]
 
     steps, episodes = sum(entry.T for entry in entries), sum(entry.episodes for entry in entries)
     size = decoded_size(layout, shards[0].kind, steps, len(entries), episodes)
-    return Flat(entries, cached_arrays(f"histories-{digest.hexdigest()}", size, build))
+    return cached_arrays(f"histories-{digest.hexdigest()}", size, build)
 
 
-def _decoded(
-    layout: Layout, entries: Sequence[Entry], shards: Sequence[Shard], threads: int, make: Callable
+def _decode(
+    entries: Sequence[Entry], shards: Sequence[Shard], threads: int, make: Callable[..., np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Flat arrays by field; `make(shape, dtype, name)` allocates one, zeroed."""
+    """Field -> array (rows, ...) with the histories of one layout; `make(shape, dtype, name)` allocates one, zeroed."""
     arrays = {}
     for field in held_fields(shards[0].kind):
-        if not any(entry.has(field) for entry in entries):
-            continue
-        rows = sum(entry.rows(field) for entry in entries) + (len(entries) + 1 if field.axis == "T" else 0)
-        element = field.held(layout)
-        arrays[field.name] = make((rows, *element.shape), element.base, field.name)
+        if any(entry.has(field) for entry in entries):
+            rows = sum(entry.rows(field) for entry in entries) + (len(entries) + 1 if field.axis == "T" else 0)
+            element = field.held(shards[0].layout)
+            arrays[field.name] = make((rows, *element.shape), element.base, field.name)
     firsts = {axis: _first_rows(entries, axis) for axis in ("T", "E")}
 
     def decode(start: int, stop: int) -> None:
@@ -153,99 +172,141 @@ def _decoded(
 
 
 def _first_rows(entries: Sequence[Entry], axis: str) -> np.ndarray:
-    """Where each history begins; before each history's steps stands one row of zeros: what precedes the first step."""
+    """int (H,): the row of each history's first step or episode in flat arrays.
+
+    A row of zeros precedes the steps of each history and one follows the last: what came before a history's first step.
+    """
     lengths = np.array([entry.T + 1 if axis == "T" else entry.episodes for entry in entries])
     return np.cumsum(lengths) - lengths + (1 if axis == "T" else 0)
 
 
-class Flat:
-    """Histories one after the other in flat arrays, in memory or memory-mapped."""
+class FlatSource:
+    """Histories one after the other in flat arrays, in memory or memory-mapped; one set of arrays a layout."""
 
-    def __init__(self, entries: Sequence[Entry], arrays: dict[str, np.ndarray]) -> None:
-        self._arrays = arrays
-        self._first, self._first_end = _first_rows(entries, "T"), _first_rows(entries, "E")
-        self._lengths = np.array([entry.T for entry in entries])
+    def __init__(self, entries: Sequence[Entry], threads: int) -> None:
+        self._ids, self._threads = np.array([entry.history_id for entry in entries]), threads
+        self._arrays: list[dict[str, np.ndarray]] = []
+        self._layout = np.zeros(len(entries), np.intp)  # which arrays a history is in
+        self._first = {axis: np.zeros(len(entries), np.intp) for axis in ("T", "E")}
+        self._rows = {"T": np.array([e.T for e in entries]), "E": np.array([e.episodes for e in entries])}
 
-    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
-        length = out.shape[1]
-        array, first = self._arrays[field], self._first[which] + starts
-        beyond = starts + length - self._lengths[which]
-        if length > len(array) or (beyond > 0).any():
-            for row, (begin, missing) in enumerate(zip(first.tolist(), np.maximum(beyond, 0).tolist(), strict=True)):
-                kept = max(length - missing, 0)
-                out[row, :kept], out[row, kept:] = array[begin : begin + kept], 0
-        else:
+    def add(self, members: Sequence[Entry], arrays: dict[str, np.ndarray]) -> None:
+        """Add the arrays with the histories of one layout, which are in order of their ids."""
+        ids = np.array([entry.history_id for entry in members])
+        number = np.minimum(np.searchsorted(ids, self._ids), len(ids) - 1)
+        here = ids[number] == self._ids
+        self._layout[here] = len(self._arrays)
+        for axis, first in self._first.items():
+            first[here] = _first_rows(members, axis)[number[here]]
+        self._arrays.append(arrays)
+
+    def read(self, requests: Sequence[ReadRequest]) -> None:
+        _on_threads(self._read, requests, self._threads)
+
+    def _read(self, request: ReadRequest) -> None:
+        name, histories, rows, out = request
+        if len(self._arrays) == 1:
+            self._copy(self._arrays[0][name], *request)
+            return
+        layout = self._layout[histories]
+        for number, arrays in enumerate(self._arrays):
+            chosen = np.flatnonzero(layout == number)
+            if not len(chosen):
+                continue
+            array = arrays[name]
+            part = np.empty((len(chosen), out.shape[1], *array.shape[1:]), out.dtype)
+            self._copy(array, name, histories[chosen], rows[chosen], part)
+            if part.shape == (len(chosen), *out.shape[1:]):
+                out[chosen] = part
+            else:  # a shorter state record
+                out[chosen, ..., : part.shape[-1]] = part
+                out[chosen, ..., part.shape[-1] :] = 0
+
+    def _copy(self, array: np.ndarray, name: str, histories: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
+        axis, length = FIELDS[name].axis, out.shape[1]
+        first = self._first[axis][histories]
+        if rows.ndim == 2:
+            if out.dtype == array.dtype:
+                np.take(array, first[:, None] + rows, axis=0, out=out, mode="clip")  # other modes copy once more
+            else:
+                out[...] = array[first[:, None] + rows]
+            return
+        first = first + rows
+        beyond = rows + length - self._rows[axis][histories]
+        if length <= len(array) and (beyond <= 1).all():  # one step beyond is the row of zeros
             _copy_windows(array, first, out)
-
-    def steps(self, field: str, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        return self._arrays[field][self._first[which][:, None] + steps]
-
-    def ends(self, which: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-        return self._arrays["episode_end_state"][self._first_end[which] + episodes]
-
-    def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
-        return []
+            return
+        for row, (begin, missing) in enumerate(zip(first.tolist(), np.maximum(beyond, 0).tolist(), strict=True)):
+            kept = max(length - missing, 0)
+            out[row, :kept], out[row, kept:] = array[begin : begin + kept], 0
 
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
-    """Rows first..first + L of array (N,) or (N, S) into out (n, L) or (n, L, S), C-contiguous: a block a window."""
+    """Copy rows first..first + K of array (N, ...) into out (n, K, ...), C-contiguous, as one block a window."""
     size = array[0].size
     flat, width = array.reshape(-1), out.shape[1] * size
-    # What sliding_window_view gives, without its twenty microseconds.
+    # A view of all windows, one for each offset. `sliding_window_view` does the same and takes 20 microseconds longer.
     blocks = np.ndarray((flat.size - width + 1, width), flat.dtype, flat, strides=flat.strides * 2)
-    place, target = first * size, out.reshape(len(out), -1)
+    offset, target = first * size, out.reshape(len(out), -1)
     windows = max(1, _COPIED // (width * flat.itemsize))
     for low in range(0, len(out), windows):
-        rows = slice(low, low + windows)
-        target[rows] = blocks[place[rows]]
+        part = slice(low, low + windows)
+        target[part] = blocks[offset[part]]
 
 
-class Streamed:
+class StreamedSource:
     """Histories in their shards, read a few chunks at a time."""
 
-    def __init__(self, layout: Layout, entries: Sequence[Entry], shards: Sequence[Shard]) -> None:
-        self._entries, self._shards, self._layout = entries, shards, layout
-        self._remote = {id(shard): shard for shard in shards if shard.is_remote}
+    def __init__(self, entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> None:
+        self._entries, self._shards, self._threads = entries, shards, threads
+        self._remote = any(shard.is_remote for shard in shards)
 
-    @cached_property
-    def _lengths(self) -> list[int]:
-        return [entry.T for entry in self._entries]
+    def read(self, requests: Sequence[ReadRequest]) -> None:
+        if self._remote:
+            fetch_rows(part for request in requests for part in self._ranges(request))
+        _on_threads(self._read, requests, self._threads)
 
-    def windows(self, field: str, which: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
-        length, lengths = out.shape[1], self._lengths
-        for row, (position, begin) in enumerate(zip(which.tolist(), starts.tolist(), strict=True)):
-            window = out[row]
-            low, high = max(begin, 0), min(begin + length, lengths[position])
-            if high - low < length:
-                window[...] = 0
+    def _ranges(self, request: ReadRequest) -> Iterator[RowRange]:
+        """The rows that a request reads of each history."""
+        field, rows = FIELDS[request.field], request.rows
+        low, high = (rows.min(axis=1), rows.max(axis=1) + 1) if rows.ndim == 2 else (rows, rows + request.out.shape[1])
+        for position, start, stop in zip(request.histories.tolist(), low.tolist(), high.tolist(), strict=True):
+            entry = self._entries[position]
+            stop = min(stop, entry.rows(field))
+            yield RowRange(self._shards[position], entry.history_id, field, max(start, 0), stop)
+
+    def _read(self, request: ReadRequest) -> None:
+        field = FIELDS[request.field]
+        for position, rows, out in zip(request.histories.tolist(), request.rows, request.out, strict=True):
+            history_id, shard = self._entries[position].history_id, self._shards[position]
+            if field.row == "state":
+                size = record_size(shard.layout)
+                out[..., size:] = 0
+                out = out[..., :size]
+            if rows.ndim:
+                low = int(rows.min())
+                out[...] = shard.read(history_id, field, low, int(rows.max()) + 1)[rows - low]
+                continue
+            begin = int(rows)
+            low, high = max(begin, 0), min(begin + len(out), self._entries[position].rows(field))
+            if high - low < len(out):
+                out[...] = 0
             if low < high:
-                history_id = self._entries[position].history_id
-                self._shards[position].read_into(history_id, FIELDS[field], low, window[low - begin : high - begin])
+                shard.read_into(history_id, field, low, out[low - begin : high - begin])
 
-    def steps(self, field: str, which: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        rows = []
-        for position, wanted in zip(which.tolist(), steps, strict=True):
-            low = int(wanted.min())
-            history_id = self._entries[position].history_id
-            rows.append(
-                self._shards[position].read(history_id, FIELDS[field], low, int(wanted.max()) + 1)[wanted - low]
-            )
-        return np.stack(rows) if rows else np.zeros((*steps.shape, *FIELDS[field].held(self._layout).shape), np.uint8)
 
-    def ends(self, which: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-        out = np.empty((len(which), *FIELDS["episode_end_state"].held(self._layout).shape), np.uint8)
-        for row, (position, episode) in enumerate(zip(which.tolist(), episodes.tolist(), strict=True)):
-            history_id = self._entries[position].history_id
-            out[row] = self._shards[position].read(history_id, FIELDS["episode_end_state"], episode, episode + 1)[0]
-        return out
+def _on_threads(read: Callable[[ReadRequest], None], requests: Sequence[ReadRequest], threads: int) -> None:
+    """Call `read` with parts of the requests, on several threads if there are enough steps.
 
-    def lacking(self, fields: Sequence[str], which: np.ndarray, low: np.ndarray, high: np.ndarray) -> list:
-        if not self._remote:
-            return []
-        rows: dict[int, list[int]] = {key: [] for key in self._remote}
-        for position, first, last in zip(which.tolist(), low.tolist(), high.tolist(), strict=True):
-            entry, shard = self._entries[position], self._shards[position]
-            for field in map(FIELDS.__getitem__, fields):
-                stop = min(last, entry.rows(field))
-                rows[id(shard)].extend(shard.needed(entry.history_id, field, max(first, 0), stop))
-        return [part for key, some in rows.items() for part in self._remote[key].lacking(some)]
+    Each thread takes the same share of every request, so that windows of one history, which share chunks, are read
+    by one thread.
+    """
+    rows, steps = max((request.out.shape[:2] for request in requests), key=lambda shape: shape[1])
+
+    def work(first: int, last: int) -> None:
+        for field, histories, wanted, out in requests:
+            part = slice(len(out) * first // rows, len(out) * last // rows)
+            if part.stop > part.start:
+                read(ReadRequest(field, histories[part], wanted[part], out[part]))
+
+    in_slices(work, rows, threads, least=max(1, _STEPS // steps))

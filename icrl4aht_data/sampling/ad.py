@@ -1,129 +1,132 @@
-"""TODO."""
+"""Batches for Algorithm Distillation (paper, App. D.4). `B` denotes the batch size, `L` the windows' length."""
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.sampling.base import ChunkRequest, Group, Sampler, _describe
-from icrl4aht_data.sampling.draws import random_uint32, scale_to_range, weighted_choice
+from icrl4aht_data.reading.sources import ReadRequest
+from icrl4aht_data.sampling.base import Sampler, describe_batch
+from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
+from icrl4aht_data.sampling.observer import ArraySpec
 
 
 class ADBatch(NamedTuple):
-    """Windows of learning histories (paper, table of the AD batch). With obs="state", obs is (B, L, S) uint8."""
+    """Windows of learning histories (paper, App. D.4).
 
-    obs: np.ndarray  # float32 (B, L, 5, 5, C)
-    prev_actions: np.ndarray  # int32 (B, L); 0 at a history's first step
-    prev_rewards: np.ndarray  # float32 (B, L); 0 at a history's first step
-    target_actions: np.ndarray  # int32 (B, L)
-    dones: np.ndarray  # bool (B, L)
-    attention_mask: np.ndarray  # bool (B, L); False on padding behind the end of a range shorter than L
-    prev_teammate_actions: np.ndarray | None = None  # int32 (B, L), on request
-    layouts: np.ndarray | None = None  # int32 (B,), places in sampler.layouts; of states of several layouts
+    All arrays are 0 on padding, which follows the last step of a history or range shorter than L.
+
+    Attributes:
+        obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations. With obs="state" uint8 (B, L, S): state records.
+        prev_actions: int32 (B, L): the ego's actions one step earlier, 0..5; 0 at a history's first step.
+        prev_rewards: float32 (B, L): the team's rewards one step earlier; 0 at a history's first step.
+        target_actions: int32 (B, L): the ego's actions, 0..5, which a model learns to predict.
+        dones: bool (B, L): True at the last step of an episode.
+        attention_mask: bool (B, L): False on padding.
+        prev_teammate_actions: int32 (B, L): the teammate's actions one step earlier, 0..5; None unless the sampler was
+            made with teammate_actions=True.
+        layouts: int32 (B,): positions in `sampler.layouts`; None unless obs="state" and there are several layouts.
+    """
+
+    obs: np.ndarray
+    prev_actions: np.ndarray
+    prev_rewards: np.ndarray
+    target_actions: np.ndarray
+    dones: np.ndarray
+    attention_mask: np.ndarray
+    prev_teammate_actions: np.ndarray | None = None
+    layouts: np.ndarray | None = None
 
     def describe(self) -> str:
-        """Fields, dtypes and shapes, one a line."""
-        return _describe(self)
+        """Fields, dtypes and shapes, one per line."""
+        return describe_batch(self)
 
 
 class ADSampler(Sampler[ADBatch]):
-    """Windows for Algorithm Distillation.
+    """Windows for Algorithm Distillation: a sequence of batches, each a pure function of (selection, options, seed, i).
 
-    A history is drawn uniformly from the selection, a start uniformly from 0..T - L; windows cross episode boundaries;
+    A history is drawn uniformly from the selection, a start uniformly from 0..T - L. Windows cross episode boundaries;
     a history shorter than L is padded at the end. `prev_*` is what preceded each step in the history.
+
+    `sampler[i]` is the same in any process, on any number of workers and threads, however the data are held, and from
+    a lite or a full release; resuming means continuing with the next i.
 
     Args:
         dataset: a selection whose layouts have observations of one shape.
         batch_size: B, over all processes.
         length: L, in steps.
-        seed: any non-negative integer.
-        teammate_actions: whether to give `prev_teammate_actions`.
-        weights: how likely each history is drawn: "uniform", "length" (by its steps) or one number a history.
+        seed: any non-negative integer below 2**63.
+        teammate_actions: whether batches have `prev_teammate_actions`.
+        weights: how likely each history is drawn: "uniform", "length" (by its steps) or one number for each history.
         episodes: windows stay inside these episodes of each history, such as (0, 10) or (-10, None).
         curriculum: windows stay inside a part of each history that moves with i.
         process_index, process_count: this process gets its share of every batch's rows.
 
     Raises:
-        OptionError: for impossible options, or a selection of unequal observations.
+        OptionError: for impossible options, or a selection with observations of several shapes.
+        LabelsMissingError: with teammate_actions=True, if some history has none.
     """
 
+    batch_type = ADBatch
+
+    @cached_property
+    def specs(self) -> dict[str, ArraySpec]:
+        shape = self.local_size, self.length
+        return {
+            "obs": self._observer.spec(*shape),
+            "prev_actions": ArraySpec("int32", shape),
+            "prev_rewards": ArraySpec("float32", shape),
+            "target_actions": ArraySpec("int32", shape),
+            "dones": ArraySpec("bool", shape),
+            "attention_mask": ArraySpec("bool", shape),
+            **({"prev_teammate_actions": ArraySpec("int32", shape)} if self.teammate_actions else {}),
+            **self._layout_specs(),
+        }
+
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Which windows batch i holds: history ids and starts, int64 (B,) each."""
-        position, starts, _ = self._windows(i)
+        """The windows of batch i: history ids and first steps, int64 (B,) each."""
+        position, starts, _ = self._draw(i)
         return self.dataset.ids[position].astype(np.int64), starts
 
-    def _windows(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in the selection, starts, and how many steps of each window are in its range."""
-        which, where = self._local(random_uint32(self.seed, i, 2, self.batch_size))
-        low, high = self._steps(i)
-        weights = self._history_weights(low, high)
-        position = scale_to_range(which, len(self.dataset)) if weights is None else weighted_choice(which, weights)
+    def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """int64 (B,) each: positions in the selection, first steps, and how many steps of each window are valid."""
+        for_history, for_start = self._random(i, 2)
+        low, high = self._draws.steps(i)
+        weights = self._draws.history_weights(low, high)
+        if weights is None:
+            position = scale_to_range(for_history, len(self.dataset))
+        else:
+            position = weighted_choice(for_history, weights)
         low, high = low[position], high[position]
-        starts = low + scale_to_range(where, np.maximum(high - low - self.length, 0) + 1)
+        starts = low + scale_to_range(for_start, np.maximum(high - low - self.length, 0) + 1)
         return position, starts, np.minimum(high - starts, self.length)
 
-    def empty(self) -> ADBatch:
-        shape = (self.local_size, self.length)
-        return ADBatch(
-            obs=self._empty_obs(*shape),
-            prev_actions=np.empty(shape, np.int32),
-            prev_rewards=np.empty(shape, np.float32),
-            target_actions=np.empty(shape, np.int32),
-            dones=np.empty(shape, bool),
-            attention_mask=np.empty(shape, bool),
-            prev_teammate_actions=np.empty(shape, np.int32) if self.teammate_actions else None,
-            layouts=self._empty_layouts(),
-        )
-
     def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
-        which, starts, valid = self._windows(i)
-        batch = self._checked(out)
-        scalars = [
-            ("actions", 0, batch.target_actions),
-            ("dones", 0, batch.dones),
-            ("actions", -1, batch.prev_actions),
-            ("rewards", -1, batch.prev_rewards),
-            ("teammate_actions", -1, batch.prev_teammate_actions),
+        position, starts, valid = self._draw(i)
+        batch = self._buffer(out)
+
+        records = self._observer.records(batch.obs)
+        reads = [
+            ReadRequest(self._observer.field, position, starts, records),
+            ReadRequest("actions", position, starts, batch.target_actions),
+            ReadRequest("dones", position, starts, batch.dones),
+            # One step earlier; before a history's first step a source reads zeros.
+            ReadRequest("actions", position, starts - 1, batch.prev_actions),
+            ReadRequest("rewards", position, starts - 1, batch.prev_rewards),
         ]
-        place = self.dataset.holding.place
-        groups = [(group, place[group.select(which)], group.select(starts)) for group in self._groups(which)]
-        fields = list(dict.fromkeys([self._record, *(name for name, _, array in scalars if array is not None)]))
-        self._bring(ChunkRequest(g.source, fields, where, low - 1, low + self.length) for g, where, low in groups)
-        for group, place, start in groups:
+        if batch.prev_teammate_actions is not None:
+            reads.append(ReadRequest("teammate_actions", position, starts - 1, batch.prev_teammate_actions))
+        self.dataset.storage.read(reads)
 
-            def fill(first: int, last: int, group=group, place=place, start=start) -> None:
-                part, which, low = group.part(first, last), place[first:last], start[first:last]
-                for field, shift, array in scalars:
-                    if array is not None:
-                        self._fill_scalar(field, part, which, low + shift, array)
-                self._fill_obs(part, which, low, batch.obs)
-
-            self._on_threads(len(place), fill)
-            if batch.layouts is not None:
-                batch.layouts[group.rows] = self.layouts.index(group.layout)
+        self._observer.observe(position, records, batch.obs)
+        if batch.layouts is not None:
+            batch.layouts[...] = self.dataset.layout_numbers[position]
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
-            padding = ~batch.attention_mask
-            for array in (batch.obs, *(array for _, _, array in scalars)):
-                if array is not None:
-                    array[padding] = 0
+            # What was read on padding is of later episodes, or rendered of the zeros after the history's end.
+            for array in (batch.obs, *(read.out for read in reads[1:])):
+                array[~batch.attention_mask] = 0
         return batch
-
-    def _fill_scalar(self, field: str, group: Group, place: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
-        if isinstance(group.rows, slice):
-            group.source.windows(field, place, start, out[group.rows])
-            return
-        rows = np.empty((len(place), self.length), out.dtype)
-        group.source.windows(field, place, start, rows)
-        out[group.rows] = rows
-
-    def _fill_obs(self, group: Group, place: np.ndarray, start: np.ndarray, obs: np.ndarray) -> None:
-        if not self._paints and obs.dtype == np.uint8 and isinstance(group.rows, slice):
-            group.source.windows(self._record, place, start, obs[group.rows])
-            return
-        for low, high in self._slabs(0, len(place)):
-            records = self._empty_records(group, high - low, self.length)
-            group.source.windows(self._record, place[low:high], start[low:high], records)
-            self._present(group.part(low, high), records, obs)

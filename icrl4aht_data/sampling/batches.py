@@ -1,43 +1,63 @@
-"""Batches made ahead of their use, on a thread, and put on a device if one is asked for."""
+"""Batches made ahead of their use on a thread, and optionally copied to a JAX device."""
 
 from __future__ import annotations
 
-import queue
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Generic, Protocol, TypeVar
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.validation import check_int
 
-if TYPE_CHECKING:
-    from icrl4aht_data.sampling.base import Sampler
-
 B = TypeVar("B")
-_POLL = 0.1  # seconds after which a waiting producer looks whether it is still wanted
+
+
+class BatchSource(Protocol[B]):
+    """The methods of a sampler that `Batches` calls."""
+
+    def batch(self, i: int, out: B | None = None) -> B:
+        """Batch i, written into `out` if it is given."""
+        ...
+
+    def empty(self) -> B:
+        """A batch of unset arrays for `out`."""
+        ...
+
+    def options(self) -> dict[str, Any]:
+        """All options that determine the batches, as JSON."""
+        ...
 
 
 class Batches(Iterator[B], Generic[B]):
-    """An iterator over `sampler[start]`, `sampler[start + 1]`, ..: at most `prefetch` finished ones wait in memory.
+    """An iterator over `sampler[start]`, `sampler[start + 1]`, .., made ahead by a thread.
 
-    An exception that making a batch raises comes out of `next`. Leaving a `with` block, `close()` or the iterator's
-    end stops the thread. `waited` is how long the consumer has waited, in seconds, over `served` batches.
+    An exception in making a batch is raised by `next`. Leaving a `with` block, `close()` or the end of the iterator
+    stops the thread.
 
     Args:
-        sampler: the batches.
-        start: the first batch's number.
-        stop: the number behind the last; None goes on without end.
-        prefetch: how many batches may wait; 0 makes each one when it is asked for, without a thread.
-        device: a jax.Device or Sharding: batches become JAX arrays there, the next one's transfer running while the
-            last one is used. Where a sharding spans processes, each gives its share of the rows. Needs JAX.
-        reuse: give the same few buffers again and again: a batch is valid until the next one is taken. New memory costs
-            more than filling it. With a device, host buffers are always reused.
+        sampler: makes the batches.
+        start: number of the first batch.
+        stop: number after the last batch; None for an endless iterator.
+        prefetch: how many batches are made ahead; with 0 each one is made by `next`, without a thread.
+        device: a jax.Device or Sharding. Batches become JAX arrays there, the next one's transfer running while the
+            last one is used. If a sharding spans processes, each process gives its share of the rows. Needs JAX.
+        reuse: write into the same few buffers again and again, since new memory costs more than filling it. A batch is
+            then valid until the next one is taken. With a device, host buffers are always reused.
+
+    Attributes:
+        next: number of the next batch.
+        served: how many batches were taken.
+        waited: seconds that `next` has waited for them.
+
+    Raises:
+        OptionError: for impossible options, or a device without JAX.
     """
 
     def __init__(
         self,
-        sampler: Sampler,
+        sampler: BatchSource[B],
         start: int = 0,
         stop: int | None = None,
         *,
@@ -49,11 +69,14 @@ class Batches(Iterator[B], Generic[B]):
         self._stop = None if stop is None else check_int("stop", stop, 0)
         self._prefetch = check_int("prefetch", prefetch, 0)
         self._put = _device_put(device) if device is not None else None
-        self._reuse = reuse
+        self._reuse = reuse or device is not None
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
-        self._worker: _Worker | None = None
-        self._held: Any = None
         self._closed = False
+        self._pool: ThreadPoolExecutor | None = None
+        self._ordered = start
+        self._pending: deque[tuple[Future[B], B | None]] = deque()  # ordered batches with their buffers
+        self._free: list[B] = []
+        self._lent: B | None = None  # the buffer of the batch that the consumer has
 
     def __iter__(self) -> Batches[B]:
         return self
@@ -63,13 +86,11 @@ class Batches(Iterator[B], Generic[B]):
             self.close()
             raise StopIteration
         started = time.perf_counter()
-        if self._worker is None:
-            self._worker = _Worker(self._sampler, self.next, self._stop, self._prefetch, self._put, self._reuse)
-        if self._held is not None:
-            self._worker.give_back(self._held)
-            self._held = None
+        if self._lent is not None:
+            self._free.append(self._lent)
+            self._lent = None
         try:
-            batch, self._held = self._worker.take()
+            batch = self._take()
         except BaseException:
             self.close()
             raise
@@ -78,15 +99,53 @@ class Batches(Iterator[B], Generic[B]):
         self.next += 1
         return batch
 
+    def _take(self) -> B:
+        """The next batch, while the thread makes the ones after it."""
+        if not self._prefetch:
+            buffer = self._buffer()
+            batch = _make(self._sampler, self.next, buffer, self._put)
+        else:
+            # One is taken before the last one is ordered, so that `prefetch + 1` buffers are enough.
+            self._order(self.next + self._prefetch)
+            future, buffer = self._pending.popleft()
+            self._order(self.next + self._prefetch + 1)
+            batch = future.result()
+        if self._put is None:
+            self._lent = buffer
+        return batch
+
+    def _order(self, stop: int) -> None:
+        """Have all batches below `stop` made that are not yet ordered."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
+            self._ordered = self.next
+        stop = stop if self._stop is None else min(stop, self._stop)
+        for i in range(self._ordered, stop):
+            buffer = self._buffer()
+            self._pending.append((self._pool.submit(_make, self._sampler, i, buffer, self._put), buffer))
+            self._ordered = i + 1
+
+    def _buffer(self) -> B | None:
+        """The buffer for one more batch; None for new memory."""
+        if not self._reuse:
+            return None
+        buffer = self._free.pop() if self._free else self._sampler.empty()
+        if self._put is not None:
+            self._free.append(buffer)  # a batch is on the device before the same thread makes the next one
+        return buffer
+
     def close(self) -> None:
         """Stop the thread and drop what it has made. The iterator is then at its end."""
         self._closed = True
-        self._stop_worker()
+        self._stop_thread()
 
-    def _stop_worker(self) -> None:
-        if self._worker is not None:
-            self._worker.close()
-            self._worker = self._held = None
+    def _stop_thread(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+        self._pending.clear()
+        self._free.clear()
+        self._lent = None
 
     def __enter__(self) -> Batches[B]:
         return self
@@ -94,16 +153,12 @@ class Batches(Iterator[B], Generic[B]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __del__(self) -> None:
-        if getattr(self, "_worker", None) is not None:
-            self._stop_worker()
-
     def state_dict(self) -> dict[str, Any]:
-        """Where the consumer is, as JSON: the number of the next batch, and what the batches are a function of."""
+        """The consumer's position, as JSON: the number of the next batch, and the sampler's options."""
         return {"next": self.next, **self._sampler.options()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from where `state_dict` was taken, exactly.
+        """Continue exactly where `state_dict` was taken.
 
         Raises:
             OptionError: if it was taken from a sampler with other options or another selection; names them.
@@ -111,108 +166,21 @@ class Batches(Iterator[B], Generic[B]):
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]
         if wrong or "next" not in state:
-            told = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))
-            raise OptionError(f"the state is of other batches: it has {told or 'no `next`'}")
-        self._stop_worker()
+            found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))
+            raise OptionError(f"the state is of other batches: it has {found or 'no `next`'}")
+        self._stop_thread()
         self._closed = False
         self.next = check_int("next", state["next"], 0)
 
 
-class _Worker:
-    """Makes batches in order; `take` gives the next one with the buffer to give back."""
-
-    def __init__(
-        self, sampler: Sampler, start: int, stop: int | None, prefetch: int, put: Callable | None, reuse: bool
-    ) -> None:
-        buffers = 1 if put else prefetch + 2 if reuse else 0
-        if not prefetch:
-            buffers = min(buffers, 1)
-        self._free: queue.Queue = queue.Queue()
-        for _ in range(buffers):
-            self._free.put(None)  # made when first needed
-        self._made: queue.Queue = queue.Queue(maxsize=max(prefetch, 1))
-        self._ended = threading.Event()
-        self._numbers = iter(range(start, stop if stop is not None else 2**62))
-        make = _maker(sampler, put, self._free if buffers else None, self._ended)
-        self._make = make
-        self._thread = None
-        if prefetch:
-            arguments = (self._numbers, make, self._made, self._ended)
-            self._thread = threading.Thread(target=_produce, args=arguments, name="icrl4aht-prefetch", daemon=True)
-            self._thread.start()
-
-    def take(self) -> tuple[Any, Any]:
-        if self._thread is None:
-            return self._make(next(self._numbers))
-        batch, buffer, error = self._made.get()
-        if error is not None:
-            raise error
-        return batch, buffer
-
-    def give_back(self, buffer: Any) -> None:
-        self._free.put(buffer)
-
-    def close(self) -> None:
-        self._ended.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            while self._thread.is_alive():
-                try:
-                    self._made.get(timeout=0.01)  # a producer that waits for room
-                except queue.Empty:
-                    continue
-            self._thread.join()
-
-
-class _Ended(Exception):
-    """The consumer is gone."""
-
-
-def _maker(
-    sampler: Sampler, put: Callable | None, free: queue.Queue | None, ended: threading.Event
-) -> Callable[[int], tuple[Any, Any]]:
-    """Number -> batch, and the buffer that the consumer has to give back before it is filled again, if any."""
-
-    def make(i: int) -> tuple[Any, Any]:
-        buffer = None if free is None else _free_buffer(sampler, free, ended)
-        batch = sampler.batch(i, buffer)
-        if put is None:
-            return batch, buffer
-        on_device = put(batch)
-        if free is not None:
-            free.put(buffer)
-        return on_device, None
-
-    return make
-
-
-def _free_buffer(sampler: Sampler, free: queue.Queue, ended: threading.Event) -> Any:
-    while True:
-        try:
-            return free.get(timeout=_POLL) or sampler.empty()
-        except queue.Empty:
-            if ended.is_set():
-                raise _Ended from None
-
-
-def _produce(numbers: Iterator[int], make: Callable, made: queue.Queue, ended: threading.Event) -> None:
-    for i in numbers:
-        try:
-            item = (*make(i), None)
-        except _Ended:
-            return
-        except BaseException as error:
-            item = (None, None, error)
-        while not ended.is_set():
-            try:
-                made.put(item, timeout=_POLL)
-                break
-            except queue.Full:
-                continue
-        if ended.is_set() or item[2] is not None:
-            return
+# A function, not a method: what the thread holds must not keep an abandoned iterator, and so the thread, alive.
+def _make(sampler: BatchSource[B], i: int, buffer: B | None, put: Callable[[B], B] | None) -> B:
+    batch = sampler.batch(i, buffer)
+    return batch if put is None else put(batch)
 
 
 def _device_put(device: Any) -> Callable[[Any], Any]:
+    """A function that copies a batch to a device."""
     try:
         import jax
         import jax.numpy as jnp

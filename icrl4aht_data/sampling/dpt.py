@@ -1,80 +1,86 @@
-"""AD and DPT samplers (paper, App. D.4): sequences of batches, each a pure function of (selection, options, seed, i).
-
-`sampler[i]` is the same in any process, on any number of workers and threads, however the data are held, from a lite or
-a full release; to resume, go on from the next i. `len(sampler)` batches hold as many steps as the selection; `i` may go
-on beyond. `B` denotes the batch size, `L` the window's length, `K` the context's, `(5, 5, C)` an observation.
-"""
+"""Batches for Decision-Pretrained Transformers (paper, App. D.4). `B` is the batch size, `K` the context length."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, OptionError, unknown
-from icrl4aht_data.reading.sources import HistorySource
-from icrl4aht_data.sampling.base import ChunkRequest, Group, Sampler, _describe
-from icrl4aht_data.sampling.draws import random_uint32, scale_to_range, weighted_choice
-
-if TYPE_CHECKING:
-    from typing import Unpack
-
-    from icrl4aht_data.dataset import Dataset
-    from icrl4aht_data.sampling.base import SamplerOptions
+from icrl4aht_data.reading.selection import Selection
+from icrl4aht_data.reading.sources import ReadRequest
+from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
+from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
+from icrl4aht_data.sampling.observer import ArraySpec
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
+"""How a context's transitions are drawn: one after the other (as published), or independently."""
 
 
 class DPTBatch(NamedTuple):
-    """Queries with contexts (paper, table of the DPT batch). With obs="state", observations are state records."""
+    """Queries with contexts (paper, App. D.4).
 
-    query_obs: np.ndarray  # float32 (B, 5, 5, C)
-    query_target: np.ndarray  # int32 (B,), the expert's action
-    context_obs: np.ndarray  # float32 (B, K, 5, 5, C)
-    context_actions: np.ndarray  # int32 (B, K)
-    context_next_obs: np.ndarray  # float32 (B, K, 5, 5, C); what followed in that episode
-    context_rewards: np.ndarray  # float32 (B, K)
-    context_teammate_actions: np.ndarray | None = None  # int32 (B, K), on request
-    layouts: np.ndarray | None = None  # int32 (B,), places in sampler.layouts; of states of several layouts
+    With obs="state", observations are state records: uint8 (B, S) and (B, K, S) instead of (B, 5, 5, C) and
+    (B, K, 5, 5, C).
+
+    Attributes:
+        query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
+        query_target: int32 (B,): the expert's action there, 0..5, which a model learns to predict.
+        context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
+        context_actions: int32 (B, K): the ego's actions in them, 0..5.
+        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations that followed in the same episode.
+        context_rewards: float32 (B, K): the team's rewards.
+        context_teammate_actions: int32 (B, K): the teammate's actions, 0..5; None unless the sampler was made with
+            teammate_actions=True.
+        layouts: int32 (B,): positions in `sampler.layouts`; None unless obs="state" and there are several layouts.
+    """
+
+    query_obs: np.ndarray
+    query_target: np.ndarray
+    context_obs: np.ndarray
+    context_actions: np.ndarray
+    context_next_obs: np.ndarray
+    context_rewards: np.ndarray
+    context_teammate_actions: np.ndarray | None = None
+    layouts: np.ndarray | None = None
 
     def describe(self) -> str:
-        """Fields, dtypes and shapes, one a line."""
-        return _describe(self)
+        """Fields, dtypes and shapes, one per line."""
+        return describe_batch(self)
 
 
 class DPTSampler(Sampler[DPTBatch]):
-    """Queries with contexts for Decision-Pretrained Transformers.
+    """Queries with contexts: a sequence of batches, each a pure function of (selection, options, seed, i).
 
     The task is drawn uniformly, then the query's history and the context's independently within the task, the query
-    step uniformly, and K transitions of the context's history: `contiguous` (as published) or `random` (i.i.d. and
+    step uniformly, and K transitions of the context's history: `contiguous` (as published) or `random` (independent and
     unordered, as in the original DPT).
 
-    A release of observations does not have what followed an episode's last step. There contexts are made of the other
-    transitions, and contiguous ones go on from an episode's last but one step with the next episode's first.
+    A release of observations does not store what followed an episode's last step. Contexts are made of the other
+    transitions there, and in contiguous ones an episode's last but one step is followed by the next episode's first.
 
     Args:
         dataset: a selection whose histories all have expert actions, of layouts with observations of one shape.
         batch_size: B, over all processes.
         context: K, in transitions.
-        seed: any non-negative integer.
-        order: see above.
-        teammate_actions: whether to give `context_teammate_actions`.
-        weights: how likely each history of a task is drawn: "uniform", "length" or one number a history.
-        episodes: query and context stay inside these episodes of their histories.
-        curriculum: query and context stay inside a part of their histories that moves with i.
-        process_index, process_count: this process gets its share of every batch's rows.
+        order: "contiguous" or "random".
+        options: as of `ADSampler`: `seed`; `teammate_actions`, whether batches have `context_teammate_actions`;
+            `weights`, how likely each history of a task is drawn; `episodes` and `curriculum`, the part of their
+            histories that query and context stay inside; `process_index` and `process_count`.
 
     Raises:
         LabelsMissingError: if a history has no expert actions.
-        OptionError: for impossible options, a selection of unequal observations, or K beyond the shortest range.
+        OptionError: for impossible options, a selection with observations of several shapes, or K beyond the shortest
+            range.
     """
+
+    batch_type = DPTBatch
 
     def __init__(
         self,
-        dataset: Dataset,
+        dataset: Selection,
         *,
         batch_size: int,
         context: int,
@@ -90,8 +96,8 @@ class DPTSampler(Sampler[DPTBatch]):
                 f"DPT needs expert actions, but {len(unlabelled)} of {len(dataset)} histories have none "
                 f"(first: {unlabelled[0]}); select labelled ones: entry.has_expert_actions"
             )
-        parts = (map(self._transitions, self._steps(i)) for i in (0, 2**62))
-        shortest = min(int((high - low).min()) for low, high in parts)
+        ranges = (map(self._transitions, self._draws.steps(i)) for i in (0, 2**62))  # a curriculum's first and last
+        shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
         self.order: ContextOrder = order
@@ -100,136 +106,101 @@ class DPTSampler(Sampler[DPTBatch]):
         excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
         return super().options() | {"order": self.order} | excluded
 
-    def _transitions(self, steps: np.ndarray) -> np.ndarray:
-        """How many of a history's first steps are transitions whose next observation is stored."""
-        return steps if self.dataset.has_states else steps - -(-steps // self._kept)
+    @cached_property
+    def specs(self) -> dict[str, ArraySpec]:
+        rows, shape = self.local_size, (self.local_size, self.length)
+        return {
+            "query_obs": self._observer.spec(rows),
+            "query_target": ArraySpec("int32", (rows,)),
+            "context_obs": self._observer.spec(*shape),
+            "context_actions": ArraySpec("int32", shape),
+            "context_next_obs": self._observer.spec(*shape),
+            "context_rewards": ArraySpec("float32", shape),
+            **({"context_teammate_actions": ArraySpec("int32", shape)} if self.teammate_actions else {}),
+            **self._layout_specs(),
+        }
 
-    def _step_of(self, transition: np.ndarray) -> np.ndarray:
-        """The reverse: which step a transition is, counted from the history's first."""
-        return transition if self.dataset.has_states else transition + transition // (self._kept - 1)
+    def batch(self, i: int, out: DPTBatch | None = None) -> DPTBatch:
+        query, query_step, context, steps = self._draw(i)
+        batch = self._buffer(out)
+
+        observer, kept_steps = self._observer, self._draws.kept_steps
+        query_records = observer.records(batch.query_obs)
+        records, next_records = observer.records(batch.context_obs), observer.records(batch.context_next_obs)
+        # Steps one after the other are read as a window; the row after a history's end, which reads as zeros, is
+        # replaced below. Other steps are read one by one, and what follows the history's last step is replaced, too.
+        if self.order == "contiguous" and self.dataset.has_states:
+            rows, next_rows = steps[:, 0], steps[:, 0] + 1
+        else:
+            rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
+        reads = [
+            ReadRequest("expert_actions", query, query_step, batch.query_target[:, None]),
+            ReadRequest(observer.field, query, query_step, query_records[:, None]),
+            ReadRequest("actions", context, rows, batch.context_actions),
+            ReadRequest("rewards", context, rows, batch.context_rewards),
+            ReadRequest(observer.field, context, rows, records),
+            ReadRequest(observer.field, context, next_rows, next_records),
+        ]
+        if batch.context_teammate_actions is not None:
+            reads.append(ReadRequest("teammate_actions", context, rows, batch.context_teammate_actions))
+        # An episode's last step is followed by the episode's end, never by the next episode's first step.
+        episodes = steps // kept_steps
+        ends = np.nonzero((steps == episodes * kept_steps + kept_steps - 1) & self.dataset.has_states)
+        end_records = np.empty((len(ends[0]), 1, *next_records.shape[2:]), next_records.dtype)
+        reads.append(ReadRequest("episode_end_state", context[ends[0]], episodes[ends], end_records))
+        self.dataset.storage.read(reads)
+        next_records[ends] = end_records[:, 0]
+
+        observer.observe(query, query_records, batch.query_obs)
+        observer.observe(context, records, batch.context_obs)
+        observer.observe(context, next_records, batch.context_next_obs)
+        if batch.layouts is not None:
+            batch.layouts[...] = self.dataset.layout_numbers[query]  # a task, and so a row, has one layout
+        return batch
+
+    def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Histories (B,) and steps (B,) of queries, histories (B,) and steps (B, K) of contexts, all int64.
+
+        Histories are positions in the selection.
+        """
+        random = self._random(i, 4 + (self.length if self.order == "random" else 1))
+        low, high = self._draws.steps(i)
+        members, begins, ends = self._tasks
+        task = scale_to_range(random[0], len(begins))
+        weights = self._draws.history_weights(low, high)
+        if weights is None:
+            size = ends[task] - begins[task]
+            query, context = (members[begins[task] + scale_to_range(number, size)] for number in random[1:3])
+        else:
+            weights = weights[members]
+            query, context = (
+                members[weighted_choice(number, weights, begins[task], ends[task])] for number in random[1:3]
+            )
+        query_step = low[query] + scale_to_range(random[3], (high - low)[query])
+        low, high = self._transitions(low)[context], self._transitions(high)[context]
+        if self.order == "random":
+            drawn = low[:, None] + scale_to_range(random[4:].T, (high - low)[:, None])
+        else:
+            first = low + scale_to_range(random[4], high - low - self.length + 1)
+            drawn = first[:, None] + np.arange(self.length)
+        return query, query_step, context, self._step_of(drawn)
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in the selection, task by task in order of appearance; where each task begins; where it ends."""
+        """Positions in the selection (H,), task by task in order of appearance; begin and end of each task in them."""
         _, first, task = np.unique(self.dataset.column("task_id"), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
         sizes = np.bincount(rank[task])
         return np.argsort(rank[task], kind="stable"), np.cumsum(sizes) - sizes, np.cumsum(sizes)
 
-    def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Query histories and steps (B,), context histories (B,) and steps (B, K)."""
-        drawn = self._local(
-            random_uint32(self.seed, i, 4 + (self.length if self.order == "random" else 1), self.batch_size)
-        )
-        low, high = self._steps(i)
-        weights = self._history_weights(low, high)
-        _, begins, ends = self._tasks
-        task = scale_to_range(drawn[0], len(begins))
-        asking, showing = (self._member(word, begins[task], ends[task], weights) for word in drawn[1:3])
-        step = low[asking] + scale_to_range(drawn[3], (high - low)[asking])
-        low, high = self._transitions(low), self._transitions(high)
-        if self.order == "random":
-            shown = low[showing][:, None] + scale_to_range(drawn[4:].T, (high - low)[showing][:, None])
-        else:
-            first = low[showing] + scale_to_range(drawn[4], (high - low)[showing] - self.length + 1)
-            shown = first[:, None] + np.arange(self.length)
-        return asking, step, showing, self._step_of(shown)
+    # Transitions are the steps whose next observation is stored: all of them in a release with states, all but each
+    # episode's last in one without. They are drawn by number and mapped to steps.
 
-    def _member(self, word: np.ndarray, begin: np.ndarray, end: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-        positions = self._tasks[0]
-        if weights is None:
-            return positions[begin + scale_to_range(word, end - begin)]
-        return positions[weighted_choice(word, weights[positions], begin, end)]
+    def _transitions(self, steps: np.ndarray) -> np.ndarray:
+        """Number of transitions among a history's first `steps` steps."""
+        return steps if self.dataset.has_states else steps - -(-steps // self._draws.kept_steps)
 
-    def empty(self) -> DPTBatch:
-        rows, shape = self.local_size, (self.local_size, self.length)
-        return DPTBatch(
-            query_obs=self._empty_obs(rows),
-            query_target=np.empty(rows, np.int32),
-            context_obs=self._empty_obs(*shape),
-            context_actions=np.empty(shape, np.int32),
-            context_next_obs=self._empty_obs(*shape),
-            context_rewards=np.empty(shape, np.float32),
-            context_teammate_actions=np.empty(shape, np.int32) if self.teammate_actions else None,
-            layouts=self._empty_layouts(),
-        )
-
-    def batch(self, i: int, out: DPTBatch | None = None) -> DPTBatch:
-        asking, step, showing, steps = self._draw(i)
-        batch = self._checked(out)
-        groups = list(self._groups(asking))  # a task, and so a row, has one layout
-        place = self.dataset.holding.place
-        self._bring(part for group in groups for part in self._needed(group, asking, step, showing, steps))
-        for group in groups:
-            query, when = place[group.select(asking)], group.select(step)[:, None]
-            batch.query_target[group.rows] = group.source.steps("expert_actions", query, when)[:, 0]
-            self._present(group, group.source.steps(self._record, query, when)[:, 0], batch.query_obs)
-            self._fill_context(group, group.select(showing), group.select(steps), batch)
-            if batch.layouts is not None:
-                batch.layouts[group.rows] = self.layouts.index(group.layout)
-        return batch
-
-    def _needed(
-        self, group: Group, asking: np.ndarray, step: np.ndarray, showing: np.ndarray, steps: np.ndarray
-    ) -> Iterator[ChunkRequest]:
-        place = self.dataset.holding.place
-        query, when = place[group.select(asking)], group.select(step)
-        yield ChunkRequest(group.source, [self._record, "expert_actions"], query, when, when + 1)
-        shown, low, high = (group.select(array) for array in (place[showing], steps.min(axis=1), steps.max(axis=1) + 1))
-        labels = ["teammate_actions"] if self.teammate_actions else []
-        yield ChunkRequest(group.source, [self._record, "actions", "rewards", "dones", *labels], shown, low, high + 1)
-        if self.dataset.has_states:
-            yield ChunkRequest(group.source, ["episode_end_state"], shown, low // self._kept, high // self._kept + 1)
-
-    def _fill_context(self, group: Group, showing: np.ndarray, steps: np.ndarray, batch: DPTBatch) -> None:
-        scalars = [
-            ("actions", batch.context_actions),
-            ("rewards", batch.context_rewards),
-            ("teammate_actions", batch.context_teammate_actions),
-        ]
-
-        def slab(first: int, last: int) -> None:
-            part, which, when = group.part(first, last), showing[first:last], steps[first:last]
-            place = self.dataset.holding.place[which]
-            for field, array in scalars:
-                if array is not None:
-                    array[part.rows] = self._read(group.source, field, place, when)
-            records, following = self._before_and_after(group, which, place, when)
-            self._present(part, records, batch.context_obs)
-            self._present(part, following, batch.context_next_obs)
-
-        self._in_slabs(len(showing), slab)
-
-    def _read(self, source: HistorySource, field: str, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        if self._scattered:
-            return source.steps(field, place, steps)
-        out = np.empty(steps.shape, np.int8)
-        source.windows(field, place, steps[:, 0], out)
-        return out
-
-    @property
-    def _scattered(self) -> bool:
-        """Whether a context's steps are not simply one after the other."""
-        return self.order == "random" or not self.dataset.has_states
-
-    def _before_and_after(
-        self, group: Group, which: np.ndarray, place: np.ndarray, steps: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Records before and after steps (n, K), uint8 (n, K, S) or (n, K, 5, 5, C) each.
-
-        The record after an episode's last kept step is the one that followed it in that episode, never the first of
-        the next.
-        """
-        source, last = group.source, self._lengths[which][:, None] - 1
-        if self._scattered:
-            records = source.steps(self._record, place, steps)
-            following = source.steps(self._record, place, np.minimum(steps + 1, last))
-        else:
-            both = self._empty_records(group, len(which), self.length + 1)
-            source.windows(self._record, place, steps[:, 0], both)
-            records, following = both[:, :-1], both[:, 1:].copy()
-        if self.dataset.has_states:
-            row, column = np.nonzero(self._read(source, "dones", place, steps))
-            following[row, column] = source.ends(place[row], steps[row, column] // self._kept)
-        return records, following
+    def _step_of(self, transition: np.ndarray) -> np.ndarray:
+        """The step that a transition is, both counted from the history's first."""
+        return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)

@@ -1,8 +1,10 @@
-"""Random draws that are functions of their arguments alone, and the parts of histories that windows come from."""
+"""Random draws that are functions of their arguments alone, and the steps of histories that they are made from.
+
+`H` denotes the number of histories in a selection, `B` the batch size.
+"""
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.utils.validation import check_int
 
 Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
@@ -17,16 +20,20 @@ WEIGHTS = ("uniform", "length")
 """How histories are weighted in a draw: equally, or by the steps they offer. Or one number for each history."""
 
 Episodes = tuple[int | None, int | None]
-"""The first episode, and the one behind the last, as a slice has them: (None, 10) the first ten, (-10, None) the last
-ten."""
+"""The first episode and the one after the last, as in a slice: (None, 10) the first ten, (-10, None) the last ten."""
 
 
 @dataclass(frozen=True)
 class Curriculum:
-    """The part of every history that windows come from, moving as training goes on.
+    """The part of every history that windows come from, moving with the number of the batch.
 
-    Parts are fractions of a history's episodes (of those in `episodes`, where that is given). Between batch 0 and batch
-    `batches` the part moves linearly from `first` to `last`, and stays there.
+    Parts are fractions of a history's episodes (of those in `episodes`, if that option is given). Between batch 0 and
+    batch `batches` the part moves linearly from `first` to `last`, and stays there.
+
+    Args:
+        batches: number of the batch from which the part is `last`, at least 1.
+        first: (low, high), the part at batch 0.
+        last: (low, high), the final part.
 
     Raises:
         OptionError: unless 0 <= low < high <= 1 for both parts.
@@ -50,7 +57,7 @@ class Curriculum:
 
 
 def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
-    """uint64 (count, batch_size): random words below 2**32, from (seed, i) alone.
+    """uint64 (count, batch_size): random integers below 2**32, a function of (seed, i) and the shape.
 
     Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
     """
@@ -60,24 +67,86 @@ def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
 
 
 def scale_to_range(random: np.ndarray, n: Any) -> np.ndarray:
-    """int64: words below 2**32 scaled to 0..n - 1."""
+    """int64: random integers below 2**32 scaled to 0..n - 1."""
     return (random * np.asarray(n).astype(np.uint64) >> np.uint64(32)).astype(np.int64)
 
 
 def weighted_choice(random: np.ndarray, weights: np.ndarray, first: Any = 0, stop: Any = None) -> np.ndarray:
-    """int64: positions first..stop - 1 of `weights`, drawn in proportion to them. `first` and `stop` may be arrays.
+    """int64: positions first..stop - 1 of `weights`, drawn in proportion to them; one of weight 0 is never drawn.
 
-    A position of weight zero is never drawn.
+    Args:
+        random: uint64 (B,), integers below 2**32.
+        weights: float64 (N,), not negative.
+        first, stop: the range of each draw, numbers or int (B,); by default all positions.
     """
-    ends = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
+    # A weight of 0 makes two equal edges, and searching from the right skips the empty interval between them.
+    edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     stop = len(weights) if stop is None else stop
-    low, high = ends[first], ends[stop]
-    place = np.searchsorted(ends, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
-    return np.clip(place, first, np.asarray(stop) - 1).astype(np.int64)
+    low, high = edges[first], edges[stop]
+    position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
+    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may have led out of the range
 
 
-def check_weights(weights: Weights, histories: int) -> Weights:
-    """The weights as they are, or as float64 (H,).
+class HistoryDraws:
+    """From which steps of each history a sampler draws at batch i, and how likely each history is drawn.
+
+    Args:
+        selection: the histories.
+        weights: see `WEIGHTS`.
+        episodes: see `Episodes`; None for all.
+        curriculum: None for all of these episodes at every batch.
+
+    Attributes:
+        lengths: int64 (H,), steps of each history.
+        kept_steps: steps of an episode.
+
+    Raises:
+        UnknownNameError, OptionError: for impossible options, or episodes that do not all have `kept_steps` steps.
+    """
+
+    def __init__(
+        self, selection: Selection, weights: Weights, episodes: Episodes | None, curriculum: Curriculum | None
+    ) -> None:
+        self.lengths, self._counts = selection.column("T"), selection.column("episodes")
+        self.kept_steps: int = selection.info.environment.kept_steps
+        ended, cut = np.divmod(self.lengths, self.kept_steps)
+        # Only histories of releases without states may end within an episode.
+        if (ended != self._counts).any() or (selection.has_states and cut.any()):
+            raise OptionError(f"some history's episodes have not {self.kept_steps} steps; run `icrl4aht-data verify`")
+        self.weights, self.episodes, self.curriculum = _check_weights(weights, len(selection)), episodes, curriculum
+        self._range = _episode_range(episodes, self._counts)
+
+    def steps(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """First step, and the one after the last, of each history's range at batch i: int64 (H,) each."""
+        first, stop = self._range
+        if self.curriculum is not None:
+            low, high = self.curriculum.part(check_int("batch", i, 0))
+            count = stop - first
+            # Complete episodes, at least one. The small number keeps 0.3 * 10 episodes from being rounded up to 4.
+            low = np.minimum(np.floor(low * count + 1e-9).astype(np.int64), count - 1)
+            high = np.maximum(np.ceil(high * count - 1e-9).astype(np.int64), low + 1)
+            first, stop = first + low, first + high
+        # A range up to the last episode includes the steps of an unfinished one.
+        return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
+
+    def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+        """float64 (H,): weights of histories with steps low..high to draw from; None for equal weights."""
+        if isinstance(self.weights, str):
+            return None if self.weights == "uniform" else (high - low).astype(np.float64)
+        return np.asarray(self.weights)
+
+    def options(self) -> dict[str, Any]:
+        """The options as JSON."""
+        curriculum = self.curriculum
+        return {
+            "weights": self.weights if isinstance(self.weights, str) else self.weights.tolist(),
+            "episodes": self.episodes and list(self.episodes),
+            "curriculum": curriculum and [curriculum.batches, *curriculum.first, *curriculum.last],
+        }
+
+
+def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
+    """The name, or the numbers as float64 (H,).
 
     Raises:
         UnknownNameError, OptionError: if they are neither a known name nor H numbers of which some is positive.
@@ -98,36 +167,23 @@ def check_weights(weights: Weights, histories: int) -> Weights:
     return numbers
 
 
-def episode_range(episodes: Episodes | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First episode and the one behind the last, int64 (H,) each, in histories of `counts` episodes.
+def _episode_range(episodes: Episodes | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First episode and the one after the last in histories of `counts` episodes: int64 (H,) each.
 
     Raises:
-        OptionError: if the range is malformed, or holds no episode of some history.
+        OptionError: if the range is malformed, or some history has no episode in it.
     """
-    if episodes is None:
-        return np.zeros_like(counts), counts
-    if not isinstance(episodes, tuple) or len(episodes) != 2:
-        raise OptionError(f"episodes = {episodes!r}: expected a pair such as (0, 10), (None, 10) or (-10, None)")
-    edges = []
-    for edge, default in zip(episodes, (np.zeros_like(counts), counts), strict=True):
-        if edge is None:
-            edges.append(default)
-            continue
-        try:
-            number = operator.index(edge)
-        except TypeError as error:
-            raise OptionError(f"episodes = {episodes!r}: expected whole numbers or None") from error
-        edges.append(np.clip(number + counts if number < 0 else np.full_like(counts, number), 0, counts))
-    first, stop = edges
+    try:
+        if not isinstance(episodes, tuple | None):
+            raise TypeError
+        bounds = slice(*(episodes or (None, None)))
+        distinct, number = np.unique(counts, return_inverse=True)
+        first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
+    except TypeError as error:
+        raise OptionError(
+            f"episodes = {episodes!r}: expected a pair of integers or None such as (0, 10), (None, 10) or (-10, None)"
+        ) from error
     if (first >= stop).any():
         fewest = int(counts[first >= stop].min())
         raise OptionError(f"episodes = {episodes!r}: a history of {fewest} episodes has none of them")
     return first, stop
-
-
-def part_of(part: tuple[float, float], first: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The episodes of that part of first..stop: whole ones, at least one."""
-    count = stop - first
-    low = np.minimum(np.floor(part[0] * count + 1e-9).astype(np.int64), count - 1)
-    high = np.maximum(np.ceil(part[1] * count - 1e-9).astype(np.int64), low + 1)
-    return first + low, first + high

@@ -236,10 +236,9 @@ def test_dependencies_come_from_the_metadata(monkeypatch):
 
 
 def test_every_extra_for_users_installs_something():
-    extras = {"plot", "generation", "baselines", "tensorboard", "hf", "s3", "grain", "torch", "cluster"}
+    extras = {"plot", "generation", "tensorboard", "hf", "s3", "grain", "torch", "cluster"}
     assert {one.extra for one in dependencies()} == {None, *extras}
     assert extra_with("PIL.Image") == "plot"
-    assert extra_with("orbax.checkpoint") == "baselines"
 
 
 def test_package_that_is_not_installed(elsewhere, monkeypatch):

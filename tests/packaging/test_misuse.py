@@ -77,9 +77,9 @@ generation: speed --layout x | unknown layout 'x'; valid: coord_simple,
 generation: teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
 baselines: train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline.
 baselines: train ad --layout demo_wide --size smal | unknown size 'smal'; valid: small, medium, large.
-baselines: train ad --layout demo_wide --order rnd | unknown order 'rnd'; valid: contiguous, random.
+baselines: train ad --layout demo_wide --order rnd | 'rnd' is not one of 'contiguous', 'random'.
 baselines: train ad --layout demo_wide --batch-size 0 | 0 is not in the range x>=1
-baselines: train ad --layout demo_wide --learning-rate nan | nan is not in the range 0<x<inf
+baselines: train ad --layout demo_wide --learning-rate nan | nan is not a finite number
 baselines: train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 baselines: train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
 baselines: train ad --layout demo_wide --coordinator a:1 --process 2 | --process 2: expected a number below 1

@@ -18,7 +18,7 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from generation.cli import cli
-from generation.collection import run
+from generation.collection import job
 from generation.collection import task as collect
 from generation.collection import task_folder as artefacts
 from generation.collection.job import CollectionError
@@ -87,7 +87,7 @@ def test_a_finished_task_is_not_done_again(built, monkeypatch):
     def never(*arguments):
         raise AssertionError("the task was collected again")
 
-    monkeypatch.setattr(run, "run_task", never)
+    monkeypatch.setattr(job, "run_task", never)
     output = StringIO()
     before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
     build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
@@ -151,7 +151,7 @@ def test_two_collectors_never_do_one_task_together(built):
     folder = built / "c" / task.task_id
 
     def meanwhile(update, metrics):
-        with pytest.raises(OptionError, match="another process is collecting this task"):
+        with pytest.raises(OptionError, match="another process works in this folder"):
             collect.run_task(task, profile, folder)
         raise KeyboardInterrupt
 
@@ -322,7 +322,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
 
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     monkeypatch.setattr(suite._Training, "run_on", never)
-    monkeypatch.setattr(run, "run_task", never)
+    monkeypatch.setattr(job, "run_task", never)
     output = StringIO()
     build.build_releases(str(learned / "learned.toml"), learned, ["lite"], Console(file=output))
     assert output.getvalue().count("finished before") == 4

@@ -18,7 +18,7 @@ from icrl4aht_data import Curriculum, load_icrl4aht
 from icrl4aht_data.errors import OptionError, ShardCorruptError, UnknownNameError
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.reading.sources import choose
+from icrl4aht_data.reading.sources import choose_cache
 from icrl4aht_data.utils.threads import in_slices
 from tests.helpers.batches import CACHES, assert_equal, samplers
 from tests.helpers.random_play import SHARD, random_release
@@ -66,8 +66,8 @@ class TestHolding:
         assert "GB decoded" in dataset.cache.reason
         monkeypatch.setattr("icrl4aht_data.reading.sources.free_memory", lambda: 10**9)
         monkeypatch.setattr("icrl4aht_data.reading.sources.cache_room", lambda: 10**10)
-        assert [choose("auto", size).cache for size in (10**8, 10**9, 10**11)] == ["ram", "mmap", "stream"]
-        assert choose("stream", 1).cache == "stream"
+        assert [choose_cache("auto", size).cache for size in (10**8, 10**9, 10**11)] == ["ram", "mmap", "stream"]
+        assert choose_cache("stream", 1).cache == "stream"
         with pytest.raises(UnknownNameError, match="unknown cache 'disk'; valid: auto, ram, mmap, stream"):
             load_icrl4aht(lite[0], cache="disk")  # type: ignore[arg-type]
 
@@ -335,7 +335,7 @@ class TestPrefetch:
         sampler = load_icrl4aht(lite[0], layout="demo_wide", obs="state").ad(batch_size=3, length=9)
 
         def workers() -> int:
-            return sum(thread.name == "icrl4aht-prefetch" for thread in threading.enumerate())
+            return sum(thread.name.startswith("icrl4aht-prefetch") for thread in threading.enumerate())
 
         with sampler.batches(prefetch=1) as batches:
             next(batches)

@@ -1,0 +1,110 @@
+"""Checks of a shard as an HDF5 file: whether other HDF5 readers see what `Shard` reads, and no byte is unaccounted."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from typing import Any
+
+import h5py
+import numpy as np
+
+from icrl4aht_data.errors import ShardCorruptError
+from icrl4aht_data.format import safe_hdf5
+from icrl4aht_data.format.chunks import BETWEEN, chunk_locations
+from icrl4aht_data.format.schema import FORMAT_VERSION, Entry, Field
+from icrl4aht_data.reading.shard import Shard
+
+
+def check_bytes_between(shard: Shard) -> list[str]:
+    """Faults in the bytes between the chunks, and bytes of the file that the chunk table does not list exactly once."""
+    ordered = np.sort(shard.table, order="offset")
+    stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
+    size = shard.path.stat().st_size
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // BETWEEN  # lines that the writer would write
+    if len(ordered) > most or [0, *stops] != [*starts, size]:
+        return [f"the chunk table does not cover the file's {size} bytes, each once"]
+    faults = []
+    for offset, size, _, expected in shard.table[shard.table["rows"] == 0].tolist():
+        found = zlib.crc32(shard.stored_bytes(offset, size, expected))
+        if found != expected:
+            where = f"bytes {offset}..{offset + size}, between the chunks"
+            faults.append(f"{where}: expected crc32 {expected:08x}, found {found:08x}")
+    return faults
+
+
+def check_structure(shard: Shard, values: bool = False) -> list[str]:
+    """Differences between what another HDF5 reader sees and what `Shard` reads.
+
+    Args:
+        shard: the shard.
+        values: also compare every value.
+    """
+    try:
+        with h5py.File(shard.path, "r") as file:
+            faults = _structure_faults(shard, file)
+            if values and not faults:
+                faults = _value_faults(shard, file)
+            return faults
+    except Exception as error:  # a damaged file makes h5py raise anything
+        return [f"not an HDF5 file as the index describes it: {error}"]
+
+
+def _structure_faults(shard: Shard, file: h5py.File) -> list[str]:
+    faults = []
+    expected = {"format_version": FORMAT_VERSION, "layout": shard.layout.name}
+    found = safe_hdf5.attributes(file)
+    if found != expected:
+        faults.append(f"attributes: expected {expected}, found {found}")
+    groups = Counter(entry.h5_group for entry in shard.entries.values())
+    if {f"/{name}" for name in file} != set(groups):
+        faults.append(f"groups: expected {sorted(groups)}, found {sorted(f'/{name}' for name in file)}")
+        return faults
+    for group, entry in {entry.h5_group: entry for entry in shard.entries.values()}.items():
+        names = sorted(field.name for field in entry.stored_fields(shard.kind))
+        if sorted(safe_hdf5.member(file, group)) != names:
+            faults.append(f"{group}: expected {names}, found {sorted(safe_hdf5.member(file, group))}")
+            return faults
+    chunks: list[tuple[int, int, int]] = []
+    for entry in shard.entries.values():
+        for field in entry.stored_fields(shard.kind):
+            faults += _dataset_faults(shard, file, entry, field, groups[entry.h5_group])
+        if not faults:
+            chunks += chunk_locations(file, shard.kind, entry)
+    table = list(zip(*(shard.table[name].tolist() for name in ("offset", "size", "rows")), strict=True))
+    wrong = [row for row, (a, b) in enumerate(zip(chunks, table, strict=False)) if a != b]
+    if wrong and not faults:
+        faults.append(f"the chunk table places {shard.describe(wrong[0])} where HDF5 has {chunks[wrong[0]]}")
+    return faults
+
+
+def _dataset_faults(shard: Shard, file: h5py.File, entry: Entry, field: Field, stacked: int) -> list[str]:
+    """Faults in filters, chunks, shape and dtype of one dataset, in whose group `stacked` histories are."""
+    faults = []
+    dataset = safe_hdf5.member(file, f"{entry.h5_group}/{field.name}")
+    used, rows = safe_hdf5.filters(dataset), entry.rows(field)
+    shape = (rows,) if entry.h5_row is None else (stacked, rows)
+    element = field.element(shard.layout, shard.kind)
+    shuffled = [safe_hdf5.SHUFFLE] if element.itemsize > 1 else []
+    if used != [*shuffled, safe_hdf5.DEFLATE]:
+        faults.append(f"{dataset.name}: filters {used}, expected {[*shuffled, safe_hdf5.DEFLATE]}")
+    elif dataset.chunks != (*(1 for _ in shape[1:]), min(field.chunk, rows)):
+        faults.append(f"{dataset.name}: chunks {dataset.chunks}, expected {min(field.chunk, rows)} rows")
+    if dataset.shape != shape or dataset.dtype != element:
+        faults.append(f"{dataset.name}: expected {shape} of {element}, found {dataset.shape} of {dataset.dtype}")
+    return faults
+
+
+def _value_faults(shard: Shard, file: h5py.File) -> list[str]:
+    faults = []
+    for entry in shard.entries.values():
+        for field in entry.stored_fields(shard.kind):
+            dataset: Any = file[f"{entry.h5_group}/{field.name}"]
+            try:
+                ours = shard.read(entry.history_id, field, 0, entry.rows(field))
+            except ShardCorruptError:
+                continue  # reported chunk by chunk, and nothing that libhdf5 should inflate
+            theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
+            if not np.array_equal(theirs, ours):
+                faults.append(f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do")
+    return faults
