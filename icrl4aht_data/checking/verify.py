@@ -21,7 +21,7 @@ from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.reading.selection import Names
+from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.remote.download import chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
@@ -34,7 +34,7 @@ def verify_release(
     *,
     level: Level = "full",
     advance: NamedProgress = lambda what, done, total: None,
-    **wanted: Names,
+    **wanted: FilterValues,
 ) -> Report:
     """Check a release; problems of the release are reported, never raised.
 
@@ -78,7 +78,7 @@ def verify_release(
     return report
 
 
-def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, Names]) -> None:
+def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, FilterValues]) -> None:
     listed: dict[str, str] = {}
     try:
         listed = read_manifest(origin.folder)

@@ -18,6 +18,7 @@ from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.writing import release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_play import SHARD, make_tasks, play, random_release
 
@@ -143,8 +144,6 @@ def test_physics_that_cannot_have_happened_is_found_by_deep(tmp_path, spoil, mes
 
 
 def test_observations_that_the_state_does_not_show(tmp_path, monkeypatch):
-    from icrl4aht_data.writing import release
-
     real = release.observe
 
     def wrong(layout, record, agent):

@@ -31,6 +31,7 @@ from icrl4aht_data.publishing.build import build_release, teammate_card
 from icrl4aht_data.utils.templates import card_file, fill
 from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.dataset_card import dataset_card, evaluated_on, size_category
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.paths import ROOT
@@ -319,8 +320,6 @@ def test_a_malformed_policy_is_named(with_learned, tmp_path, wrong):
 
 
 def test_releases_of_observations_are_built(release, tmp_path):
-    from icrl4aht_data.writing.convert import to_release
-
     source = to_release(load_icrl4aht(release), tmp_path / "source", "observations")
     out = build_release(source, tmp_path / "out")
     assert verify_release(out).ok
