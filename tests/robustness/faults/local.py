@@ -166,7 +166,7 @@ for number in itertools.count():
 
 
 def _start(code: str, *arguments: object, wait: bool = False) -> subprocess.Popen[str]:
-    """Start a Python process that runs `code`, and wait for its first line if told to."""
+    """Start a Python process that runs `code`, and with `wait` read its first line."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     pipe = subprocess.PIPE
     process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=ROOT)
