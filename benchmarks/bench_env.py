@@ -63,7 +63,7 @@ def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironmen
 
 
 def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
-    """A compiled call that plays `STEPS` steps with random actions and waits for them; each goes on from the last."""
+    """A compiled call that plays `STEPS` steps with random actions and waits for them; each continues from the last."""
     state, step = game
     steps = STEPS // n
 

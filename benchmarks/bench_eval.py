@@ -36,8 +36,8 @@ def evaluator(layout: Layout, family: str) -> tuple[Any, int]:
     mates = [build(layout, task.teammate, noise="seeded") for task in tasks]
     rollout = EvaluationRollout(layout, random(layout), mates, replace(PROTOCOLS["seeded"], episodes=_EPISODES))
     play, params = jax.jit(rollout.episode), rollout.teammate_params
-    tables = rollout.start(jnp.stack([task_key(0, task.task_id) for task in tasks]))
-    return lambda: play((), params, tables), len(tasks)
+    environments = rollout.start(jnp.stack([task_key(0, task.task_id) for task in tasks]))
+    return lambda: play((), params, environments), len(tasks)
 
 
 def bare_environment(layout: Layout, n: int) -> Any:

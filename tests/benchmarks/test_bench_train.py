@@ -1,4 +1,4 @@
-"""The benchmark of training, on the smallest scale: it runs and adds up; both ways are fed the same."""
+"""The benchmark of training on the smallest scale: it runs, its figures are consistent, both ways get the same data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from icrl4aht_data.writing.published import to_published
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 
-def test_the_peer_is_fed_the_same_batches(lite, tmp_path):
+def test_the_peer_gets_the_same_batches(lite, tmp_path):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     to_published(dataset, tmp_path / "published", states=False)
     sampler = dataset.ad(batch_size=8, length=100, seed=3)  # starts 0 to 20, among them 0
