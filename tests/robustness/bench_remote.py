@@ -4,7 +4,8 @@
     download    one layout of two, then verify every byte of it
     repair      after flipped bits: share of the shard that is fetched again
 
-All servers are on loopback. One JSON line for each kind of remote. Exits with 1 if a target is missed or data differ from the local release.
+All servers are on loopback. One JSON line for each kind of remote. Exits with 1 if a target is missed or data differ
+from the local release.
 """
 
 from __future__ import annotations
