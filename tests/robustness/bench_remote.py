@@ -23,9 +23,10 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.common import COUNT, print_line
+from benchmarks.common import print_line
 from benchmarks.histories import write_many
 from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.remote.download import fetch_planned, plan_download, repair
 from tests.servers.common import http_server, hub_server, s3_server
