@@ -26,7 +26,7 @@ import click
 import h5py
 import jax
 
-from benchmarks.common import COUNT, folder_size, peak_memory, print_line
+from benchmarks.common import folder_size, peak_memory, print_line
 from generation.collection.task import make_learner, run_task
 from generation.collection.task_folder import last_timing
 from generation.learners.network import Widths
@@ -34,6 +34,7 @@ from generation.profiles import Profile, load_profile
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
@@ -125,7 +126,7 @@ def _wide() -> Profile:
     return replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
 
 
-def stored_bytes(streams: int) -> dict[str, Any]:
+def transition_bytes(streams: int) -> dict[str, Any]:
     """Bytes per transition of the first streams of every task of the bundled release, in all formats."""
     dataset = load_icrl4aht(obs="uint8")
     chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
@@ -175,7 +176,7 @@ def main(parts: tuple[str, ...], profile_name: str, updates: int, wide_updates: 
     measures: dict[str, Callable[[], dict[str, Any]]] = {
         "speed": lambda: collection_speed(profile_name, updates),
         "memory": lambda: collection_memory(wide_updates),
-        "bytes": lambda: stored_bytes(streams),
+        "bytes": lambda: transition_bytes(streams),
     }
     for part in parts or PARTS_OF_COLLECTION:
         print_line("collect", part=part, **measures[part]())

@@ -20,12 +20,13 @@ import click
 import jax
 import jax.numpy as jnp
 
-from benchmarks.common import COUNT, print_line, rates_in_turn, ratio_facts
+from benchmarks.common import print_line, rates_in_turn, ratio_facts
 from benchmarks.peers import jaxmarl_environment
 from generation.env import Environment
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
-LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")
+_LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")
 ENVIRONMENTS = (64, 1024)
 WRITTEN = ("uint8", "state", "float32")
 STEPS = 51_200  # in one call, of all environments together
@@ -63,7 +64,7 @@ def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironmen
 
 
 def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
-    """A compiled call that plays `STEPS` steps with random actions and waits for them; each goes on from the last."""
+    """A compiled call that plays `STEPS` steps with random actions and waits for them; each continues from the last."""
     state, step = game
     steps = STEPS // n
 
@@ -92,7 +93,7 @@ def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
 
 
 @click.command()
-@click.option("--layout", "layouts", multiple=True, default=LAYOUTS, show_default=True)
+@click.option("--layout", "layouts", multiple=True, default=_LAYOUTS, show_default=True)
 @click.option("--environments", multiple=True, type=COUNT, default=ENVIRONMENTS, show_default=True)
 @click.option("--written", multiple=True, type=click.Choice(WRITTEN), default=WRITTEN, show_default=True)
 @click.option("--rounds", type=COUNT, default=7, show_default=True)

@@ -20,11 +20,12 @@ from baselines.agents.egos import random
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.rollout import EvaluationRollout, task_key
-from benchmarks.common import COUNT, elapsed, print_line, rates_in_turn
+from benchmarks.common import elapsed, print_line, rates_in_turn
 from generation.env import Environment
 from generation.teammates.instances import published_tasks
 from generation.teammates.registry import build
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _EPISODES = 20
@@ -36,8 +37,8 @@ def evaluator(layout: Layout, family: str) -> tuple[Any, int]:
     mates = [build(layout, task.teammate, noise="seeded") for task in tasks]
     rollout = EvaluationRollout(layout, random(layout), mates, replace(PROTOCOLS["seeded"], episodes=_EPISODES))
     play, params = jax.jit(rollout.episode), rollout.teammate_params
-    tables = rollout.start(jnp.stack([task_key(0, task.task_id) for task in tasks]))
-    return lambda: play((), params, tables), len(tasks)
+    environments = rollout.start(jnp.stack([task_key(0, task.task_id) for task in tasks]))
+    return lambda: play((), params, environments), len(tasks)
 
 
 def bare_environment(layout: Layout, n: int) -> Any:

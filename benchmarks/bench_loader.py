@@ -28,10 +28,13 @@ import click
 import h5py
 import numpy as np
 
-from benchmarks.common import COUNT, elapsed, folder_size, print_line
+from benchmarks.common import elapsed, folder_size, print_line
 from benchmarks.histories import write_many
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.commands.options import COUNT
+from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.sampling.ad import ADSampler
+from icrl4aht_data.utils.threads import in_slices
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
 
@@ -112,8 +115,6 @@ def fair_reader(path: Path, length: int, batch: int) -> Callable[[np.ndarray, np
 
 def memcpy_rate(size: int, threads: int) -> float:
     """Bytes/s of copying a buffer of that size onto another one that has been written before."""
-    from icrl4aht_data.utils.threads import in_slices
-
     size = min(size, 2**29)
     source, target = np.ones(size, np.uint8), np.ones(size, np.uint8)
 
@@ -224,8 +225,6 @@ def train_step_waits(folder: Path, batch: int, length: int, steps: int) -> None:
     """Share of a training step that waits for data; the step is jitted and renders states, batches are prefetched."""
     import jax
     import jax.numpy as jnp
-
-    from icrl4aht_data.overcooked.observe import observe
 
     dataset = load_icrl4aht(folder / "lite", obs="state", cache="ram")
     layout = dataset.layouts[0]

@@ -33,11 +33,12 @@ from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
 from baselines.training.options import TrainOptions
 from baselines.training.trainer import Trainer
-from benchmarks.common import COUNT, elapsed, print_line
+from benchmarks.common import elapsed, print_line
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
@@ -119,7 +120,7 @@ def compare_training(dataset: Dataset, model: ModelOptions, options: TrainOption
     )
 
 
-def untrained(layout: Layout, model: ModelOptions) -> tuple[Method, Any]:
+def untrained_ad(layout: Layout, model: ModelOptions) -> tuple[Method, Any]:
     """AD for a layout's observations, and its initial parameters."""
     method = get_method("ad")(model, overcooked_world([layout]))
     return method, method.init(jax.random.key(0))
@@ -130,7 +131,7 @@ def compare_acting(layout: Layout, model: ModelOptions, context: int, steps: int
 
     Both compute over all K positions of the context, however many of them are filled.
     """
-    method, params = untrained(layout, model)
+    method, params = untrained_ad(layout, model)
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
     ways: dict[Acting, int] = {"cached": 10 * steps, "exact": steps}  # so that the start of an episode weighs little
     seconds: dict[Acting, list[float]] = {"cached": [], "exact": []}
@@ -168,7 +169,7 @@ def evaluate_all_tasks(model: ModelOptions, context: int, protocol: Protocol) ->
     tasks = [task for track in TRACKS for task in published_tasks(track)]
 
     def make(layout: Layout) -> Policy:
-        return _ego(*untrained(layout, model), context, "cached")(layout)
+        return _ego(*untrained_ad(layout, model), context, "cached")(layout)
 
     seconds = elapsed(lambda: evaluate("AD", make, tasks, protocol))
     _print(

@@ -12,9 +12,6 @@ from typing import Any
 
 import click
 
-COUNT = click.IntRange(min=1)
-"""Type of command-line options that count something."""
-
 
 def print_line(benchmark: str, **facts: Any) -> None:
     """Print one JSON line of a benchmark."""

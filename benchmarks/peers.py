@@ -1,4 +1,4 @@
-"""The peers that benchmarks and differential tests run beside ours."""
+"""Peers of benchmarks and differential tests: environments of other packages on our layouts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of collecting, on the smallest scale: it runs and adds up."""
+"""The benchmark of collection on the smallest scale: it runs, and its figures are consistent."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""The benchmark of training, on the smallest scale: it runs and adds up; both ways are fed the same."""
+"""The benchmark of training on the smallest scale: it runs, its figures are consistent, both ways get the same data."""
 
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from icrl4aht_data.writing.published import to_published
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 
-def test_the_peer_is_fed_the_same_batches(lite, tmp_path):
+def test_the_peer_gets_the_same_batches(lite, tmp_path):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     to_published(dataset, tmp_path / "published", states=False)
     sampler = dataset.ad(batch_size=8, length=100, seed=3)  # starts 0 to 20, among them 0
@@ -28,16 +29,31 @@ def test_the_peer_is_fed_the_same_batches(lite, tmp_path):
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_all_parts(monkeypatch):
+SMALLEST = "--histories 1 --batch 2 --length 6 --steps 1 --acting-steps 2 --episodes 1 --tasks 1 --rounds 1 --layers 1"
+
+
+def run_part(part: str) -> dict[str, Any]:
+    """The line of one part on the smallest scale."""
+    result = CliRunner().invoke(main, [*SMALLEST.split(), "--width", "8", "--part", part], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.output)
+
+
+def test_training():
+    line = run_part("train")
+    assert line["transitions_per_second"] == pytest.approx(12 * line["steps_per_second"], rel=0.01)
+    assert line["ratio"] > 0
+
+
+@pytest.mark.slow
+def test_acting():
+    assert run_part("act")["ratio"] > 0
+
+
+@pytest.mark.slow
+def test_all_tasks(monkeypatch):
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
     monkeypatch.setattr(bench_train, "published_tasks", lambda track: tasks)
-    small = ["--histories", "1", "--batch", "2", "--length", "6", "--steps", "1", "--acting-steps", "2"]
-    tiny = ["--episodes", "1", "--tasks", "1", "--rounds", "1", "--layers", "1", "--width", "8"]
-    result = CliRunner().invoke(main, [*small, *tiny], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    train, act, every = (json.loads(line) for line in result.output.splitlines())
-    assert train["transitions_per_second"] == pytest.approx(12 * train["steps_per_second"], rel=0.01)
-    assert train["ratio"] > 0
-    assert act["ratio"] > 0
-    assert (every["tasks"], every["episodes"]) == (2, 1)
-    assert every["minutes"] > 0
+    line = run_part("all")
+    assert (line["tasks"], line["episodes"]) == (2, 1)
+    assert line["minutes"] > 0
