@@ -1,4 +1,4 @@
-"""Experiments as commands: trained, evaluated, reported; what is finished is kept; held-out teammates."""
+"""Experiments: trained, evaluated, reported; finished work is kept; held-out teammates."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import pytest
 from click.testing import CliRunner
 
 from baselines import experiments
 from baselines.commands.cli import cli
+from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.results import read_result
 from baselines.experiments import (
     CONTEXTS,
@@ -24,7 +26,6 @@ from baselines.experiments import (
     held_out_tasks,
     run_experiment,
 )
-from baselines.methods.options import ModelOptions
 from baselines.report.episode_gifs import family_gifs
 from baselines.report.results import TEST_LAYOUTS, read_run
 from baselines.training.run_folder import CHECKPOINTS
@@ -67,8 +68,23 @@ def test_the_settings_are_the_papers():
     assert (TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]) == ("asymm_right", "cramped_down")
 
 
-def killed(what: str):
-    """A run that dies when this is done."""
+def test_a_tiny_experiment_ends_in_a_report(release, tmp_path, monkeypatch):
+    """One task of five steps with a model of one layer."""
+    monkeypatch.setitem(PROTOCOLS, "seeded", dataclasses.replace(PROTOCOLS["seeded"], steps=5))
+    plan = dataclasses.replace(SMALL, root=str(release), layouts=("demo_wide",), train=TRAIN | {"context": 8})
+    done = run_experiment("tracks", plan, tmp_path)
+    assert done.notes == ["Teammate and layout generalization (`tracks`)"]
+    assert all(path.is_file() for path in done.report)
+    lines = (tmp_path / "report" / "report.csv").read_text().splitlines()
+    assert [line.split(",")[:6] for line in lines[1:]] == [["AD", "seeded", "demo_wide", "H4", "1", "2"]]
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")}
+    assert len(before) == 1
+    run_experiment("tracks", plan, tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")} == before
+
+
+def interrupt_after(what: str):
+    """Returns a progress callback that raises when this part is done."""
 
     def progress(task: str, done: int, total: int) -> None:
         if what in task and done == total:
@@ -79,18 +95,19 @@ def killed(what: str):
 
 @pytest.fixture(scope="module")
 def swept(release, tmp_path_factory) -> tuple[Path, ExperimentPlan]:
-    """Killed twice, then run to its end."""
+    """An experiment that was interrupted twice, then run to its end."""
     out = tmp_path_factory.mktemp("swept")
     plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
     for what in ("K250 on demo_wide: training", "K250 on demo_wide: evaluation"):
         with pytest.raises(KeyboardInterrupt):
-            run_experiment("sweep context", plan, out, killed(what))
+            run_experiment("sweep context", plan, out, interrupt_after(what))
     assert Checkpoints(out / "ad-K250" / "demo_wide" / "run" / CHECKPOINTS).latest == 2
     done = run_experiment("sweep context", plan, out)
     assert done.notes[1] == "left out, the release has no training histories of them: test_wide"
     return out, plan
 
 
+@pytest.mark.slow
 def test_a_sweep_ends_in_a_report(swept):
     out, _ = swept
     page = (out / "report" / "report.html").read_text()
@@ -101,7 +118,8 @@ def test_a_sweep_ends_in_a_report(swept):
     assert lines[1].startswith("AD,seeded,demo_wide,H4,1,2,")
 
 
-def test_what_is_finished_is_not_done_again(swept, monkeypatch):
+@pytest.mark.slow
+def test_finished_work_is_kept(swept, monkeypatch):
     out, plan = swept
     results = sorted(out.rglob("tasks/*.json"))
     before = [(path, path.stat().st_mtime_ns) for path in results]
@@ -116,9 +134,9 @@ def test_what_is_finished_is_not_done_again(swept, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def asked(release, tmp_path_factory) -> Path:
-    """DPT, with all that it can be given."""
-    out = tmp_path_factory.mktemp("asked")
+def ablated(release, tmp_path_factory) -> Path:
+    """DPT with all of its options."""
+    out = tmp_path_factory.mktemp("ablated")
     plan = dataclasses.replace(
         SMALL,
         root=str(release),
@@ -132,21 +150,23 @@ def asked(release, tmp_path_factory) -> Path:
     return out
 
 
-def test_dpt_is_trained_evaluated_and_reported(asked):
-    where = asked / "dpt-ta-next_obs" / "demo_wide"
+@pytest.mark.slow
+def test_dpt_is_trained_evaluated_and_reported(ablated):
+    where = ablated / "dpt-ta-next_obs" / "demo_wide"
     losses = [json.loads(line) for line in (where / "run" / "metrics.jsonl").read_text().splitlines()]
     assert {"prior_accuracy", "next_obs_loss"} <= losses[-1].keys()
     assert list((where / "run" / "tensorboard" / "train").iterdir())
-    lines = (asked / "report" / "report.csv").read_text().splitlines()
+    lines = (ablated / "report" / "report.csv").read_text().splitlines()
     assert [line.split(",")[:6] for line in lines[1:]] == [["DPT+TA+next_obs", "seeded", "demo_wide", "H4", "1", "2"]]
 
 
-def test_the_page_shows_the_reported_agent(asked, tmp_path):
-    where = asked / "dpt-ta-next_obs" / "demo_wide"
+@pytest.mark.slow
+def test_the_page_shows_the_reported_agent(ablated, tmp_path):
+    where = ablated / "dpt-ta-next_obs" / "demo_wide"
     (result,) = (read_result(path) for path in where.rglob("tasks/*.json"))
-    page = (asked / "report" / "report.html").read_text()
-    told = f"DPT+TA+next_obs with H4/t0 on demo_wide: team return {result.returns[0][0]:g} in episode 1 of 2. "
-    assert f"{told}Task {result.task_id}, protocol seeded, seed 0." in page
+    page = (ablated / "report" / "report.html").read_text()
+    caption = f"DPT+TA+next_obs with H4/t0 on demo_wide: team return {result.returns[0][0]:g} in episode 1 of 2. "
+    assert f"{caption}Task {result.task_id}, protocol seeded, seed 0." in page
     assert page.count("data:image/gif") == 1
 
     other = shutil.copytree(where, tmp_path / "other")
@@ -162,7 +182,7 @@ def test_the_page_shows_the_reported_agent(asked, tmp_path):
         assert f"{folder} {why}" in gif.caption
 
 
-def test_what_cannot_be_trained_on_fails_before_any_work(release, tmp_path):
+def test_impossible_trainings_fail_before_any_work(release, tmp_path):
     random_release(tmp_path / "plain", layouts=("demo_wide",), teammates=1, streams=2, episodes=6, labels=False)
     plan = dataclasses.replace(SMALL, root=str(tmp_path / "plain"), methods=("ad", "dpt"))
     with pytest.raises(LabelsMissingError, match=r"dpt none on demo_wide: DPT needs expert actions.* leave it out, by"):
@@ -172,31 +192,33 @@ def test_what_cannot_be_trained_on_fails_before_any_work(release, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
-    asked = []
+def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
+    calls = []
 
-    def note(name, plan, out, progress):
-        asked.append((name, plan, out))
+    def note_call(name, plan, out, progress):
+        calls.append((name, plan, out))
         return ExperimentOutcome([tmp_path / "report.html"], ["left out: nothing"])
 
-    monkeypatch.setattr(experiments, "run_experiment", note)
+    monkeypatch.setattr(experiments, "run_experiment", note_call)
     small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-films"]
+    small += ["--layers", "2", "--warmup", "0.5"]
     chosen = ["--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]
     result = CliRunner().invoke(cli, ["ablate", "ta", *chosen, *small], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert "left out: nothing" in result.output
-    ((name, plan, out),) = asked
+    ((name, plan, out),) = calls
     assert (name, out) == ("ablate ta", Path("runs/ablate-ta"))
     options: dict[str, Any] = {
         "layouts": ("cramped_up",),
         "values": ("ta",),
-        "train": {"steps": 1, "batch_size": 2},
+        "train": {"steps": 1, "batch_size": 2, "warmup": 0.5},
+        "model": {"layers": 2},
         "episodes": 3,
     }
     rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "gifs": False, "root": str(release)}
     assert plan == ExperimentPlan(**options, **rest)
     assert CliRunner().invoke(cli, ["tracks", *small], catch_exceptions=False).exit_code == 0
-    assert (asked[1][0], asked[1][2]) == ("tracks", Path("runs/tracks"))
+    assert (calls[1][0], calls[1][2]) == ("tracks", Path("runs/tracks"))
 
 
 # Held-out teammates.
@@ -209,7 +231,10 @@ def suite(tmp_path_factory) -> Path:
     layout = get_layout("cramped_up")
     network = ActorCritic(Widths((4,), (4,), 8, 8, 8))
     where = "cramped_up/fcp/m0/c0"
-    save_policy(root / where, network, network.untrained(jax.random.key(0), layout.channels), {"seed": 0})
+    shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))  # zeros compile faster
+    save_policy(
+        root / where, network, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), {"seed": 0}
+    )
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
     entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / WEIGHTS)}
     (root / "manifests").mkdir()
@@ -217,10 +242,11 @@ def suite(tmp_path_factory) -> Path:
     return root
 
 
-def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path, monkeypatch):
-    monkeypatch.setattr(experiments, "ModelOptions", lambda **own: ModelOptions(**(own | MODEL)))
+@pytest.mark.slow
+def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path):
     arguments = ["heldout-rl", "--suite", str(suite), "--method", "ad", "--layout", "cramped_up"]
     small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "2"]
+    small += ["--layers", "1", "--width", "8", "--heads", "2"]
     command = [*arguments, *small, "--root", str(release), "--out", str(tmp_path)]
     result = CliRunner().invoke(cli, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -270,7 +296,7 @@ def test_impossible_plans(release, tmp_path):
     fails(UnknownNameError, "unknown teammate family of these tasks 'rl'; valid: H1, H2, H3, H4", families=("rl",))
     fails(OptionError, "tasks = 0: expected at least 1", tasks=0)
     result = CliRunner().invoke(cli, ["sweep", "context", "--context", "9"])
-    assert "`sweep context` varies it; choose by --only" in str(result.exception)
+    assert "context = 9: `sweep context` varies it; choose by --only, such as K250" in str(result.exception)
     assert (
         "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'"
         in CliRunner().invoke(cli, ["sweep", "sizes"]).output

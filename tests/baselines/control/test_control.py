@@ -1,4 +1,4 @@
-"""The positive control, its small worlds and its table."""
+"""The positive control: its small worlds, its sources, its checks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_what_the_worlds_reward():
     assert rewards.tolist() == [[1] * 6, [0] * 6]
     above, corner = worlds.MIDDLE - worlds.SIDE, 0
     _, rewards = worlds.play_world(worlds.dark_room(), fixed(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
-    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # it passes the goal and goes on to the wall
+    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # it passes the goal and continues to the wall
     assert rewards.tolist() == [episode * 2, [0] * 2 * worlds.ROOM_STEPS]
     assert worlds.best_return(np.array([above, corner])).tolist() == [10, 7]
 
@@ -48,11 +48,30 @@ def test_sources_learn():
     assert shares[:, -4:].mean() > 0.8
 
 
+def test_a_part_of_the_control_trains_and_fails(tmp_path):
+    """Without its context no model can have twice the regret of the algorithm within four steps."""
+    checks = control.ad_on_bandits(tmp_path, TINY, lambda step, loss: None)
+    full, cut = control.format_checks(checks).splitlines()[1:]
+    assert full.split()[1:3] == ["bandits", "AD"]
+    assert cut.startswith("FAIL  bandits    AD, context cut off")
+    assert (tmp_path / "checkpoints" / "2.safetensors").is_file()
+
+
+@pytest.mark.parametrize(("passed", "code"), [(True, 0), (False, 1)])
+def test_the_command_fails_with_a_check(tmp_path, monkeypatch, passed, code):
+    check = control.ControlCheck("bandits", "AD", "regret, at most", 1.0, 2.0, passed, "")
+    monkeypatch.setattr(control, "run_control", lambda folder, done: [check])
+    result = CliRunner().invoke(cli, ["control", "--out", str(tmp_path)])
+    assert result.exit_code == code, result.output
+    assert ("FAIL" in result.output) == (not passed)
+
+
+@pytest.mark.slow
 def test_a_tiny_control_runs_and_fails(tmp_path, monkeypatch):
-    """Two updates teach nothing: the table says so, and the exit code."""
-    monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, of, step, loss: None))
+    monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, total, step, loss: None))
     result = CliRunner().invoke(cli, ["control", "--out", str(tmp_path)])
     assert result.exit_code == 1, result.output
     assert result.output.count("FAIL") >= 2
     assert "context cut off" in result.output
-    assert {path.name for path in tmp_path.iterdir()} == {"dpt_on_bandits", "ad_on_bandits", "ad_in_dark_room"}
+    parts = {path.name for path in tmp_path.iterdir() if path.is_dir()}
+    assert parts == {"dpt_on_bandits", "ad_on_bandits", "ad_in_dark_room"}

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from baselines.agents.egos import find_agent
 from baselines.commands.cli import cli
-from baselines.evaluate.drift import measure_drift
+from baselines.evaluate.drift import Drift, measure_drift
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.methods.options import SIZES, ModelOptions
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 @pytest.fixture(scope="module")
 def runs(lite, tmp_path_factory) -> Path:
-    """Run folders ad and dpt, as training would leave them, of models that know nothing."""
+    """Run folders `ad` and `dpt` of untrained models, as training would write them."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("ad", "dpt"):
         job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
@@ -49,7 +49,10 @@ def runs(lite, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("name", "label", "acting"), [("ad", "AD+TA", "exact"), ("dpt", "DPT+TA", "cached")])
+@pytest.mark.parametrize(
+    ("name", "label", "acting"),
+    [pytest.param("ad", "AD+TA", "exact", marks=pytest.mark.slow), ("dpt", "DPT+TA", "cached")],
+)
 def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting):
     agent = find_agent(str(runs / name), acting)
     assert agent.name == label
@@ -61,7 +64,8 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
 
 
-def test_drift_is_nothing_before_the_window_is_full_and_something_after(runs, monkeypatch):
+@pytest.mark.slow
+def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
     """With one layer there is no drift at all: a step's cache is computed from that step alone."""
     two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
     params, found, protocol = drawn(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
@@ -81,6 +85,20 @@ def test_drift_is_nothing_before_the_window_is_full_and_something_after(runs, mo
     assert episode.distance[:, 30:].max() > 1e-5
 
 
+def test_the_drift_command(runs, monkeypatch):
+    """The command's plan and table, without playing."""
+
+    def play(method, params, context, tasks, planned):
+        assert (context, len(tasks), planned.episodes) == (30, 5, 2)
+        yield Drift(np.full((5, 100), 0.25), np.ones((5, 100), bool))
+
+    monkeypatch.setattr("baselines.evaluate.drift.measure_drift", play)
+    command = ["drift", str(runs / "ad"), "--episodes", "2", "--family", "H1"]
+    result = CliRunner().invoke(cli, command, catch_exceptions=False)
+    assert "AD+TA on demo_wide with 5 teammates of H1, K = 30" in result.output
+    assert result.output.splitlines()[-1].split() == ["0", "100.0%", "0.250000", "0.250000"]
+
+
 class TestBadRuns:
     def test_a_layout_that_does_not_fit(self, runs, tmp_path):
         arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
@@ -89,7 +107,7 @@ class TestBadRuns:
         message = "trained on demo_wide with observations (5, 5, 45); coord_simple has (5, 5, 40)"
         assert message in str(result.exception)
 
-    def test_folders_that_are_no_runs(self, runs, tmp_path):
+    def test_folders_without_a_run(self, runs, tmp_path):
         with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle"):
             find_agent("no/where")
         with pytest.raises(OptionError, match=r"not a run: expected config\.json with run_format"):

@@ -1,10 +1,12 @@
-"""The evaluator: purity, what egos are given, results on disk, clear errors."""
+"""The evaluator: results depend on the task alone; inputs of egos, results on disk, messages."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from baselines.agents.egos import get_agent, random, stay
 from baselines.agents.host import Percept, from_host
 from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate, play_tasks
-from baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
 from baselines.evaluate.results import read_result
 from baselines.report.headroom import write_headroom_cards
 from baselines.report.results import EvaluationRun, as_run, normalized_return, read_run
@@ -23,10 +25,13 @@ from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
+from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 PUBLISHED = dataclasses.replace(PROTOCOLS["published"], episodes=4)
 ALL = [task for track in TRACKS for task in published_tasks(track)]
@@ -40,19 +45,19 @@ def returns(results):
 
 @pytest.fixture(scope="module")
 def together():
-    """Ten tasks at once."""
+    """Returns of ten tasks that were evaluated together."""
     return returns(evaluate("random", random, SIMPLE + RING, PUBLISHED))
 
 
 def test_a_task_is_the_same_alone_and_among_others(together):
     alone = returns(evaluate("random", random, [RING[3]], PUBLISHED))
     assert alone[RING[3].task_id] == together[RING[3].task_id]
-    reordered = returns(evaluate("random", random, [RING[1], SIMPLE[2], RING[0]], PUBLISHED))
-    for task_id, values in reordered.items():
-        assert values == together[task_id]
+    assert returns(evaluate("random", random, RING[::-1], PUBLISHED)) == {
+        task.task_id: together[task.task_id] for task in RING
+    }
 
 
-def test_an_interrupted_run_goes_on_to_the_same_results(together, tmp_path):
+def test_an_interrupted_run_resumes_to_the_same_results(together, tmp_path):
     first = evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
     started = []
 
@@ -67,30 +72,26 @@ def test_an_interrupted_run_goes_on_to_the_same_results(together, tmp_path):
 
 
 def test_seeds_and_tasks_differ(together):
+    """Several seeds play in one batch, and each as if it were alone."""
+    both = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[0, 1]))
     other = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[1]))
+    for task in SIMPLE:
+        assert both[task.task_id] == [together[task.task_id][0], other[task.task_id][0]]
     assert other != {task.task_id: together[task.task_id] for task in SIMPLE}
     assert len({tuple(together[task.task_id][0]) for task in SIMPLE}) > 1
 
 
-def test_several_seeds_play_at_once(together):
-    both = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[0, 1]))
-    other = returns(evaluate("random", random, SIMPLE[1:2], PUBLISHED, seeds=[1]))
-    for task in SIMPLE:
-        assert both[task.task_id][0] == together[task.task_id][0]
-    assert both[SIMPLE[1].task_id][1:] == other[SIMPLE[1].task_id]
-
-
 def test_results_of_other_settings_are_never_reused(tmp_path):
-    evaluate("stay", stay, SIMPLE[:1], PUBLISHED, out=tmp_path)
+    evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
     with pytest.raises(OptionError, match="holds a result of other settings"):
-        evaluate("stay", stay, SIMPLE[:1], PUBLISHED, seeds=[1], out=tmp_path)
+        evaluate("stay", stay, SIMPLE, PUBLISHED, seeds=[1], out=tmp_path)
     with pytest.raises(OptionError, match="holds a result of other settings"):
-        evaluate("random", random, SIMPLE[:1], PUBLISHED, out=tmp_path)
+        evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
 
 
 def test_damaged_results_are_named(tmp_path):
-    evaluate("stay", stay, SIMPLE[:1], PUBLISHED, out=tmp_path)
-    (path,) = (tmp_path / "tasks").iterdir()
+    evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
+    path = min((tmp_path / "tasks").iterdir())
     content = json.loads(path.read_text())
     content["settings"]["seeds"] = [5]
     path.write_text(json.dumps(content))
@@ -101,13 +102,13 @@ def test_damaged_results_are_named(tmp_path):
         read_run(tmp_path)
 
 
-def test_a_motionless_ego_gets_exactly_the_published_40_beside_h4():
+def test_a_motionless_ego_earns_exactly_the_published_40_with_h4():
     for result in evaluate("stay", stay, SIMPLE, PUBLISHED):
         assert result.returns == [[40.0] * 4]
 
 
 class Watcher:
-    """A host agent that plays fixed actions and keeps what it was given."""
+    """A host agent that plays fixed actions and records its percepts."""
 
     def __init__(self, actions=None):
         self.actions = actions
@@ -123,10 +124,10 @@ class Watcher:
         return chosen
 
 
-def test_host_agents_are_given_what_happened():
+def test_host_agents_see_what_happened():
     watcher = Watcher()
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    played = list(play_tasks(from_host(watcher), SIMPLE[:3], protocol))
+    played = list(play_tasks(from_host(watcher), SIMPLE, protocol))
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played], axis=1) for k in range(3))
     assert len(watcher.seen) == 200
     layout = LAYOUTS["coord_simple"]
@@ -137,14 +138,14 @@ def test_host_agents_are_given_what_happened():
             np.testing.assert_array_equal(percept.prev_action, actions[:, t - 1, 0])
             np.testing.assert_array_equal(percept.prev_teammate_action, actions[:, t - 1, 1])
             np.testing.assert_array_equal(percept.prev_reward, reward[:, t - 1])
-        assert percept.prev_done.tolist() == [t == 100] * 3
+        assert percept.prev_done.tolist() == [t == 100] * 5
     assert not watcher.seen[0].prev_action.any()
     assert not watcher.seen[0].prev_reward.any()
 
 
 def test_recorded_play_follows_the_rules():
     protocol = dataclasses.replace(PUBLISHED, episodes=1)
-    (played,) = play_tasks(random, RING[:2], protocol, [3])
+    (played,) = play_tasks(random, RING, protocol, [3])
     record, actions = np.asarray(played.record), np.asarray(played.actions)
     layout = LAYOUTS["coord_ring"]
     outcome = step(layout, record[:, :-1], actions[:, :-1], record[:, 1:, 6])
@@ -156,27 +157,46 @@ def test_recorded_play_follows_the_rules():
     ("actions", "message"),
     [
         (lambda batch: np.full(batch, 6), r"returned actions 6\.\.6 on coord_simple, expected 0\.\.5"),
-        (lambda batch: np.full(batch, -1), r"returned actions -1\.\.-1"),
-        (lambda batch: np.zeros((batch, 1), int), r"returned int64 of shape \(1, 1\), expected integers \(1,\)"),
-        (lambda batch: np.zeros(batch), r"returned float64 of shape \(1,\), expected integers \(1,\)"),
+        pytest.param(lambda batch: np.full(batch, -1), r"returned actions -1\.\.-1", marks=pytest.mark.slow),
+        pytest.param(
+            lambda batch: np.zeros((batch, 1), int),
+            r"failed on coord_simple.*returned int64 of shape \(5, 1\)",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
-def test_host_agents_that_return_nonsense(actions, message):
-    with pytest.raises(OptionError, match=message):
-        evaluate("mine", from_host(Watcher(actions)), SIMPLE[:1], dataclasses.replace(PUBLISHED, episodes=1))
+def test_invalid_actions_of_host_agents(actions, message):
+    with pytest.raises(OptionError, match=re.compile(message, re.DOTALL)):
+        evaluate("mine", from_host(Watcher(actions)), SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((1, 1), int), r"returned int64 of shape \(1, 1\), expected integers \(1,\)"),
+        (np.zeros(1), r"returned float64 of shape \(1,\), expected integers \(1,\)"),
+    ],
+)
+def test_host_agents_return_one_integer_per_task(actions, message):
+    """Without the environment, whose compilation takes seconds."""
+    policy, keys = from_host(Watcher(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
+    percept = Percept(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
+    memory = policy.init((), keys)
+    with pytest.raises(jax.errors.JaxRuntimeError, match=message):
+        jax.block_until_ready(jax.jit(policy.act)((), memory, percept, keys))
 
 
 @pytest.mark.parametrize("action", [jnp.zeros(3, jnp.int32), jnp.float32(1)])
-def test_jax_agents_that_return_nonsense(action):
+def test_invalid_actions_of_jax_agents(action):
     def mine(layout):
         return Policy((), lambda params, key: (), lambda params, carry, view, key: (action, carry), "observation")
 
     with pytest.raises(OptionError, match=r"expected one integer 0\.\.5 for each"):
-        evaluate("mine", mine, SIMPLE[:1], PUBLISHED)
+        evaluate("mine", mine, SIMPLE, PUBLISHED)
 
 
-def test_memory_lives_through_the_task():
-    """An ego that counts its steps: the count goes on over episodes and starts anew with each task."""
+def test_memory_lasts_for_the_task():
+    """An ego that counts its steps: the count continues over episodes and starts at 0 in each task."""
 
     def mine(layout):
         def act(params, count, view, key):
@@ -185,12 +205,12 @@ def test_memory_lives_through_the_task():
         return Policy((), lambda params, key: jnp.int32(0), act, "observation")
 
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
-    first, second = play_tasks(mine, SIMPLE[:2], protocol)
+    first, second = play_tasks(mine, SIMPLE, protocol)
     assert (first.actions[..., 0] == 4).all()
     assert (second.actions[..., 0] == 5).all()
 
 
-def test_impossible_teammates_are_found_before_any_work(tmp_path):
+def test_impossible_teammates_fail_before_any_work(tmp_path):
     wrong = dataclasses.replace(
         SIMPLE[1], teammate=SIMPLE[1].teammate | {"theta": SIMPLE[1].teammate["theta"] | {"inertia": 2.0}}
     )
@@ -213,7 +233,7 @@ def test_bootstrap_interval_covers_the_mean():
     assert bootstrap_interval(np.full(5, 7.0), np.random.default_rng(0)) == (7.0, 7.0)
 
 
-def test_report_shows_the_published_numbers_beside(together):
+def test_report_shows_the_published_numbers(together):
     run = as_run(evaluate("random", random, SIMPLE, PUBLISHED))
     text = markdown([run])
     assert "published 35.2 ± 0.4" in text
@@ -225,13 +245,25 @@ def test_report_shows_the_published_numbers_beside(together):
     assert lines[1].startswith("random,published,coord_simple,H4,5,4,")
 
 
-def test_commands(tmp_path):
-    from icrl4aht_data.benchmark.tasks import write_tasks
+def test_tasks_and_episodes_are_limited():
+    assert limit_tasks(SIMPLE + RING, 2) == SIMPLE[:2] + RING[:2]
+    assert limit_tasks(SIMPLE, None) == SIMPLE
+    assert get_protocol("seeded", 3) == dataclasses.replace(PROTOCOLS["seeded"], episodes=3)
+    with pytest.raises(OptionError, match="tasks = 0: expected at least 1"):
+        limit_tasks(SIMPLE, 0)
+    with pytest.raises(OptionError, match="episodes = 0: expected at least 1"):
+        get_protocol("seeded", 0)
 
-    write_tasks(tmp_path / "two.jsonl", SIMPLE[:1])
+
+def test_commands(tmp_path):
+    write_tasks(tmp_path / "two.jsonl", SIMPLE[:2])
     options = ["--protocol", "published", "--manifest", str(tmp_path / "two.jsonl"), "--out", str(tmp_path / "run")]
+    options += ["--tasks", "1", "--episodes", "4"]
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert result.exit_code == 0, result.output
+    assert "1 result in" in result.output
+    (path,) = (tmp_path / "run" / "tasks").iterdir()
+    assert read_result(path).returns == [[40.0] * 4]
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert result.exit_code == 0, result.output
     assert "40.0 ± 0.0" in result.output
@@ -241,7 +273,7 @@ def test_commands(tmp_path):
     assert "line 1" in str(result.exception)
 
 
-def test_headroom_cards_name_the_cells_that_leave_nothing_to_do(tmp_path):
+def test_headroom_cards_name_cells_without_headroom(tmp_path):
     def run(agent, values):
         returns = {cell: np.full((5, 2), value) for cell, value in values.items()}
         return EvaluationRun(agent, "seeded", returns)
@@ -256,10 +288,10 @@ def test_headroom_cards_name_the_cells_that_leave_nothing_to_do(tmp_path):
     assert "No headroom: coord_simple/H4." in text
 
 
-def test_normalised_scores_stand_only_where_there_is_headroom():
-    table = {"stay": 10.0, "random": 5.0, "oracle": 30.0}
-    assert normalized_return(20.0, table) == 0.5
-    assert normalized_return(10.0, {**table, "oracle": 10.5}) is None
+def test_normalized_returns_need_headroom():
+    references = {"stay": 10.0, "random": 5.0, "oracle": 30.0}
+    assert normalized_return(20.0, references) == 0.5
+    assert normalized_return(10.0, {**references, "oracle": 10.5}) is None
     assert normalized_return(10.0, None) is None
 
 

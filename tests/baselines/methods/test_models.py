@@ -1,4 +1,4 @@
-"""The models: sizes, what depends on what, the ways to compute the same thing."""
+"""The models: sizes, dependence of outputs on inputs, equality of training, cached and exact acting."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.sampling.ad import ADBatch
 from tests.helpers.flat_world import FLAT, TINY, ad_batch, dpt_batch, drawn
+from tests.helpers.random_play import random_release
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
-STEPS = ("ad", "hybrid_ad", "amago_offline")
+STEPS = ("ad", "hybrid_ad", pytest.param("amago_offline", marks=pytest.mark.slow))
 
 
 def sizes(method: Method) -> int:
@@ -43,7 +44,7 @@ def sizes(method: Method) -> int:
 
 @cache
 def tiny(name: str, **changes: Any) -> tuple[Method, Any]:
-    """A method in the flat world, and parameters, none of them zero."""
+    """Returns a method in the flat world, and parameters, none of them zero."""
     method = get_method(name)(dataclasses.replace(TINY, **changes), FLAT)
     return method, drawn(method)
 
@@ -63,7 +64,7 @@ class TestSizes:
         world = overcooked_world([get_layout("coord_simple")])
         assert sizes(get_method(name)(ModelOptions(), world)) == parameters
 
-    def test_teammate_actions_add_one_table_or_one_hot(self):
+    def test_teammate_actions_add_an_embedding_or_a_one_hot(self):
         world = overcooked_world([get_layout("coord_simple")])
         option = ModelOptions(teammate_actions=True)
         assert sizes(get_method("ad")(option, world)) == 3_283_870 + 6 * 64 + 64 * 256
@@ -81,7 +82,7 @@ class TestSizes:
 
 
 def reach(f, *inputs) -> list[np.ndarray]:
-    """For each input (T, ..): bool (outputs, T), which outputs (outputs, ..) of f move with which of its rows."""
+    """Returns for each input (T, ..) which outputs (O, ..) of f depend on which of its rows, bool (O, T)."""
     jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
         np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
@@ -89,7 +90,12 @@ def reach(f, *inputs) -> list[np.ndarray]:
     ]
 
 
-KINDS = [("ad", "none"), ("ad", "rope"), ("hybrid_ad", "none"), ("amago_offline", "none")]
+KINDS = [
+    ("ad", "rope"),
+    ("hybrid_ad", "none"),
+    pytest.param("ad", "none", marks=pytest.mark.slow),
+    pytest.param("amago_offline", "none", marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.parametrize(("name", "positions"), KINDS)
@@ -123,7 +129,7 @@ def test_policies_depend_on_the_actions_before(name):
         assert (moved[2:] > 1e-6).all()
 
 
-@pytest.mark.parametrize("positions", ["none", "rope"])
+@pytest.mark.parametrize("positions", [pytest.param("none", marks=pytest.mark.slow), "rope"])
 def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positions):
     method, params = tiny("dpt", positions=positions)
     batch = dpt_batch(rows=1)
@@ -141,7 +147,7 @@ def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positi
 
 
 def query_mask(context: int) -> np.ndarray:
-    """What each of [c_1 .. c_K, q_0 .. q_K] sees: a transition those up to itself, query j the first j and itself."""
+    """Mask of [c_1 .. c_K, q_0 .. q_K]: a transition sees those up to itself, query j the first j and itself."""
     to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
     to_queries = np.concatenate([np.zeros((context, context + 1)), np.eye(context + 1)])
     return np.concatenate([to_context, to_queries], axis=1).astype(bool)
@@ -158,7 +164,7 @@ def test_the_query_stands_behind_its_context():
 
 
 def test_attention_is_that_of_the_mask(monkeypatch):
-    """To the rounding of float32, its gradient too; whole and in parts."""
+    """Values and gradients, to the rounding of float32; at once and in blocks of rows."""
     q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
 
     def of_mask(q, k, v):
@@ -189,7 +195,7 @@ def test_padding_is_not_seen(monkeypatch):
 
 
 def arrays_in(jaxpr: Any) -> Iterator[Any]:
-    """Everything that a computation makes."""
+    """Yields all intermediate arrays of a computation."""
     for equation in jaxpr.eqns:
         yield from (out.aval for out in equation.outvars)
         for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda leaf: hasattr(leaf, "eqns")):
@@ -233,7 +239,7 @@ def test_padding_has_no_part_in_the_loss(name):
     assert not np.abs(gradient)[~mask].any()
 
 
-@pytest.mark.parametrize("name", ["ad", "dpt"])
+@pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
 def test_bfloat16_computes_nearly_the_same(name):
     full, params = tiny(name, layers=1)
     half, batch = tiny(name, layers=1, bfloat16=True)[0], batch_for(full)
@@ -251,7 +257,7 @@ def test_remat_changes_no_gradient():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *gradients)
 
 
-@pytest.mark.parametrize("name", ["ad", "dpt", "hybrid_ad"])
+@pytest.mark.parametrize("name", ["ad", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dpt", "hybrid_ad"))])
 def test_dropout_is_a_function_of_its_key(name):
     method, params = tiny(name, layers=1)
     batch = batch_for(method)
@@ -276,24 +282,22 @@ def test_next_observations_are_of_the_same_episode():
 class TestOvercooked:
     """On real batches."""
 
-    def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite):
+    @pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
+    def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite, name):
         world = overcooked_world([get_layout("demo_wide")])
         options = dataclasses.replace(TINY, teammate_actions=False, next_obs=True, layers=1)
         data = {obs: load_icrl4aht(lite[0], layout="demo_wide", obs=obs) for obs in ("state", "float32")}
-        for name in ("ad", "dpt"):
-            shown = get_method(name)(options, world._replace(view=plain_view))
-            rendered = get_method(name)(options, world)
-            params = drawn(shown)
-            state, obs = (
-                d.ad(batch_size=2, length=6)[3] if name == "ad" else d.dpt(batch_size=2, context=5)[3]
-                for d in data.values()
-            )
-            one = jax.jit(rendered.loss)(params, None, state, None)[0]
-            np.testing.assert_allclose(one, jax.jit(shown.loss)(params, None, obs, None)[0], rtol=1e-6)
+        shown = get_method(name)(options, world._replace(view=plain_view))
+        rendered = get_method(name)(options, world)
+        params = drawn(shown)
+        state, obs = (
+            d.ad(batch_size=2, length=6)[3] if name == "ad" else d.dpt(batch_size=2, context=5)[3]
+            for d in data.values()
+        )
+        one = jax.jit(rendered.loss)(params, None, state, None)[0]
+        np.testing.assert_allclose(one, jax.jit(shown.loss)(params, None, obs, None)[0], rtol=1e-6)
 
     def test_a_batch_of_several_layouts(self, tmp_path):
-        from tests.helpers.random_play import random_release
-
         random_release(tmp_path / "two", layouts=("asymm_both", "cramped_up"))
         states, shown = (
             load_icrl4aht(tmp_path / "two", obs=obs).ad(batch_size=8, length=5) for obs in ("state", "uint8")
@@ -306,7 +310,7 @@ class TestOvercooked:
 
 
 def percepts(steps: int, episode: int, seed=0) -> Percept:
-    """What an ego is given over so many steps."""
+    """Input of an ego over some steps."""
     rng = np.random.default_rng(seed)
     t = np.arange(steps)
     zero_first = t > 0
@@ -334,7 +338,9 @@ def player(name: str, context: int, cached: bool, **changes: Any):
     return play
 
 
-@pytest.mark.parametrize(("name", "positions"), [*KINDS, ("dpt", "none"), ("dpt", "rope")])
+@pytest.mark.parametrize(
+    ("name", "positions"), [*KINDS, ("dpt", "none"), pytest.param("dpt", "rope", marks=pytest.mark.slow)]
+)
 def test_cached_equals_exact_while_the_window_is_not_full(name, positions):
     seen = percepts(12, episode=4)
     exact, cached = (player(name, 12, way, positions=positions)(seen) for way in (False, True))
@@ -348,8 +354,8 @@ def test_acting_computes_what_training_computes(name):
     seen = percepts(9, episode=4)
     steps = jax.tree.map(lambda x: x[None], percept_step(seen))
     policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
-    whole = policy(steps)
-    np.testing.assert_allclose(player(name, 12, False)(seen), whole, rtol=1e-4, atol=1e-5)
+    expected = policy(steps)
+    np.testing.assert_allclose(player(name, 12, False)(seen), expected, rtol=1e-4, atol=1e-5)
     # a full window holds the last K steps, as a window of training data does
     last = policy(jax.tree.map(lambda x: x[:, -4:], steps))[-1]
     np.testing.assert_allclose(player(name, 4, False)(seen)[-1], last, rtol=1e-4, atol=1e-5)
@@ -370,7 +376,7 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
 
 
 def test_a_cached_window_forgets_what_is_older_than_it():
-    """What is left of it are the traces in what was computed while it was there."""
+    """Older steps only affect what was computed while they were in the window."""
     seen = percepts(12, episode=4)
     play = player("ad", 4, False)
     changed = seen._replace(obs=seen.obs.at[0].add(3.0))
@@ -381,8 +387,9 @@ def test_a_cached_window_forgets_what_is_older_than_it():
     assert (cached[:4] > 0).all() and cached[-1] < cached[:4].max()
 
 
+@pytest.mark.slow
 def test_amago_prefers_what_is_rewarded():
-    """From random play alone, of which action 2 is rewarded: imitation would stay random."""
+    """Learns from random play in which action 2 is rewarded; imitation alone would remain random."""
     options = ModelOptions(layers=1, width=16, heads=2, dropout=0.0, discounts=(0.5, 0.8))
     method = get_method("amago_offline")(options, FLAT)
     params = slow = drawn(method)

@@ -1,4 +1,4 @@
-"""The trainer: its step, exact resume, many devices, held-out parts, run folders, the commands."""
+"""The trainer: one step, exact resume, several devices and processes, held-out parts, run folders."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from baselines.training.trainer import Trainer, TrainingData, TrainState, learni
 from generation.learners.resume import Checkpoints
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import LabelsMissingError, OptionError
-from tests.helpers.flat_world import FLAT, TINY, ad_batch
+from tests.helpers.flat_world import FLAT, TINY, ad_batch, drawn
 from tests.helpers.random_play import random_release
 from tests.helpers.tiny import start
 
@@ -59,7 +59,7 @@ def trained(folder: Path, die_at: int | None = None, tensorboard: bool = False) 
 
 @pytest.fixture(scope="module")
 def through(tmp_path_factory) -> tuple[Path, TrainState]:
-    """An uninterrupted run, of the method with most state: slow parameters too."""
+    """An uninterrupted run, of the method with the most state (slow parameters)."""
     folder = tmp_path_factory.mktemp("runs") / "through"
     return folder, trained(folder)
 
@@ -82,7 +82,7 @@ def scalars(folder: Path) -> list[tuple[str, int, str, float]]:
 
 
 class TestResume:
-    def test_a_killed_run_goes_on_to_the_same_bits(self, through, tmp_path):
+    def test_a_killed_run_resumes_to_the_same_bits(self, through, tmp_path):
         with pytest.raises(KeyboardInterrupt):
             trained(tmp_path, die_at=5, tensorboard=True)  # behind the checkpoint of step 3, and behind a logged line
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
@@ -127,7 +127,7 @@ class TestResume:
         assert config["method"] == "amago_offline"
         assert not list(folder.rglob("*.pkl")) + list(folder.rglob("*.pickle"))
 
-    def test_tensorboard_asked_for_later_has_it_all(self, through):
+    def test_tensorboard_enabled_later_has_the_complete_log(self, through):
         trained(through[0], tensorboard=True)
         assert {step for _, step, *_ in scalars(through[0])} == {2, 3, 4, 6, 7}
 
@@ -148,22 +148,21 @@ class TestResume:
 
 class TestStep:
     def test_parts_of_a_batch_add_up(self):
-        """The gradient, and so the step, is that of the whole batch; padding is not the same in all parts."""
-        whole, parts = (
-            Trainer(
-                get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT),
-                dataclasses.replace(OPTIONS, accumulate=n),
-            )
-            for n in (1, 2)
-        )
+        """The gradient, and so the step, is that of the complete batch; padding differs between the parts."""
+        method = get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT)
+        one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
         batch = Rows().batch(0)
         batch = batch._replace(attention_mask=np.arange(7) < np.array([7, 2, 5, 7])[:, None])
-        batch = jax.device_put(batch, whole.rows)
-        states = [trainer.init() for trainer in (whole, parts)]
-        results = [trainer.step(state, batch) for trainer, state in zip((whole, parts), states, strict=True)]
-        (_, one), (_, two) = results
-        for name in one:
-            np.testing.assert_allclose(one[name], two[name], rtol=1e-5, err_msg=name)
+        params = drawn(method)
+
+        def log_of(trainer: Trainer) -> dict[str, Any]:
+            state = TrainState(params, None, make_optimizer(OPTIONS).init(params), jnp.int32(0))
+            placed = jax.device_put(jax.tree.map(jnp.copy, state), trainer.everywhere)
+            return trainer.step(placed, jax.device_put(batch, trainer.rows))[1]
+
+        expected, found = log_of(one), log_of(parts)
+        for name in expected:
+            np.testing.assert_allclose(expected[name], found[name], rtol=1e-5, err_msg=name)
 
     def test_the_learning_rate_is_the_papers(self):
         schedule = learning_rate_schedule(TrainOptions(steps=100, warmup=0.05))
@@ -204,7 +203,7 @@ class TestHeldOut:
         assert split.teammates is None
         assert [len(split.train), len(split.histories)] == [7, 1]
 
-    def test_what_cannot_be_trained_on(self, tmp_path, lite):
+    def test_impossible_trainings(self, tmp_path, lite):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
         wide = HistoryOptions(("demo_wide",), str(tmp_path / "r"))
         with pytest.raises(LabelsMissingError, match="DPT needs expert actions"):
@@ -225,9 +224,10 @@ import jax
 if len(sys.argv) > 2:
     jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
 from pathlib import Path
-from baselines.training.histories import HistoryOptions, prepare
+from baselines.training.histories import prepare
 from baselines.methods.options import ModelOptions
-from baselines.training.options import TrainOptions, train
+from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.trainer import train
 options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
 model = ModelOptions(layers=1, width=8, heads=2)
 root, out = sys.argv[1].split(",")
@@ -239,6 +239,19 @@ print(json.dumps({"devices": jax.device_count()}))
 
 def metrics(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_processes_share_the_batches(lite, monkeypatch):
+    """Rows of two processes, one after the other, are those of a single one."""
+
+    def rows(index: int, count: int) -> Any:
+        monkeypatch.setattr(jax, "process_index", lambda: index)
+        monkeypatch.setattr(jax, "process_count", lambda: count)
+        options = TrainOptions(steps=1, batch_size=4, context=6)
+        return prepare("ad", MODEL, options, HistoryOptions(("demo_wide",), str(lite[0]))).data.train.batch(1)
+
+    both = jax.tree.map(lambda *parts: np.concatenate(parts), rows(0, 2), rows(1, 2))
+    assert_same(both, rows(0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -268,14 +281,16 @@ def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
             np.testing.assert_allclose(a[name], b[name], rtol=2e-5, atol=1e-7, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
-    """Dropout, accumulation and validation among it."""
+    """Also with dropout, accumulation and validation."""
     two = across(lite[0], tmp_path, [{"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}])
     assert_close(two, on_one_device)
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
-    with socket.socket() as held:  # which JAX's coordinator may share, and nothing else takes
+    with socket.socket() as held:  # keeps the port from other programs; JAX's coordinator may share it
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))
         port = held.getsockname()[1]
