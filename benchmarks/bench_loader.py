@@ -327,7 +327,7 @@ def write_long_index(root: Path, lines: int) -> None:
                 **dict(zip(scores, rng.normal(30, 10, 4).tolist(), strict=True)),
             }
             stream.write(json.dumps(line) + "\n")
-    info = source.info | {"histories": lines}
+    info = source.info.to_json() | {"histories": lines}
     (root / "meta" / "info.json").write_text(json.dumps(info))
 
 

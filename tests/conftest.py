@@ -1,16 +1,24 @@
-"""Releases that many tests read, made once."""
+"""Settings of every test, and releases that many tests read."""
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
+import resource
 import shutil
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import jax
 import numpy as np
+import psutil
 import pytest
 from click.testing import CliRunner
+from filelock import FileLock
 
 from generation.cli import cli
 from icrl4aht_data import load_icrl4aht
@@ -20,47 +28,105 @@ from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_play import random_release
 from tests.helpers.tiny import PAIR, TINY
 
+SharedFolder = Callable[[str, Callable[[Path], object]], Path]
+COMPILATION_CACHE: dict[str, Any] = {
+    "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
+    "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit JAX locks the folder, so that processes can share it
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # half the CPU time of 0.5 when the cache is warm
+}
 
-@pytest.fixture(scope="session", autouse=True)
-def compilation_cache() -> None:
-    """Keep compiled programs on disk for other workers and later runs; a size limit makes JAX lock the folder."""
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_compilation_cache_max_size", 2 * 2**30)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+def pytest_configure() -> None:
+    """Keep compiled programs of this process and its subprocesses in a folder, for other workers and later runs."""
+    for name, value in COMPILATION_CACHE.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        _remove_unfinished_entries(Path(COMPILATION_CACHE["jax_compilation_cache_dir"]))
+
+
+def _remove_unfinished_entries(folder: Path) -> None:
+    """Remove entries of killed processes, without a time of access: JAX would stop adding entries."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / ".lockfile"):
+        for entry in folder.glob("*-cache"):
+            if not entry.with_name(entry.name.removesuffix("-cache") + "-atime").exists():
+                entry.unlink()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Report a worker's memory to the main process."""
+    if hasattr(session.config, "workeroutput"):
+        peak, now = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, psutil.Process().memory_info().rss >> 20
+        session.config.workeroutput["memory"] = f"{peak} MB at most, {now} MB at the end"  # type: ignore[attr-defined]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    """Print the memory of a worker."""
+    terminal = node.config.pluginmanager.get_plugin("terminalreporter")
+    terminal.write_line(f"\n{node.gateway.id}: {getattr(node, 'workeroutput', {}).get('memory')}")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def free_compiled_programs() -> Iterator[None]:
+    """Drop the compiled programs of a module, which would take gigabytes by the end of a session."""
+    yield
+    jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="module")
-def compiled_quickly():
-    """For small models: compile in half the time what then runs slower."""
+def compiled_quickly() -> Iterator[None]:
+    """For small models: halve the time of compilation, at the cost of slower programs."""
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache_of_this_run(tmp_path_factory) -> None:
-    """What tests keep on disk does not outlive them, nor meets what earlier runs kept."""
+def temporary_cache(tmp_path_factory) -> None:
+    """Redirect the package's cache to a folder of this session."""
     os.environ["ICRL4AHT_CACHE_DIR"] = str(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory) -> SharedFolder:
+    """Return `shared_folder(name, make)`: the folder that the first worker fills by `make(folder)`. Read only."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def make_once(name: str, make: Callable[[Path], object]) -> Path:
+        folder, finished = base / "shared" / name, base / "shared" / f"{name}.finished"
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(base / "shared" / f"{name}.lock"):
+            if not finished.exists():
+                make(folder)
+                finished.touch()
+        return folder
+
+    return make_once
+
+
+@pytest.fixture(scope="session")
 def lite(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A lite release of random play, and what went in. Read only."""
+    """A lite release of random play, and the arrays that were written. Read only."""
     root = tmp_path_factory.mktemp("releases") / "lite"
     return root, random_release(root, "lite")
 
 
 @pytest.fixture(scope="session")
 def full(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """The full twin of `lite`. Read only."""
+    """A full release with the histories of `lite`. Read only."""
     root = tmp_path_factory.mktemp("releases") / "full"
     return root, random_release(root, "full")
 
 
 @pytest.fixture(params=["lite", "full"])
 def either(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """Both kinds in turn."""
+    """`lite`, then `full`."""
     return request.getfixturevalue(request.param)
 
 
@@ -72,25 +138,28 @@ def damaged(lite, tmp_path) -> Path:
     return root
 
 
-@pytest.fixture(scope="session")
-def built(tmp_path_factory) -> Path:
-    """tiny.toml and pair.toml; `a`, the first collected and packed both ways by the command. Read only."""
-    out = tmp_path_factory.mktemp("built")
-    (out / "tiny.toml").write_text(TINY)
-    (out / "pair.toml").write_text(PAIR)
-    arguments = ["generate", "--profile", str(out / "tiny.toml"), "--out", str(out / "a")]
-    result = CliRunner().invoke(cli, [*arguments, "--kind", "lite", "--kind", "full"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return out
-
-
-@pytest.fixture(scope="session")
-def pair(built) -> Path:
-    """pair.toml, collected and packed by the command. Read only."""
-    arguments = ["generate", "--profile", str(built / "pair.toml"), "--out", str(built / "pair")]
+def _generate(profile: Path, out: Path, *options: str) -> None:
+    arguments = ["generate", "--profile", str(profile), "--out", str(out), *options]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    return built / "pair"
+
+
+@pytest.fixture(scope="session")
+def built(shared_folder) -> Path:
+    """tiny.toml, pair.toml, and `a`: the first, collected and packaged as both kinds by the command. Read only."""
+
+    def make(folder: Path) -> None:
+        (folder / "tiny.toml").write_text(TINY)
+        (folder / "pair.toml").write_text(PAIR)
+        _generate(folder / "tiny.toml", folder / "a", "--kind", "lite", "--kind", "full")
+
+    return shared_folder("built", make)
+
+
+@pytest.fixture(scope="session")
+def pair(built, shared_folder) -> Path:
+    """pair.toml, collected and packaged by the command. Read only."""
+    return shared_folder("pair", lambda folder: _generate(built / "pair.toml", folder))
 
 
 @pytest.fixture(scope="session")
@@ -102,7 +171,7 @@ def theirs(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
 
 @pytest.fixture(scope="session")
 def ours(theirs, tmp_path_factory) -> Path:
-    """The release of observations made of `theirs`. Read only."""
+    """The release of observations converted from `theirs`. Read only."""
     root = tmp_path_factory.mktemp("ours") / "release"
     assert from_published(theirs[0], root, kept_steps=KEPT) == "observations"
     return root
@@ -110,7 +179,7 @@ def ours(theirs, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def twin(lite, tmp_path_factory) -> Path:
-    """`lite` by way of published files without states. Read only."""
+    """`lite` converted to published files without states and back. Read only."""
     folder = tmp_path_factory.mktemp("twin")
     to_published(load_icrl4aht(lite[0]), folder / "files", states=False)
     with h5py.File(folder / "files" / "histories.h5") as file:

@@ -57,7 +57,7 @@ def track_of(layout: str) -> str:
     raise unknown("layout", layout, LAYOUT_NAMES)
 
 
-def check_place(track: object, split: object, layout: object) -> None:
+def check_membership(track: object, split: object, layout: object) -> None:
     """Whether a layout (short name) belongs to that split of that track.
 
     Raises:

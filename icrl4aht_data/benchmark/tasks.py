@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS, SPLITS, TRACKS, check_place
+from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS, SPLITS, TRACKS, check_membership
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -82,7 +82,7 @@ def named_task(line: Mapping[str, Any]) -> NamedTask:
         UnknownNameError: for names that the benchmark does not know.
     """
     layout = get_layout(line["layout"])
-    check_place(line["track"], line["split"], layout.name)
+    check_membership(line["track"], line["split"], layout.name)
     if line["teammate_family"] not in FAMILIES:
         raise unknown("teammate_family", line["teammate_family"], FAMILIES)
     teammate = {name: line[name] for name in ("teammate_kind", "teammate_family")}
@@ -96,7 +96,7 @@ def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], see
         UnknownNameError: if the layout does not belong to that split of that track.
     """
     known = get_layout(layout)
-    check_place(track, split, known.name)
+    check_membership(track, split, known.name)
     return Task(task_id(track, split, known.alias, teammate, seed), track, split, known.alias, seed, teammate)
 
 
@@ -157,7 +157,7 @@ def _parse(line: str) -> Task:
             raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
     if abs(fields["seed"]) >= 2**63:
         raise TaskFormatError(f"seed: expected at most 64 bits, found {fields['seed']}")
-    check_place(fields["track"], fields["split"], get_layout(fields["layout_name"]).name)
+    check_membership(fields["track"], fields["split"], get_layout(fields["layout_name"]).name)
     teammate = fields["teammate"]
     if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
         raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")

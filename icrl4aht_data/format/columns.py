@@ -1,55 +1,58 @@
-"""meta/histories.jsonl as columns: parsed block by block, kept in the cache folder, entries made when asked for."""
+"""meta/histories.jsonl as columns: decoded and checked block by block, kept in the cache folder."""
 
 from __future__ import annotations
 
-import json
 import re
-import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, overload
 
+import msgspec
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import FAMILIES, check_place
+from icrl4aht_data.benchmark.facts import FAMILIES, check_membership
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, unknown
-from icrl4aht_data.format.schema import FINITE, JSON_TYPES, LONGEST, Entry, is_name
+from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.utils.cache import cached_arrays, content_hash
-from icrl4aht_data.utils.files import LINE_BYTES, parse_json, plain_size, wrap_read_errors
+from icrl4aht_data.utils.files import LINE_BYTES, plain_size, wrap_read_errors
 from icrl4aht_data.utils.paths import LARGEST
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id")
 """The entry fields that can be filtered by."""
 
 _VERSION = 1  # of the cached columns
-_UNCACHED = 2**20  # bytes: a smaller index is parsed as quickly as its columns are opened
-_BLOCK = 2**19  # bytes parsed at a time
+_UNCACHED = 2**20  # bytes: a smaller index is decoded as quickly as its columns are opened
+_BLOCK = 2**22  # bytes decoded at a time
 
-_NAMES = tuple(field.name for field in fields(Entry))
-_DTYPES = {"int": np.int64, "bool": np.bool_, "float": np.float64, "int | None": np.int64}
-_NUMBERS = {field.name: _DTYPES[str(field.type)] for field in fields(Entry) if str(field.type) in _DTYPES}
-_STRINGS = tuple(field.name for field in fields(Entry) if str(field.type) == "str")
-_DERIVED = ("history_id", "obs_shape")  # the row, and the layout's: checked, not stored
-_RULED = ("track", "split", "layout", "teammate_family", "obs_shape", "action_dim", "shard")
+_DERIVED = ("history_id", "obs_shape")  # checked, but not stored: they follow from the row and the layout
+_DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64}
+_NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
+_STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint is str)
+_RELATED = ("track", "split", "layout", "teammate_family", "obs_shape", "shard")
 
-Block = dict[str, tuple[list[Any] | np.ndarray, np.ndarray]]
-"""column -> values, and which of them each line has"""
+_DECODER = msgspec.json.Decoder(Entry)
 
 
 class Columns(Sequence[Entry]):
-    """The index as arrays, one row a history; also the sequence of its entries, made when asked for.
+    """The index as arrays with one row per history; also the sequence of its entries, which are made on access.
 
-    A string column is int32 codes into its values; `h5_row` is -1 for null. Histories that agree in all of
-    `QUERY_FIELDS` form a combination; `order` lists the rows combination by combination, ascending within each.
+    A string column is int32 codes into its values; `h5_row` is -1 for None. Histories that agree in all of
+    `QUERY_FIELDS` form a combination.
+
+    Args:
+        arrays: every column by name; see `combinations`, `order` and `starts`.
+
+    Attributes:
+        combinations: int64 (N, 6), codes of `QUERY_FIELDS`.
+        order: int64 (H,), the rows combination by combination, ascending within each.
+        starts: int64 (N + 1,), position of each combination's first row in `order`.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray]) -> None:
         self._arrays = arrays
-        self.combinations = arrays["combinations"]  # int64 (N, 6): codes of QUERY_FIELDS
-        self.order, self.starts = arrays["order"], arrays["starts"]
+        self.combinations, self.order, self.starts = (arrays[name] for name in ("combinations", "order", "starts"))
 
     def __len__(self) -> int:
         return len(self._arrays["T"])
@@ -61,11 +64,11 @@ class Columns(Sequence[Entry]):
         self.__init__(arrays)
 
     def column(self, name: str) -> np.ndarray:
-        """A number column's values, or a string column's codes."""
+        """A number column's values (H,), or a string column's codes (H,)."""
         return self._arrays[name]
 
     def values(self, name: str) -> list[str]:
-        """A string column's distinct values, by code, in order of first appearance."""
+        """A string column's distinct values by code, in order of first appearance."""
         return [value.decode() for value in self._arrays[f"{name}.values"].tolist()]
 
     def code(self, name: str, value: str) -> int | None:
@@ -74,10 +77,10 @@ class Columns(Sequence[Entry]):
         wanted = value.encode()
         if len(wanted) > values.itemsize:
             return None
-        place = int(np.searchsorted(values, np.array(wanted, values.dtype), sorter=ascending))
-        if place == len(values) or values[ascending[place]] != wanted:
+        position = int(np.searchsorted(values, np.array(wanted, values.dtype), sorter=ascending))
+        if position == len(values) or values[ascending[position]] != wanted:
             return None
-        return int(ascending[place])
+        return int(ascending[position])
 
     def rows(self, combination: int) -> np.ndarray:
         """The rows of one combination, ascending."""
@@ -101,7 +104,7 @@ class Columns(Sequence[Entry]):
         if isinstance(row, slice):
             return [self[i] for i in range(len(self))[row]]
         row = range(len(self))[row]
-        values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS if name not in _DERIVED}
+        values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
         for name in _STRINGS:
             values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].item().decode()
         if values["h5_row"] < 0:
@@ -132,28 +135,34 @@ def read_columns(path: Path) -> Columns:
     except (OSError, Icrl4ahtError) as error:
         if isinstance(error, IndexFormatError):
             raise
-        return Columns(parsed or _parse(path))  # no cache folder, or one too small: do without
+        return Columns(parsed or _parse(path))  # there is no cache folder, or it is too small
 
 
 def _parse(path: Path) -> dict[str, np.ndarray]:
     """Every array of `Columns`."""
-    merged = {name: _Merged(name) for name in _NAMES if name not in _DERIVED}
+    codes = {name: _Codes() for name in (*_STRINGS, "obs_shape")}
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     first = 0
     for text in _blocks(path):
-        block = _split(text)
-        if block is None or not _is_valid(block, first):
-            block = _parse_lines(text.split(b"\n"), first, path)
-        for name, column in merged.items():
-            column.add(*block[name])
-        first += len(block["T"][1])
-    arrays: dict[str, np.ndarray] = {}
-    for column in merged.values():
-        arrays |= column.arrays()
-    return arrays | _combined(arrays)
+        entries = _decode(text, first, path)
+        try:
+            block = _encode(entries, codes, first)
+        except _LineError as error:
+            raise IndexFormatError(f"{path}, line {first + error.row + 1}: {error}") from error
+        for name, arrays in parts.items():
+            arrays.append(block[name])
+        first += len(entries)
+    arrays = {
+        name: np.concatenate([np.zeros(0, _NUMBERS.get(name, np.int32)), *blocks]) for name, blocks in parts.items()
+    }
+    for name in _STRINGS:
+        values = np.array([value.encode() for value in codes[name]] or [b""], np.bytes_)[: len(codes[name])]
+        arrays |= {f"{name}.values": values, f"{name}.sorted": np.argsort(values, kind="stable").astype(np.int32)}
+    return arrays | _group_rows(arrays)
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
-    """The file in blocks of whole lines, without the last line's end."""
+    """The file in blocks of complete lines, without the newline after the last one."""
     with wrap_read_errors(path), path.open("rb") as stream:
         while text := stream.read(_BLOCK):
             text += stream.readline(LINE_BYTES)
@@ -162,33 +171,109 @@ def _blocks(path: Path) -> Iterator[bytes]:
             yield text.removesuffix(b"\n")
 
 
-class _Merged:
-    """One column over all blocks."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self._codes: dict[Any, int] = {}
-        self._parts: list[np.ndarray] = []
-
-    def add(self, values: list[Any] | np.ndarray, which: np.ndarray) -> None:
-        if self.name in _STRINGS:
-            values = np.array([self._codes.setdefault(value, len(self._codes)) for value in values], np.int32)
-        elif not isinstance(values, np.ndarray):
-            values = np.array([-1 if value is None else value for value in values], _NUMBERS[self.name])
-        self._parts.append(values[which])
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        if self.name not in _STRINGS:
-            return {self.name: np.concatenate(self._parts or [np.zeros(0, _NUMBERS[self.name])])}
-        values = np.array([value.encode() for value in self._codes] or [b""], np.bytes_)[: len(self._codes)]
-        return {
-            self.name: np.concatenate(self._parts or [np.zeros(0, np.int32)]),
-            f"{self.name}.values": values,
-            f"{self.name}.sorted": np.argsort(values, kind="stable").astype(np.int32),
-        }
+def _decode(text: bytes, first: int, path: Path) -> list[Entry]:
+    """The entries of a block of lines, of which the first has number `first`, counted from 0."""
+    newlines = text.count(b"\n")
+    # Every line starts an object. Without this the decoder would accept an object that spans two lines.
+    if text.count(b"\n{") == newlines:
+        try:
+            entries = _DECODER.decode_lines(text)
+            if len(entries) == newlines + 1:
+                return entries
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            pass
+    entries = []
+    for number, line in enumerate(text.split(b"\n"), start=first + 1):  # to find the malformed line
+        try:
+            entries.append(_DECODER.decode(line.decode()))
+        except UnicodeDecodeError as error:
+            raise IndexFormatError(f"{path}, line {number}: not UTF-8 text: {error}") from error
+        except msgspec.MsgspecError as error:
+            raise IndexFormatError(f"{path}, line {number}: {error}") from error
+    return entries
 
 
-def _combined(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+class _LineError(Icrl4ahtError):
+    """A problem with one line of a block."""
+
+    def __init__(self, row: int, problem: object) -> None:
+        super().__init__(str(problem))
+        self.row = row
+
+
+class _Codes(dict[Any, int]):
+    """Value -> code. A value that is looked up for the first time gets the next code."""
+
+    def __missing__(self, value: Any) -> int:
+        if isinstance(value, str):
+            check_name(value)
+        code = self[value] = len(self)
+        return code
+
+
+def _encode(entries: list[Entry], codes: dict[str, _Codes], first: int) -> dict[str, np.ndarray]:
+    """The columns of a block of entries, checked.
+
+    Args:
+        entries: valid one by one, as far as types and bounds go.
+        codes: of the coded fields; new values are added.
+        first: the number of the first line, counted from 0.
+
+    Raises:
+        _LineError: for a name that is not printable, a wrong id, or fields that contradict one another.
+    """
+    values: dict[str, Sequence[Any]] = dict(
+        zip(ENTRY_HINTS, zip(*map(msgspec.structs.astuple, entries), strict=True), strict=True)
+    )
+    block: dict[str, np.ndarray] = {}
+    for name, known in codes.items():
+        try:
+            block[name] = np.fromiter(map(known.__getitem__, values[name]), np.int32, len(entries))
+        except IndexFormatError as error:
+            row = next(row for row, value in enumerate(values[name]) if value not in known)
+            raise _LineError(row, f"field {name!r}: {error}") from error
+    values["h5_row"] = [-1 if row is None else row for row in values["h5_row"]]
+    for name, dtype in (*_NUMBERS.items(), ("history_id", np.int64)):
+        block[name] = np.array(values[name], dtype)
+
+    for row in np.flatnonzero(block["history_id"] != np.arange(first, first + len(entries))).tolist():
+        raise _LineError(row, f"history_id {values['history_id'][row]}: ids count up from 0, expected {first + row}")
+    for row in np.flatnonzero(block["action_dim"] != len(ACTIONS)).tolist():
+        raise _LineError(row, f"expected action_dim {len(ACTIONS)}, found {values['action_dim'][row]}")
+    for row in np.flatnonzero(block["episodes"] > block["T"]).tolist():
+        raise _LineError(row, f"{values['episodes'][row]} episodes in {values['T'][row]} steps")
+    # Histories of one task agree in the related fields, so that few combinations are left to check.
+    combinations = np.zeros(len(entries), np.int64)
+    for name in _RELATED:
+        combinations = np.unique(combinations * len(codes[name]) + block[name], return_inverse=True)[1]
+    for row in sorted(np.unique(combinations, return_index=True)[1].tolist()):
+        try:
+            _check_related(*(values[name][row] for name in _RELATED))
+        except Icrl4ahtError as error:
+            raise _LineError(row, error) from error
+    return block
+
+
+def _check_related(
+    track: str, split: str, layout: str, family: str, obs_shape: tuple[int, int, int], shard: str
+) -> None:
+    """Check the fields of an entry that depend on one another.
+
+    Raises:
+        IndexFormatError, UnknownNameError: without file and line, which the caller adds.
+    """
+    check_membership(track, split, layout)
+    if family not in FAMILIES:
+        raise unknown("teammate_family", family, FAMILIES)
+    expected = LAYOUTS[layout].obs_shape
+    if obs_shape != expected:
+        raise IndexFormatError(f"obs_shape {list(obs_shape)}, expected {list(expected)} for {layout}")
+    folder = f"data/{track}/{layout}/{split}"
+    if not re.fullmatch(rf"{folder}-[0-9]{{5}}-of-[0-9]{{5}}\.h5", shard):
+        raise IndexFormatError(f"shard {shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
+
+
+def _group_rows(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The rows of every combination of the query fields, and of every shard."""
     sizes = [max(1, len(arrays[f"{name}.values"])) for name in QUERY_FIELDS]
     keys = np.zeros(len(arrays["T"]), np.int64)
@@ -205,129 +290,3 @@ def _combined(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         "shard_order": by_shard,
         "shard_starts": np.searchsorted(arrays["shard"][by_shard], shards),
     }
-
-
-def _split(text: bytes) -> Block | None:
-    """The columns of lines written as our writer writes them, cut at the field names: quicker than a JSON parser.
-
-    None if any line is written otherwise. Strings are parsed as JSON, each distinct one once.
-    """
-    lines = text.count(b"\n") + 1
-    pieces = text.replace(b"\n", b', "').split(b', "')
-    if len(pieces) != lines * len(_NAMES):
-        return None
-    block: Block = {}
-    for number, name in enumerate(_NAMES):
-        head, tail = f'{name}": '.encode(), b""
-        if number == 0:
-            head = b'{"' + head
-        elif number == len(_NAMES) - 1:
-            tail = b"}"
-        column = pieces[number :: len(_NAMES)]
-        if column.count(column[0]) == lines:
-            column, which = column[:1], np.zeros(lines, np.intp)
-        elif name in _STRINGS or name in _RULED:
-            places = {piece: place for place, piece in enumerate(dict.fromkeys(column))}
-            column, which = list(places), np.fromiter(map(places.__getitem__, column), np.intp, lines)
-        else:
-            which = np.arange(lines)
-        joined = b",".join(column)
-        if joined.count(head) != len(column) or (tail and joined.count(tail) != len(column)):
-            return None
-        joined = joined.replace(head, b"").replace(tail, b"") if tail else joined.replace(head, b"")
-        values = _decimals(joined, _NUMBERS.get(name)) if len(column) == lines else None
-        values = _json_values(joined) if values is None else values
-        if values is None or len(values) != len(column):
-            return None
-        block[name] = values, which
-    return block
-
-
-def _json_values(joined: bytes) -> list[Any] | None:
-    try:
-        return json.loads(b"[" + joined + b"]")
-    except (ValueError, RecursionError):
-        return None
-
-
-def _decimals(joined: bytes, dtype: type | None) -> np.ndarray | None:
-    """Finite numbers with commas between them, three times as quick as by a JSON parser; None if they are not."""
-    allowed = {np.float64: b"0123456789.-+e,", np.int64: b"0123456789-,"}.get(dtype)
-    if allowed is None or joined.translate(None, allowed):
-        return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # what NumPy makes of malformed text
-        try:
-            values = np.fromstring(joined, dtype, sep=",")
-        except (DeprecationWarning, ValueError):
-            return None
-    too_large = dtype is np.int64 and ((values >= 2**62) | (values <= -(2**62))).any()  # NumPy clips them
-    return None if too_large else values
-
-
-def _parse_lines(lines: list[bytes], first: int, path: Path) -> Block:
-    """The same of any lines, with every check on each of them."""
-    entries = []
-    for number, line in enumerate(lines, start=first):
-        try:
-            entry = Entry.from_json(parse_json(line.decode()))
-            check_entry(entry, number)
-        except UnicodeDecodeError as error:
-            raise IndexFormatError(f"{path}, line {number + 1}: not UTF-8 text: {error}") from error
-        except Icrl4ahtError as error:
-            raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
-        entries.append(entry)
-    every = np.arange(len(entries))
-    return {name: ([getattr(entry, name) for entry in entries], every) for name in _NAMES}
-
-
-def _is_valid(block: Block, first: int) -> bool:
-    """Whether `check_entry` and `Entry.from_json` would take every line."""
-    lists = {name: values for name, (values, _) in block.items() if not isinstance(values, np.ndarray)}
-    if not all(set(map(type, values)) <= JSON_TYPES[name] for name, values in lists.items()):
-        return False
-    if not all(is_name(value) for name in _STRINGS for value in lists[name]):
-        return False
-    for name in (name for name, dtype in _NUMBERS.items() if dtype is np.float64):
-        if not (np.abs(np.asarray(block[name][0], np.float64)) < FINITE).all():
-            return False
-    try:
-        ids, steps, episodes, _, _ = (
-            np.asarray(block[name][0], np.int64)[block[name][1]]
-            for name in ("history_id", "T", "episodes", "env_idx", "seed")
-        )
-        ruled = np.zeros(len(ids), np.int64)
-        for name in _RULED:
-            values, which = block[name]
-            ruled = ruled * len(values) + which
-        for row in np.unique(ruled, return_index=True)[1].tolist():
-            line = {name: values[which[row]] for name, (values, which) in block.items()}
-            line |= {name: value.item() for name, value in line.items() if isinstance(value, np.generic)}
-            check_entry(Entry.from_json(line), first + row)
-    except (Icrl4ahtError, OverflowError):
-        return False
-    counted = np.array_equal(ids, np.arange(first, first + len(ids)))
-    return bool(counted and (episodes > 0).all() and (episodes <= steps).all() and (steps < LONGEST).all())
-
-
-def check_entry(entry: Entry, number: int) -> None:
-    """Everything in the entry of line `number` (from 0) that other parts rely on.
-
-    Raises:
-        IndexFormatError, UnknownNameError: without file and line, which the caller adds.
-    """
-    if entry.history_id != number:
-        raise IndexFormatError(f"history_id {entry.history_id}: ids count up from 0, expected {number}")
-    check_place(entry.track, entry.split, entry.layout)
-    if entry.teammate_family not in FAMILIES:
-        raise unknown("teammate_family", entry.teammate_family, FAMILIES)
-    expected = LAYOUTS[entry.layout].obs_shape
-    if entry.obs_shape != expected:
-        raise IndexFormatError(f"obs_shape {list(entry.obs_shape)}, expected {list(expected)} for {entry.layout}")
-    if entry.action_dim != len(ACTIONS):
-        raise IndexFormatError(f"expected action_dim {len(ACTIONS)}, found {entry.action_dim}")
-    folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
-    if not re.fullmatch(rf"{folder}-[0-9]{{5}}-of-[0-9]{{5}}\.h5", entry.shard):
-        raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
-    if entry.episodes > entry.T:
-        raise IndexFormatError(f"{entry.episodes} episodes in {entry.T} steps")

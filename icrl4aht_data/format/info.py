@@ -21,7 +21,7 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, Entry, Kind, is_name
+from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, Entry, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
@@ -144,8 +144,7 @@ class ReleaseInfo:
             info = msgspec.convert(content, cls)
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
-        if not is_name(info.data_version):
-            raise IndexFormatError(f"data_version {info.data_version[:100]!r}, expected a short name")
+        check_name(info.data_version)
         if len(content["environment"]) != 2:
             raise IndexFormatError("environment: expected max_steps and kept_steps only")
         return info

@@ -1,4 +1,4 @@
-"""What a release contains, said once for reader, writer, verifier and card.
+"""The files, arrays and index entries of a release: the definitions that reader, writer, verifier and card share.
 
     meta/info.json          versions, kind, environment, totals
     meta/histories.jsonl    one line per learning history: `Entry`
@@ -6,27 +6,29 @@
     meta/provenance.json    task_id -> how its histories were made
     meta/chunks/**.npy      for each shard: offset, size, rows, crc32 of every chunk
     data/<track>/<layout>/<split>-00000-of-00001.h5
-    teammates/<sha256>/     checkpoints of learned teammates, named as the tasks name their weights
+    teammates/<sha256>/     checkpoints of learned teammates, in folders named by the SHA-256 of their weights
     MANIFEST.sha256         every file above, in sha256sum's format
 
 A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard leaves
 `obs` out (it is a function of the state) and stacks the histories of equal length in one group, [history, T] arrays. A
-shard of `observations` is a `full` one without state records, which the published code's files do not have.
+shard of `observations` is a `full` one without state records, which files of the published code do not have.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_type_hints
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
 FORMAT_VERSION = 2
-"""Of the files' layout. A reader takes exactly this one; see `FormatTooOldError` and `FormatTooNewError`."""
+"""Version of the file format. A reader accepts exactly this one, see `FormatTooOldError` and `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
@@ -38,18 +40,19 @@ TEAMMATES = "teammates"
 
 Kind = Literal["full", "lite", "observations"]
 KINDS: tuple[Kind, ...] = ("full", "lite")
-"""The kinds that have state records: those that are generated."""
+"""The kinds of release with state records: those that are generated."""
 
 OBSERVATIONS: Kind = "observations"
-"""The kind that has none: observations do not determine the state, so nothing can be replayed or drawn."""
+"""The kind without state records: observations do not determine the state, so nothing can be replayed or drawn."""
 
 ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
 CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")])
-"""One line of a chunk table: where the stored bytes are, how many of the chunk's rows are the history's (the last chunk
-is padded), and the checksum of the stored bytes. What lies between the chunks follows in lines of 0 rows, so that every
-byte of a shard stands in its table once. Chunks stand in the order of histories, then of `FIELDS`, then of
-chunks. In the file a history's chunks stand by time, so that a window is one range of bytes: `shard_writer.in_time`."""
+"""One row of a chunk table: position and size of the stored bytes, how many of the chunk's rows belong to the history
+(the last chunk is padded), and the checksum of the stored bytes. The bytes between the chunks follow in rows with
+`rows` = 0, so that the table covers every byte of a shard exactly once. Rows are ordered by history, then by `FIELDS`,
+then by chunk. In the file a history's chunks are ordered by time, so that a window of steps is one range of bytes, see
+`shard_writer.in_time`."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +61,15 @@ class Field:
 
     Args:
         name: the HDF5 dataset's name.
-        dtype: what the reader presents, and what a `full` shard stores (paper, App. D.1).
+        dtype: what the reader returns, and what a `full` shard stores (paper, App. D.1).
         compact: what a `lite` shard stores; the writer checks that it is lossless.
-        axis: "T" for one row a step, "E" for one row an episode.
-        row: what a row is: "scalar", "state" (S bytes) or "obs" (5 x 5 x C bytes). The latter two are one HDF5 element
-            each, of array type, so that the shuffle filter groups what lies at one place in time; h5py gives them as
+        axis: "T" for one row per step, "E" for one row per episode.
+        row: content of a row: "scalar", "state" (S bytes) or "obs" (5 x 5 x C bytes). A state or an observation is one
+            HDF5 element of array type, so that the shuffle filter groups equal positions over time; h5py shows them as
             (T, S) and (T, 5, 5, C).
         chunk: rows per chunk.
-        optional: the kinds of release in which a history may lack it; its index entry says so.
-        absent: the kinds of release that do not have it.
+        optional: the kinds of release in which a history may be without it; its index entry says so.
+        absent: the kinds of release that never have it.
     """
 
     name: str
@@ -79,13 +82,13 @@ class Field:
     absent: tuple[Kind, ...] = ()
 
     def element(self, layout: Layout, kind: Kind) -> np.dtype:
-        """The stored element: a scalar, the S bytes of a state record, or the 5 x 5 x C of an observation."""
+        """The stored element's dtype: a scalar, the S bytes of a state record, or 5 x 5 x C bytes."""
         if self.row == "scalar":
             return np.dtype(self.compact if kind == "lite" else self.dtype)
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
     def held(self, layout: Layout) -> np.dtype:
-        """The element as samplers hold it: compact, whatever the release."""
+        """The element's dtype in the memory of samplers: the compact one for every kind of release."""
         return self.element(layout, "lite")
 
 
@@ -108,128 +111,144 @@ ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions")
 
 
 def held_fields(kind: Kind) -> tuple[Field, ...]:
-    """What batches and other releases are made of: every stored field, but `obs` only where no state shows it."""
+    """The fields that batches and converted releases are made of.
+
+    All stored ones, except `obs` where it can be rendered from the state records.
+    """
     stored = kind if kind == OBSERVATIONS else "lite"
     return tuple(field for field in FIELDS.values() if stored not in field.absent)
 
 
-LONGEST = 2**40
-"""No history has as many steps, so that sums of steps fit into 64 bits."""
-
-
 def record_field(kind: Kind) -> Field:
-    """The field that is held of each step to show what the ego saw: the state record, or the observation itself."""
+    """The field that determines what the ego saw: the state record, or the observation itself."""
     return FIELDS["state" if kind in KINDS else "obs"]
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One line of meta/histories.jsonl: the paper's 14 fields (App. D.3), then ours."""
+LONGEST = 2**40
+"""Every history has fewer steps than this, so that sums of steps fit into 64 bits."""
 
-    history_id: int
-    task_id: str
-    env_idx: int  # environment stream within the learner's parallel roll-out
-    T: int
+_NAME_LENGTH = 512  # characters: a name column is as wide as its longest name
+_FINITE = 1e15  # sums of numbers below this stay finite
+
+_Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+_Row = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Name = Annotated[str, Meta(max_length=_NAME_LENGTH)]
+_Number = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]
+
+
+class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
+    """One line of meta/histories.jsonl: the paper's 14 fields (App. D.3), then ours.
+
+    Args:
+        history_id: position of the line in the index.
+        task_id: task whose learner made the history, see `benchmark.tasks`.
+        env_idx: environment stream within the learner's parallel rollout.
+        T: number of steps.
+        obs_shape: (5, 5, C) of one observation.
+        action_dim: number of actions.
+        track: "teammate" or "layout".
+        split: "train", "test" or "heldout".
+        layout: the layout's short name.
+        teammate_family: "rl" or "H1".."H4".
+        teammate_kind: the algorithm's or the heuristic's name.
+        h5_group: HDF5 group of the arrays.
+        has_teammate_actions: whether the history has `teammate_actions`.
+        has_expert_actions: whether the history has `expert_actions`.
+        h5_row: row in the group's stacked arrays; None where the group contains this history alone.
+        shard: path of the shard in the release.
+        seed: the learner's seed; -1 where the task is unknown.
+        episodes: number of finished episodes, as many as there are dones.
+        score: end + (end - start), see `curve_ends` (paper, App. F.1).
+        return_start: mean return of the first episodes.
+        return_end: mean return of the last episodes.
+        return_mean: mean return of all episodes.
+    """
+
+    history_id: _Int
+    task_id: _Name
+    env_idx: _Int
+    T: Annotated[int, Meta(gt=0, lt=LONGEST)]
     obs_shape: tuple[int, int, int]
-    action_dim: int
-    track: str
-    split: str
-    layout: str
-    teammate_family: str  # rl, H1..H4
-    teammate_kind: str  # the algorithm or the heuristic's name
-    h5_group: str
+    action_dim: _Int
+    track: _Name
+    split: _Name
+    layout: _Name
+    teammate_family: _Name
+    teammate_kind: _Name
+    h5_group: _Name
     has_teammate_actions: bool
     has_expert_actions: bool
-    h5_row: int | None  # row in the group's stacked arrays; null where the group holds this history alone
-    shard: str  # path below the release's root
-    seed: int  # of the learner; -1 where the task was not given
-    episodes: int  # that ended: as many as there are dones
-    score: float  # end + (end - start), see `curve_ends` (paper, App. F.1)
-    return_start: float  # mean return of the first episodes
-    return_end: float  # mean return of the last episodes
-    return_mean: float
+    h5_row: _Row | None
+    shard: _Name
+    seed: _Int
+    episodes: Annotated[int, Meta(gt=0, lt=LONGEST)]
+    score: _Number
+    return_start: _Number
+    return_end: _Number
+    return_mean: _Number
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """The fields that this history's shard stores."""
         return tuple(field for field in FIELDS.values() if kind not in field.absent and self.has(field))
 
     def has(self, field: Field) -> bool:
-        """Whether the history has a field that its kind of release has; see `Field.optional`."""
+        """Whether the history has a field that its kind of release may have, see `Field.optional`."""
         return getattr(self, f"has_{field.name}", True)
 
     def rows(self, field: Field) -> int:
+        """Number of the field's rows: T or E."""
         return self.T if field.axis == "T" else self.episodes
 
     def chunks(self, field: Field) -> int:
+        """Number of the field's chunks."""
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self) | {"obs_shape": list(self.obs_shape)}
+        """The object of the index line."""
+        return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)}
 
-    @classmethod
-    def from_json(cls, line: Any) -> Entry:
-        """Checks names and types; unknown fields are errors.
 
-        Raises:
-            IndexFormatError: without file and line, which the caller adds.
-        """
-        if not isinstance(line, dict):
-            raise IndexFormatError(f"expected an object, found {type(line).__name__}")
-        missing, extra = JSON_TYPES.keys() - line.keys(), line.keys() - JSON_TYPES.keys()
-        if missing or extra:
-            raise IndexFormatError(f"missing fields {sorted(missing)}, unknown fields {sorted(extra)}")
-        for name in JSON_TYPES:
-            check_value(name, line[name])
-        shape = line["obs_shape"]
-        if len(shape) != 3 or not all(isinstance(n, int) for n in shape):
-            raise IndexFormatError(f"field 'obs_shape': expected three integers, found {shape!r}")
-        if line["T"] <= 0 or line["episodes"] <= 0:
-            raise IndexFormatError(f"T = {line['T']} and episodes = {line['episodes']}: expected positive numbers")
-        if line["T"] >= LONGEST:
-            raise IndexFormatError(f"T = {line['T']}: expected less than {LONGEST}")
-        values: dict[str, Any] = {**line, "obs_shape": tuple(shape)}
-        return cls(**values)
-
+ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
+"""Type of every field of an index line, without bounds."""
 
 JSON_TYPES: dict[str, set[type]] = {
-    field.name: {
-        "int": {int},
-        "str": {str},
-        "bool": {bool},
-        "float": {float, int},
-        "int | None": {int, type(None)},
-        "tuple[int, int, int]": {list},
-    }[str(field.type)]
-    for field in fields(Entry)
+    name: {
+        int: {int},
+        str: {str},
+        bool: {bool},
+        float: {float, int},
+        int | None: {int, type(None)},
+        tuple[int, int, int]: {list},
+    }[hint]
+    for name, hint in ENTRY_HINTS.items()
 }
-"""The types that a JSON parser may give for each field of an index line."""
+"""The types that a JSON parser may return for each field of an index line."""
 
-_NAME = 512  # characters: names are stored side by side, each as wide as the longest
-FINITE = 1e15
-"""What numbers of the index stay below: neither infinite nor anything that a sum would make so."""
-
-
-def is_name(text: str) -> bool:
-    """Whether a text may name something: short, and without what a terminal or UTF-8 takes otherwise."""
-    return len(text) <= _NAME and text.isprintable()
+_BOUNDED = get_type_hints(Entry, include_extras=True)
 
 
 def check_value(name: str, value: Any) -> None:
-    """Whether a field of an index line has its type, and a value that can be stored.
+    """Check one field of an index line: its type and bounds, and that names are printable.
 
     Raises:
         IndexFormatError: names the field.
     """
-    types = JSON_TYPES[name]
-    if type(value) not in types:
-        expected = " or ".join(sorted(t.__name__ for t in types))
-        raise IndexFormatError(f"field {name!r}: expected {expected}, found {value!r:.200}")
-    if type(value) is int and not -(2**63) <= value < 2**63:
-        raise IndexFormatError(f"field {name!r}: expected at most 64 bits, found {value}")
-    if types == {float, int} and not abs(value) < FINITE:
-        raise IndexFormatError(f"field {name!r}: expected a number below {FINITE:g}, found {value}")
-    if type(value) is str and not is_name(value):
-        raise IndexFormatError(f"field {name!r}: expected at most {_NAME} printable characters, found {value[:100]!r}")
+    try:
+        msgspec.convert(value, _BOUNDED[name])
+        if isinstance(value, str):
+            check_name(value)
+    except (msgspec.ValidationError, IndexFormatError) as error:
+        raise IndexFormatError(f"field {name!r}: {error}, found {value!r:.200}") from error
+
+
+def check_name(text: str) -> None:
+    """Check that a text can name something.
+
+    Raises:
+        IndexFormatError: if it is too long, or has characters that terminals interpret or UTF-8 does not encode.
+    """
+    if len(text) > _NAME_LENGTH or not text.isprintable():
+        raise IndexFormatError(f"expected at most {_NAME_LENGTH} printable characters: {text[:100]!r}")
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""Files of a remote of which parts are here: each chunk proved by its checksum, so that no record of them is needed.
+"""Partially downloaded files, validated chunk by chunk.
 
-A partial file has every part at its place, with holes between them. A chunk is here if what lies at its place has its
-checksum: after a crash, beside another process, or on a disk that lost a sector, what is not whole is fetched again.
-The same holds for reading windows, for downloads that go on, and for repairs.
+A partial file is sparse: every part that has arrived is at its final offset, with holes between the parts. No record of
+the parts is kept. A chunk counts as downloaded if the bytes at its offset have its checksum, so that after a crash,
+next to another process, or on a disk that lost a sector, exactly what is missing or damaged is fetched again. Reading
+windows, resumed downloads and repairs all rely on this.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,30 +25,39 @@ from icrl4aht_data.utils.cache import cache_limit, data_folder
 from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.hashes import file_hash
 
+T = TypeVar("T")
+R = TypeVar("R")
+
 _GAP = 4096  # bytes between two chunks that cost less than another request
-_PIECE = 2**20  # bytes asked for at once: what a cut can lose
-_AT_ONCE = 16  # requests
-_TRIES = 3  # for bytes that come, but wrong
-_OVERFLOW = 64 * 2**20  # bytes kept in memory where the disk takes no more
-_DISK_BLOCK = 4096  # bytes: what a disk gives to a sparse file at once
-_CHECKED = 64 * 2**20  # bytes written between two looks at the folder's size
+_REQUEST_BYTES = 2**20  # longest range of one request: what a cut connection can lose
+_PARALLEL_REQUESTS = 16
+_ATTEMPTS = 3  # for bytes that arrive with a wrong checksum
+_OVERFLOW = 64 * 2**20  # bytes of chunks kept in memory if the disk is full
+_DISK_BLOCK = 4096  # bytes that a file system allocates at once for a sparse file
+_CHECKED = 64 * 2**20  # bytes written between two checks of the folder's size
 
 
-class Piece(NamedTuple):
-    """Bytes asked for at once, and the chunks in them."""
+class ByteRange(NamedTuple):
+    """One request: contiguous bytes of a file, and the chunks within them.
+
+    Args:
+        start: first byte.
+        stop: end, exclusive.
+        chunks: CHUNK_DTYPE (n,), by offset; n = 0 for a file without a chunk table.
+    """
 
     start: int
     stop: int
-    chunks: np.ndarray  # CHUNK_DTYPE
+    chunks: np.ndarray
 
 
 class PartialFile:
-    """One file of a remote.
+    """The downloaded part of one remote file. Can be shared between threads and pickled.
 
     Args:
-        store: where it is.
-        name: what it is called there.
-        path: what is here of it.
+        store: the remote.
+        name: the file's path in it.
+        path: local file for the parts; it need not exist.
     """
 
     def __init__(self, store: Store, name: str, path: Path) -> None:
@@ -55,14 +65,11 @@ class PartialFile:
         self._lock = threading.Lock()
         self._overflow: OrderedDict[int, bytes] = OrderedDict()
 
-    def __getstate__(self) -> tuple[Store, str, Path]:
-        return self.store, self.name, self.path
-
-    def __setstate__(self, state: tuple[Store, str, Path]) -> None:
-        self.__init__(*state)
+    def __reduce__(self) -> tuple:
+        return type(self), (self.store, self.name, self.path)
 
     def get(self, offset: int, size: int, crc32: int) -> bytes | None:
-        """A chunk, if it is here and whole."""
+        """The bytes of a chunk, or None if it is not downloaded or damaged."""
         with self._lock:
             data = self._overflow.get(offset)
         if data is None:
@@ -75,10 +82,10 @@ class PartialFile:
         return data if len(data) == size and zlib.crc32(data) == crc32 else None
 
     def put(self, start: int, data: bytes) -> None:
-        """Write bytes at their place.
+        """Write bytes at their offset.
 
         Raises:
-            OSError: if the disk does not take them.
+            OSError: if the disk is full or not writable; names the file.
         """
         if not self.path.exists():
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -87,187 +94,191 @@ class PartialFile:
             stream.seek(start)
             stream.write(data)
 
-    def keep(self, piece: Piece, data: bytes) -> None:
-        """The same for bytes that are only cached: in memory where the disk does not take them."""
+    def cache(self, fetched: ByteRange, data: bytes) -> None:
+        """Write bytes that can be fetched again at any time; keep their chunks in memory if the disk is full."""
         try:
-            self.put(piece.start, data)
+            self.put(fetched.start, data)
         except OSError:
             with self._lock:
-                for offset, size, *_ in piece.chunks.tolist():
-                    self._overflow[offset] = data[offset - piece.start :][:size]
+                for offset, size, *_ in fetched.chunks.tolist():
+                    self._overflow[offset] = data[offset - fetched.start :][:size]
                 excess = sum(map(len, self._overflow.values())) - _OVERFLOW
                 while excess > 0 and len(self._overflow) > 1:
                     excess -= len(self._overflow.popitem(last=False)[1])
 
     def chunk(self, offset: int, size: int, crc32: int) -> bytes:
-        """A chunk, fetched if it is not here.
+        """The bytes of a chunk, fetched if necessary.
 
         Raises:
-            RemoteError: if it cannot be had.
+            RemoteError: if it cannot be fetched, or arrives with a wrong checksum.
         """
         data = self.get(offset, size, crc32)
         if data is None:
-            chunk = np.array([(offset, size, 0, crc32)], CHUNK_DTYPE)
-            data = _fetch(self, Piece(offset, offset + size, chunk), self.keep)
+            wanted = ByteRange(offset, offset + size, np.array([(offset, size, 0, crc32)], CHUNK_DTYPE))
+            data = _fetch(self, wanted)
+            self.cache(wanted, data)
         return data
 
-    def missing(self, chunks: np.ndarray) -> np.ndarray:
-        """Those of the chunks (CHUNK_DTYPE) that are not here, in the order of the file."""
-        if not self.path.exists() and not self._overflow:
-            return np.sort(chunks, order="offset")
-        absent = [self.get(offset, size, crc) is None for offset, size, _, crc in chunks.tolist()]
-        return np.sort(chunks[absent], order="offset")
+    def missing_chunks(self, chunks: np.ndarray) -> np.ndarray:
+        """The chunks (CHUNK_DTYPE) that are not downloaded or damaged, by offset."""
+        if self.path.exists() or self._overflow:
+            chunks = chunks[[self.get(offset, size, crc) is None for offset, size, _, crc in chunks.tolist()]]
+        return np.sort(chunks, order="offset")
 
 
 def fetch_chunks(wanted: Iterable[tuple[PartialFile, np.ndarray]]) -> None:
-    """Make sure that chunks of several files are here: what is missing comes in few requests, many at once.
+    """Download the missing chunks of several files, with few requests, many at once.
+
+    Chunks at most 4 KiB apart share a request. Chunks that are already downloaded cost no request. If the parts exceed
+    the cache's size limit, the least recently written files are removed.
 
     Args:
-        wanted: files, and chunks of each (CHUNK_DTYPE).
+        wanted: pairs of a file and the chunks needed of it: rows of its chunk table (CHUNK_DTYPE (n,)), in any order.
+            A file may occur in several pairs, a chunk in one of them only.
 
     Raises:
-        RemoteError: if bytes cannot be had, or come wrong again and again.
+        RemoteError: if bytes cannot be fetched, or arrive with a wrong checksum three times.
     """
-    pieces = [(file, piece) for file, chunks in wanted for piece in _pieces(file.missing(chunks))]
-    if not pieces:
-        return
-    _at_once([lambda file=file, piece=piece: _fetch(file, piece, file.keep) for file, piece in pieces])
-    disk = sum(piece.stop // _DISK_BLOCK - piece.start // _DISK_BLOCK + 1 for _, piece in pieces) * _DISK_BLOCK
-    _bound({file.path for file, _ in pieces}, disk)
+    requests = [(file, span) for file, chunks in wanted for span in _ranges(file.missing_chunks(chunks))]
+    map_parallel(lambda request: request[0].cache(request[1], _fetch(*request)), requests)
+    if requests:
+        blocks = sum(span.stop // _DISK_BLOCK - span.start // _DISK_BLOCK + 1 for _, span in requests)
+        _limit_disk_use({file.path for file, _ in requests}, blocks * _DISK_BLOCK)
 
 
-def _pieces(chunks: np.ndarray, gap: int = _GAP) -> list[Piece]:
-    """Few ranges with all the chunks (sorted by offset), and at most `gap` bytes between them; none much longer than
-    `_PIECE`."""
-    starts = chunks["offset"].astype(np.int64)
-    stops = starts + chunks["size"]
-    pieces, first = [], 0
-    for row in range(1, len(chunks) + 1):
-        if row == len(chunks) or starts[row] - stops[row - 1] > gap or stops[row] - starts[first] > _PIECE:
-            pieces.append(Piece(int(starts[first]), int(stops[first:row].max()), chunks[first:row]))
-            first = row
-    return pieces
-
-
-def _fetch(file: PartialFile, piece: Piece, write: Callable[[Piece, bytes], None]) -> bytes:
-    """Ask for a piece until every chunk in it is right, and write it."""
-    wrong = 0, 0, 0
-    for _ in range(_TRIES):
-        data = file.store.read(file.name, piece.start, piece.stop)
-        for offset, size, _, crc in piece.chunks.tolist():
-            if zlib.crc32(data[offset - piece.start : offset - piece.start + size]) != crc:
-                wrong = offset, offset + size, crc
-                break
-        else:
-            write(piece, data)
-            return data
-    raise RemoteError(
-        f"{file.store.url}/{file.name}: bytes {wrong[0]}..{wrong[1]}: expected crc32 {wrong[2]:08x}, got others "
-        f"{_TRIES} times: the remote's file is damaged or not of this version; tell its publisher"
-    )
-
-
-def whole_file(
+def complete_file(
     file: PartialFile,
     size: int,
     digest: str,
-    table: np.ndarray | None,
+    chunks: np.ndarray | None,
     advance: Callable[[int], None],
-    keep: bool = False,
+    in_place: bool = False,
 ) -> None:
-    """Make `file.path` the whole file: what is missing or wrong of it is fetched.
+    """Make `file.path` the complete file: fetch what is missing or damaged, then check the file's hash.
 
     Args:
-        size: the file's.
-        digest: SHA-256 that it must have.
-        table: its chunk table, if it is a shard; without one what is here is taken for the first bytes.
-        advance: called with the bytes that have arrived, those that were here included.
-        keep: leave what there is if it does not become the file.
+        file: what has been downloaded so far.
+        size: bytes of the complete file.
+        digest: SHA-256 that it must have, hexadecimal.
+        chunks: its chunk table (CHUNK_DTYPE (n,)), if it is a shard. Without one the bytes downloaded so far are
+            taken for the beginning of the file.
+        advance: called with the number of valid bytes since the last call, those downloaded before included.
+        in_place: `file.path` is a damaged file of a release, not to be removed if it cannot be repaired.
 
     Raises:
-        RemoteError: if what has come is not that file.
+        RemoteError: if the remote's file is not the one that the manifest lists.
         ChunkTableError: if the chunk table does not cover the file.
-        OSError: if the disk does not take it.
+        OSError: if the disk is full or not writable.
     """
     found = ""
-    for _ in range(1 if keep else _TRIES):
-        if table is None:
-            _in_order(file, size, advance)
-        else:
-            _by_chunks(file, size, np.sort(table, order="offset"), advance)
+    for _ in range(1 if in_place else _ATTEMPTS):
+        _fetch_missing(file, size, chunks, advance)
         found = file_hash(file.path)
         if found == digest:
             return
         advance(-size)
-        if not keep:
+        if not in_place:
             file.path.unlink()
     raise RemoteError(
         f"{file.store.url}/{file.name}: expected sha256 {digest}, found {found} in {size} bytes: the remote's file is "
-        f"damaged or not of this version; tell its publisher"
+        f"damaged or not of this version; report it to its publisher"
     )
 
 
-def _in_order(file: PartialFile, size: int, advance: Callable[[int], None]) -> None:
-    have = file.path.stat().st_size if file.path.exists() else 0
-    if have > size:
-        file.path.unlink()
-        have = 0
-    file.put(have, b"")
-    advance(have)
-    for start in range(have, size, _PIECE):
-        stop = min(start + _PIECE, size)
-        file.put(start, file.store.read(file.name, start, stop))
-        advance(stop - start)
+def _fetch_missing(file: PartialFile, size: int, chunks: np.ndarray | None, advance: Callable[[int], None]) -> None:
+    if chunks is None:
+        present = file.path.stat().st_size if file.path.exists() else 0
+        if present > size:
+            file.path.unlink()
+            present = 0
+        starts = range(present, size, _REQUEST_BYTES)
+        spans = [ByteRange(start, min(start + _REQUEST_BYTES, size), np.empty(0, CHUNK_DTYPE)) for start in starts]
+    else:
+        chunks = np.sort(chunks, order="offset")
+        stops = (chunks["offset"] + chunks["size"]).tolist()
+        if [0, *stops] != [*chunks["offset"].tolist(), size]:
+            raise ChunkTableError(f"{file.store.url}/{file.name}: its chunk table does not cover its {size} bytes")
+        missing = file.missing_chunks(chunks)
+        present = size - int(missing["size"].sum())
+        spans = _ranges(missing, gap=0)
+    advance(present)
+    file.put(0, b"")  # creates an empty file
 
+    def fetch(span: ByteRange) -> None:
+        file.put(span.start, _fetch(file, span))
+        advance(span.stop - span.start)
 
-def _by_chunks(file: PartialFile, size: int, table: np.ndarray, advance: Callable[[int], None]) -> None:
-    stops = (table["offset"] + table["size"]).tolist()
-    if [0, *stops] != [*table["offset"].tolist(), size]:
-        raise ChunkTableError(f"{file.store.url}/{file.name}: its chunk table does not cover its {size} bytes")
-    missing = file.missing(table)
-    advance(size - int(missing["size"].sum()))
-    file.put(0, b"")
-
-    def copy(piece: Piece) -> None:
-        _fetch(file, piece, lambda piece, data: file.put(piece.start, data))
-        advance(int(piece.chunks["size"].sum()))
-
-    _at_once([lambda piece=piece: copy(piece) for piece in _pieces(missing, gap=0)])
+    # Without checksums the file must grow from its beginning, or a hole would pass for data after a cut.
+    map_parallel(fetch, spans, threads=1 if chunks is None else _PARALLEL_REQUESTS)
     with add_filename(file.path), file.path.open("r+b") as stream:
         stream.truncate(size)
 
 
-def _at_once(work: Sequence[Callable[[], object]]) -> None:
-    """Call all of them on a few threads; the first error, after all have ended."""
-    if len(work) < 2:
-        for one in work:
-            one()
-        return
-    with ThreadPoolExecutor(min(_AT_ONCE, len(work))) as pool:
-        futures = [pool.submit(one) for one in work]
-    for future in futures:
-        future.result()
+def _ranges(chunks: np.ndarray, gap: int = _GAP) -> list[ByteRange]:
+    """Few ranges that contain all chunks (sorted by offset), with at most `gap` unneeded bytes between two chunks.
+
+    A range is at most `_REQUEST_BYTES` long, unless a single chunk is longer.
+    """
+    starts = chunks["offset"].astype(np.int64)
+    stops = starts + chunks["size"]
+    ranges, first = [], 0
+    for row in range(1, len(chunks) + 1):
+        if row == len(chunks) or starts[row] - stops[row - 1] > gap or stops[row] - starts[first] > _REQUEST_BYTES:
+            ranges.append(ByteRange(int(starts[first]), int(stops[first:row].max()), chunks[first:row]))
+            first = row
+    return ranges
 
 
-_unlooked = 0
+def _fetch(file: PartialFile, wanted: ByteRange) -> bytes:
+    """The bytes of a range, requested until the checksum of every chunk in it is right."""
+    damaged = 0, 0, 0
+    for _ in range(_ATTEMPTS):
+        data = file.store.read(file.name, wanted.start, wanted.stop)
+        for offset, size, _, crc in wanted.chunks.tolist():
+            if zlib.crc32(data[offset - wanted.start : offset - wanted.start + size]) != crc:
+                damaged = offset, offset + size, crc
+                break
+        else:
+            return data
+    raise RemoteError(
+        f"{file.store.url}/{file.name}: bytes {damaged[0]}..{damaged[1]}: expected crc32 {damaged[2]:08x}, got others "
+        f"{_ATTEMPTS} times: the remote's file is damaged or not of this version; report it to its publisher"
+    )
 
 
-def _bound(used: set[Path], written: int) -> None:
-    """Keep what is here of all partial files below the cache's limit: the least recently written ones go first."""
-    global _unlooked
-    _unlooked += written
+def map_parallel(work: Callable[[T], R], items: Sequence[T], threads: int = _PARALLEL_REQUESTS) -> list[R]:
+    """Results of `work` for every item, called on a few threads; raises the first error after all calls have ended."""
+    if threads == 1 or len(items) < 2:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(min(threads, len(items))) as pool:
+        futures = [pool.submit(work, item) for item in items]
+    return [future.result() for future in futures]
+
+
+_written_since_check = 0
+
+
+def _limit_disk_use(in_use: set[Path], written: int) -> None:
+    """Remove the least recently written partial files if all of them together exceed the cache's size limit.
+
+    Args:
+        in_use: files to remove last.
+        written: bytes written since the last call.
+    """
+    global _written_since_check
+    _written_since_check += written
     limit = cache_limit()
-    if _unlooked < min(_CHECKED, limit // 4):
+    if _written_since_check < min(_CHECKED, limit // 4):
         return
-    _unlooked = 0
+    _written_since_check = 0
     kept = []
     for path in data_folder().glob("*/*.partial/**/*"):
         try:
             status = path.stat()
-        except FileNotFoundError:
+        except FileNotFoundError:  # removed by another process
             continue
         if path.is_file() and not path.name.startswith("."):
-            kept.append((path in used, status.st_mtime_ns, path, getattr(status, "st_blocks", 0) * 512))
+            kept.append((path in in_use, status.st_mtime_ns, path, getattr(status, "st_blocks", 0) * 512))
     excess = sum(size for *_, size in kept) - limit
     for _, _, path, size in sorted(kept):
         if excess <= 0:

@@ -11,6 +11,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -253,7 +254,9 @@ def _placed(entries: list[Entry], kind: Kind, first_id: int) -> list[Entry]:
         rows = groups.setdefault((shape,), [])
         group = f"/{list(groups).index((shape,))}"
         placed.append(
-            replace(entry, history_id=first_id + number, h5_group=group, h5_row=len(rows) if kind == "lite" else None)
+            msgspec.structs.replace(
+                entry, history_id=first_id + number, h5_group=group, h5_row=len(rows) if kind == "lite" else None
+            )
         )
         rows.append(number)
     return placed

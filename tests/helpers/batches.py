@@ -1,4 +1,4 @@
-"""What tests of batches share: samplers of each kind, equality, a digest."""
+"""Samplers of each kind, equality of batches, a digest of batches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CACHES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
 
 
 def samplers(dataset, **options):
-    """One of each kind and order."""
+    """Return samplers of each kind and order."""
     return [
         dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
         dataset.ad(batch_size=6, length=130, **options),  # longer than the histories
@@ -24,14 +24,14 @@ def samplers(dataset, **options):
 
 
 def assert_equal(one, two) -> None:
-    """Two batches have the same arrays, and lack the same ones."""
+    """Assert that two batches have equal arrays, and None for the same fields."""
     assert one._fields == two._fields
     for name, array in one._asdict().items():
         np.testing.assert_array_equal(array, getattr(two, name), err_msg=name, strict=True)
 
 
 def digest(root: Path) -> str:
-    """Of a few batches of both samplers."""
+    """Return the SHA-256 of a few batches of each kind and order."""
     dataset = load_icrl4aht(root, layout="demo_wide")
     samplers = [
         dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),

@@ -1,4 +1,4 @@
-"""Small models in a world of three numbers and four actions, and batches for them."""
+"""Small models for observations of three numbers and four actions, and batches for them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FLAT = World(lambda dtype: FlatEncoder(8, dtype), (3,), plain_view, 4)
 
 
 def drawn(method: Method) -> Any:
-    """Parameters without the method's own initialisation, which takes longer to compile than all the rest."""
+    """Return random parameters without the method's initialisation, which takes long to compile."""
     rng = np.random.default_rng(1)
 
     def leaf(path, shape):

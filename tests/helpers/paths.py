@@ -1,8 +1,8 @@
-"""Paths that tests share."""
+"""Paths of the repository."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-"""The repository."""
+"""The root of the repository."""

@@ -1,4 +1,4 @@
-"""Small populations, and the update of multipliers written out by hand."""
+"""Small populations, and a plain implementation of the update of LBRDiv's multipliers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def population(algorithm: Algorithm, config: PPOConfig = CONFIG, **options: Any)
 
 
 def plain_adapt(old: Multipliers, returns: np.ndarray, seen: np.ndarray, tolerance: float, rate: float) -> Multipliers:
-    """Entry by entry, from the paper's update; J[i, j] of confederate i with best response j."""
+    """Return the multipliers that the LBRDiv paper computes, entry by entry; [i, j]: confederate i, best response j."""
     k = len(old.vertical)
     vertical, horizontal, latest = (np.array(x, np.float64) for x in old[:3])
     known = np.array(old.known)

@@ -1,4 +1,4 @@
-"""Published files as their authors write them, for tests."""
+"""Published files as their authors write them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.random_play import play
 
 KEPT = 20
-"""Steps an episode."""
+"""Steps of an episode."""
 SHARD = "data/teammate/demo_wide/train-00000-of-00001.h5"
-"""The one of demo_wide in the release made of the files."""
+"""The shard of demo_wide in the release converted from the files."""
 
 _IDS = {name: number for number, name in enumerate(PUBLISHED_ACTIONS)}
 
@@ -25,7 +25,7 @@ def publish(folder: Path) -> list[dict[str, np.ndarray]]:
     """Write `histories.h5` and its index: no states, no tasks, optional fields, an unfinished last episode.
 
     Returns:
-        Each history's arrays, actions in our order.
+        The arrays of each history; actions are numbers of `ACTIONS`.
     """
     rng = np.random.default_rng(0)
     plans = [("demo_wide", "a", 120), ("demo_wide", "a", 130), ("coord_simple", "b", 60), ("demo_wide", "c", 50)]

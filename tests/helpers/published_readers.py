@@ -1,4 +1,4 @@
-"""JaxMARL's OvercookedV2 beside our rules: states translated both ways."""
+"""JaxMARL's OvercookedV2 as reference of the rules: states translated both ways."""
 
 from __future__ import annotations
 

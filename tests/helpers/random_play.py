@@ -1,10 +1,11 @@
-"""Histories for tests, played by the NumPy game itself: real states, rewards and episode ends, no learning."""
+"""Histories of random actions, simulated by the NumPy rules: real states, rewards and episode ends, no learning."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data import load_icrl4aht
@@ -23,7 +24,7 @@ SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 
 
 def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """The arrays of one history: random actions, rich in interactions."""
+    """Return the arrays of one history of random actions, 40% of them `interact`."""
     rooms = layout.rooms
     positions = np.stack([rng.choice(room, episodes) for room in rooms], axis=1)
     clash = positions[:, 0] == positions[:, 1]
@@ -52,7 +53,7 @@ def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -
 
 
 def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
-    """Tasks with made-up heuristic entries, of the training split where the layout has one."""
+    """Return tasks with heuristic teammates, of the training split if the layout is in it."""
     return [
         make_task(
             track_of(layout),
@@ -78,7 +79,7 @@ def random_release(
     seed: int = 0,
     shard_histories: int = 1024,
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release of random play; history id -> the arrays that went in."""
+    """Write a release of random actions; returns the written arrays by history id."""
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
     tasks = []
@@ -98,7 +99,7 @@ def random_release(
 
 
 def long_index(root: Path, lines: int = 3000) -> list[Entry]:
-    """A release's meta with that many lines, more than are parsed at once; no shards."""
+    """Write the metadata of a release of `lines` histories, without shards; returns its entries."""
     source = load_icrl4aht(MINI).entries
     rng = np.random.default_rng(0)
     made = []
@@ -113,4 +114,4 @@ def long_index(root: Path, lines: int = 3000) -> list[Entry]:
         json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
     )
     (root / "meta" / "histories.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))
-    return [Entry.from_json(line) for line in made]
+    return [msgspec.convert(line, Entry) for line in made]

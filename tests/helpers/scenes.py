@@ -1,4 +1,4 @@
-"""States for tests: random ones of every kind, and scenes drawn by hand."""
+"""State records: random ones of every kind, and hand-made ones."""
 
 from __future__ import annotations
 

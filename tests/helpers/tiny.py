@@ -1,4 +1,4 @@
-"""The smallest rebuilds, and how to run one in a process of its own."""
+"""Profiles of the smallest rebuilds, and Python processes that run them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-
-import jax
 
 from tests.helpers.paths import ROOT
 
@@ -31,7 +29,7 @@ presets = ["default"]
 """One task, 25 updates."""
 
 PAIR = TINY.replace('presets = ["default"]', 'presets = ["default", "high_inertia"]')
-"""The same task, and one with another teammate."""
+"""The task of `TINY`, and one with another teammate."""
 
 LEARNED = TINY.replace('presets = ["default"]', 'algorithms = ["fcp", "brdiv"]').replace(
     "[release]",
@@ -49,25 +47,21 @@ widths = { pointwise = [4], spatial = [4], dense = 8, gru = 8, head = 8 }
 
 [release]""",
 )
-"""Two tasks beside learned teammates."""
+"""Two tasks with learned teammates."""
 
 
 def artefact(out: Path, number: int = 0) -> Path:
-    """The folder of a finished task, in order of task ids."""
+    """Return the folder of a finished task; tasks are numbered in the order of their ids."""
     return sorted(path for path in (out / "artefacts").iterdir() if path.is_dir())[number]
 
 
-def start(*arguments: str, **environment: str) -> subprocess.Popen:
-    """A Python process that finds compiled what this one has compiled."""
-    cache = {
-        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),  # type: ignore[attr-defined]
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-    }
+def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
+    """Start Python in the repository, with variables added to the environment."""
     return subprocess.Popen(
         [sys.executable, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | cache | environment,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         cwd=ROOT,
     )

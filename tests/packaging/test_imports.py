@@ -1,77 +1,295 @@
-"""Which way imports may point, and what importing the reader loads."""
+"""The order of packages and folders that imports follow, and the libraries that importing the reader loads."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
+import icrl4aht_data
 from tests.helpers.paths import ROOT
 
-NOBODY_MAY_USE = {"benchmarks", "tests", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
-FORBIDDEN = {
-    "icrl4aht_data": {"generation", "baselines", "jax", "flax", "optax"},
-    "generation": {"baselines"},
-    "baselines": set(),
+ORDER = {
+    "": "icrl4aht_data generation baselines benchmarks tests",
+    "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling dataset interop plotting "
+    "writing checking publishing commands",
+    "generation": "progress env policy learners teammates profiles collection populations releases planning cli",
+    "baselines": "methods training agents evaluate control report experiments demo commands",
 }
-BASELINES_MAY_USE = ("generation.env", "generation.teammates", "generation.learners.network")
-HEAVY = ("jax", "flax", "optax", "matplotlib", "PIL", "torch", "datasets", "huggingface_hub", "grain", "pyarrow")
+"""Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
+
+BASELINES_MAY_USE = ("generation.env", "generation.policy", "generation.teammates", "generation.learners")
+JAX = {"jax", "jaxlib", "flax", "optax"}
+JAX_ON_DEMAND = {"icrl4aht_data.sampling.batches"}
+"""The modules of the reader with functions that import JAX: they put batches on a device if the caller has one."""
+
+HEAVY = {*JAX, "matplotlib", "PIL", "torch", "datasets", "huggingface_hub", "grain", "pyarrow"}
 
 
-def imported(path: Path) -> set[str]:
-    """The modules a file imports, anywhere in it."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            names |= {node.module or ""} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+class Import(NamedTuple):
+    """One import statement's target.
+
+    Attributes:
+        importer: the importing module, "package.folder.file".
+        imported: the imported module, own or of a library.
+        how: "" at the top level, else "in a function" or "under TYPE_CHECKING".
+    """
+
+    importer: str
+    imported: str
+    how: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.importer} imports {self.imported}" + f" {self.how}" * bool(self.how)
 
 
-def wrong_arrows(package: str, modules: set[str]) -> list[str]:
-    """The imports that point the wrong way."""
-    wrong = {m for m in modules if m.split(".")[0] in FORBIDDEN[package] | NOBODY_MAY_USE}
-    if package == "baselines":
-        inner = {m for m in modules if m.startswith("generation") and m != "generation"}
-        wrong |= {m for m in inner if not m.startswith(BASELINES_MAY_USE)}
-    return sorted(wrong)
+class Tree:
+    """The imports of all modules of some packages.
 
+    Args:
+        root: the folder with the packages.
+        core: libraries that are always installed; importing any other is a reason to defer an import.
+    """
 
-@pytest.mark.parametrize("package", FORBIDDEN)
-def test_imports_point_down(package):
-    for path in sorted((ROOT / package).rglob("*.py")):
-        on_demand = {"jax", "jax.numpy"} if path.name == "prefetch.py" else set()  # when a device is asked for
-        assert not wrong_arrows(package, imported(path) - on_demand), path
-
-
-def test_a_wrong_arrow_is_seen():
-    assert wrong_arrows("icrl4aht_data", {"numpy", "jax.numpy"}) == ["jax.numpy"]
-    assert wrong_arrows("generation", {"baselines.methods.ad", "icrl4aht_data"}) == ["baselines.methods.ad"]
-    assert wrong_arrows("baselines", {"generation.collection.task", "generation.env"}) == ["generation.collection.task"]
-    for package in FORBIDDEN:
-        assert wrong_arrows(package, {"benchmarks.bench_env", "tests", "plays", "numpy"}) == [
-            "benchmarks.bench_env",
-            "plays",
-            "tests",
+    def __init__(self, root: Path, core: set[str]) -> None:
+        paths = {_module(path.relative_to(root)): path for name in _order("") for path in (root / name).rglob("*.py")}
+        self.modules, self._installed = set(paths), core | sys.stdlib_module_names
+        self.imports = [
+            i for name, path in sorted(paths.items()) for i in self._read(name, ast.parse(path.read_text()))
         ]
+        self._top: dict[str, set[str]] = {name: set() for name in self.modules}
+        for found in self.imports:
+            if not found.how:
+                self._top[found.importer].add(found.imported)
+
+    @property
+    def own(self) -> list[Import]:
+        """The imports of modules of the packages themselves."""
+        return [found for found in self.imports if found.imported in self.modules]
+
+    def optional(self, module: str) -> set[str]:
+        """Libraries outside the core dependencies that are loaded by importing `module`."""
+        seen, todo = set(), [module]
+        while todo:
+            name = todo.pop()
+            if name not in seen:
+                seen.add(name)
+                todo += self._top.get(name, ())
+                todo += [name.rpartition(".")[0]] if name in self.modules and "." in name else []
+        return {name.split(".")[0] for name in seen - self.modules} - self._installed
+
+    def _read(self, importer: str, node: ast.AST, how: str = "") -> Iterator[Import]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Import):
+                yield from (Import(importer, alias.name, how) for alias in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                source = "." * child.level + (child.module or "")
+                names = (f"{source}.{alias.name}" for alias in child.names)
+                yield from (Import(importer, name if name in self.modules else source, how) for name in names)
+            elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+                yield from self._read(importer, child, how or "under TYPE_CHECKING")
+            elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+                yield from self._read(importer, child, "in a function")
+            else:
+                yield from self._read(importer, child, how)
+
+
+def _module(path: Path) -> str:
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def _order(package: str) -> list[str]:
+    return ORDER.get(package, "").split()
+
+
+def absolute(tree: Tree) -> Iterator[str]:
+    """Relative imports, which are forbidden."""
+    for found in tree.imports:
+        if found.imported.startswith("."):
+            yield f"{found}: write the full name"
+
+
+def downwards(tree: Tree) -> Iterator[str]:
+    """Imports of a package or folder that comes later in `ORDER`."""
+    for found in tree.own:
+        (package, *inner), (other, *inner_other) = found.importer.split("."), found.imported.split(".")
+        folder, order = "", _order("")
+        if package == other:
+            if package not in ORDER or not inner or not inner_other:
+                continue  # `__init__.py` collects names from all folders
+            folder, order, package, other = package, _order(package), inner[0], inner_other[0]
+            unknown = [name for name in (package, other) if name not in (*order, "__main__")]
+            if unknown or package == "__main__":
+                yield from (f"{found}: {name} is not in the order of {folder}" for name in unknown)
+                continue
+        if order.index(other) > order.index(package):
+            yield f"{found}: {package} comes before {other}" + f" in {folder}" * bool(folder)
+
+
+def acyclic(tree: Tree) -> Iterator[str]:
+    """Cycles between files, also those hidden in functions and under TYPE_CHECKING."""
+    graph: dict[str, set[str]] = {name: set() for name in tree.modules}
+    for found in tree.own:
+        graph[found.importer].add(found.imported)
+    while True:
+        try:
+            return TopologicalSorter(graph).prepare()
+        except CycleError as error:
+            cycle = error.args[1]
+            yield " is imported by ".join(cycle) + ": a cycle"
+            graph[cycle[1]].discard(cycle[0])
+
+
+def at_the_top(tree: Tree) -> Iterator[str]:
+    """Deferred imports of own modules that do not keep JAX or an optional library from loading."""
+    for found in tree.own:
+        if found.how and not tree.optional(found.imported) - tree.optional(found.importer):
+            yield f"{found}: it loads no optional library, import it at the top"
+
+
+def reader_without_jax(tree: Tree) -> Iterator[str]:
+    """Imports of JAX by the reader: none at the top level, and few in functions."""
+    for found in tree.imports:
+        of_reader = found.importer.split(".")[0] == "icrl4aht_data" and found.imported.split(".")[0] in JAX
+        if of_reader and (found.how != "in a function" or found.importer not in JAX_ON_DEMAND):
+            yield f"{found}: the reader works without JAX"
+
+
+def narrow_use_of_generation(tree: Tree) -> Iterator[str]:
+    """Imports by `baselines` of what only a rebuild needs."""
+    for found in tree.own:
+        of_baselines = found.importer.startswith("baselines") and found.imported.startswith("generation.")
+        if of_baselines and not found.imported.startswith(BASELINES_MAY_USE):
+            yield f"{found}: baselines may use {', '.join(BASELINES_MAY_USE)}"
+
+
+Rule = Callable[[Tree], Iterator[str]]
+RULES: tuple[Rule, ...] = (absolute, downwards, acyclic, at_the_top, reader_without_jax, narrow_use_of_generation)
+
+
+@cache
+def project() -> Tree:
+    """The imports of this repository."""
+    requirements = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    return Tree(ROOT, {re.split(r"[^\w-]", text)[0].replace("-", "_") for text in requirements})
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_imports_follow(rule):
+    found = list(rule(project()))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("rule", "files", "message"),
+    [
+        (absolute, {"generation/env.py": "from . import policy"}, "generation.env imports .: write the full name"),
+        (
+            downwards,
+            {"generation/env.py": "import baselines.demo", "baselines/demo.py": ""},
+            "generation.env imports baselines.demo: generation comes before baselines",
+        ),
+        (
+            downwards,
+            {"benchmarks/bench.py": "def f():\n    import tests.conftest", "tests/conftest.py": ""},
+            "benchmarks.bench imports tests.conftest in a function: benchmarks comes before tests",
+        ),
+        (
+            downwards,
+            {"icrl4aht_data/reading/shard.py": "from icrl4aht_data import dataset", "icrl4aht_data/dataset.py": ""},
+            "icrl4aht_data.reading.shard imports icrl4aht_data.dataset: reading comes before dataset in icrl4aht_data",
+        ),
+        (
+            downwards,
+            {"generation/new.py": "import generation.env", "generation/env.py": ""},
+            "generation.new imports generation.env: new is not in the order of generation",
+        ),
+        (
+            acyclic,
+            {
+                "generation/learners/a.py": "from generation.learners import b",
+                "generation/learners/b.py": "def f():\n    from generation.learners.a import x",
+            },
+            r"generation.learners.(a|b) is imported by generation.learners.\w is imported by generation.learners.\1"
+            ": a cycle",
+        ),
+        (
+            at_the_top,
+            {
+                "generation/cli.py": "import numpy, os\nif TYPE_CHECKING:\n    import generation.env",
+                "generation/env.py": "import numpy, pathlib",
+            },
+            "generation.cli imports generation.env under TYPE_CHECKING: it loads no optional library.*",
+        ),
+        (
+            at_the_top,
+            {
+                "generation/cli.py": "import jax\ndef f():\n    from generation.env import step",
+                "generation/env.py": "import generation.policy",
+                "generation/policy.py": "import jax.numpy",
+            },
+            "generation.cli imports generation.env in a function: it loads no optional library.*",
+        ),
+        (
+            reader_without_jax,
+            {"icrl4aht_data/sampling/batches.py": "import jax.numpy as jnp"},
+            "icrl4aht_data.sampling.batches imports jax.numpy: the reader works without JAX",
+        ),
+        (
+            reader_without_jax,
+            {"icrl4aht_data/interop.py": "def f():\n    from flax import nnx"},
+            "icrl4aht_data.interop imports flax in a function: the reader works without JAX",
+        ),
+        (
+            narrow_use_of_generation,
+            {"baselines/demo.py": "import generation.profiles", "generation/profiles.py": ""},
+            "baselines.demo imports generation.profiles: baselines may use .*",
+        ),
+    ],
+)
+def test_a_wrong_import_is_found(rule, files, message, tmp_path):
+    (found,) = rule(_tree(tmp_path, files))
+    assert re.fullmatch(message, found)
+
+
+def test_right_imports_are_not_found(tmp_path):
+    files = {
+        "icrl4aht_data/sampling/batches.py": "def f():\n    import jax",
+        "generation/env.py": "import icrl4aht_data.sampling.batches\nimport jax.numpy",
+        "generation/policy.py": "import generation.env",
+        "generation/cli.py": "import numpy\ndef f():\n    from generation.env import step",
+        "baselines/demo.py": "from generation import env",
+    }
+    tree = _tree(tmp_path, files)
+    assert len(tree.own) == 4
+    assert [found for rule in RULES for found in rule(tree)] == []
+
+
+def _tree(root: Path, files: dict[str, str]) -> Tree:
+    """The imports of hand-made files."""
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return Tree(root, {"numpy"})
 
 
 def test_importing_the_reader_loads_nothing_heavy():
     code = "import sys, icrl4aht_data; print(sorted({name.split('.')[0] for name in sys.modules}))"
-    loaded = ast.literal_eval(
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = ast.literal_eval(done.stdout)
     assert "numpy" in loaded
-    assert not set(HEAVY) & set(loaded)
+    assert not HEAVY & set(loaded)
 
 
 def test_public_names_exist():
-    import icrl4aht_data
-
     for name in icrl4aht_data.__all__:
         assert getattr(icrl4aht_data, name).__doc__ or name.isupper(), name

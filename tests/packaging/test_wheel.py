@@ -1,5 +1,5 @@
-"""What is published: the wheel holds the reader and nothing else, and works in an environment that has only what it
-asks for; the source archive holds all that the wheel is built of.
+"""The wheel contains the reader and nothing else, and works in an environment with only its dependencies; the source
+archive contains all that the wheel is built from.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGE = "icrl4aht_data"
 NAME, VERSION = PROJECT["project"]["name"], PROJECT["project"]["version"]
 
+pytestmark = pytest.mark.slow
+
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 CODE_BYTES, RELEASE_BYTES = 2_000_000, 12_000_000
-"""The most that the installed package may take, without the bundled release; and the release."""
+"""Size limits of the installed package without the bundled release, and of the release."""
 ENVIRONMENT_BYTES = 250_000_000
-"""The same with what it depends on."""
+"""Size limit of the package with its dependencies."""
 
 UNREACHABLE = ("NewConnectionError", "NameResolutionError", "ConnectTimeoutError", "dns error", "Connection refused")
 
@@ -44,7 +46,7 @@ dpt = dataset.dpt(batch_size=2, context=20, seed=0)[0]
 history = dataset[0]
 print(json.dumps({
     "histories": len(load_icrl4aht()),
-    "whole": verify_release(quick=True).ok,
+    "ok": verify_release(quick=True).ok,
     "ad": [list(ad.obs.shape), hashlib.sha256(ad.obs.tobytes() + ad.target_actions.tobytes()).hexdigest()],
     "dpt": [list(dpt.query_obs.shape), hashlib.sha256(dpt.query_obs.tobytes()).hexdigest()],
     "return": float(history.returns()[-1]),
@@ -54,14 +56,14 @@ print(json.dumps({
 
 
 def call(*command: str | Path, **options) -> subprocess.CompletedProcess:
-    """A process that knows nothing of this environment."""
+    """Run a command without this environment's Python variables."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     environment |= options.pop("env", {})
     return subprocess.run(list(map(str, command)), capture_output=True, text=True, env=environment, **options)
 
 
 def install(*arguments: str | Path) -> None:
-    """By uv where this environment has it, else by pip; no registry is no failure of ours."""
+    """Install with uv if this environment has it, else with pip; skip the test if the registry cannot be reached."""
     uv = Path(sys.executable).with_name("uv")
     python, *rest = arguments
     if uv.exists():
@@ -76,19 +78,19 @@ def install(*arguments: str | Path) -> None:
 
 @pytest.fixture(scope="session")
 def backend(tmp_path_factory) -> Path:
-    """A folder with what builds the project."""
+    """A folder with the build requirements."""
     folder = tmp_path_factory.mktemp("backend")
     install(sys.executable, "--target", folder, *PROJECT["build-system"]["requires"])
     return folder
 
 
 def build(backend: Path, source: Path, target: Path, kind: str) -> Path:
-    """The wheel or the sdist of a folder."""
+    """Build the wheel or the source archive of a folder."""
     command = (sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", target)
     done = call(*command, cwd=source, env={"PYTHONPATH": str(backend)})
     assert done.returncode == 0, done.stderr
-    (made,) = target.iterdir()
-    return made
+    (path,) = target.iterdir()
+    return path
 
 
 @pytest.fixture(scope="session")
@@ -102,18 +104,18 @@ def sdist(backend, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def wheel(backend, sdist, tmp_path_factory) -> Path:
-    """The wheel, built from the source archive as publishing it does."""
+    """The wheel, built from the source archive as for publication."""
     return build(backend, sdist, tmp_path_factory.mktemp("wheel"), "wheel")
 
 
 def files_below(folder: Path) -> set[str]:
-    """What belongs there, by path within it."""
+    """Return the relative paths of all files that are not hidden or caches."""
     paths = (path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix() for path in paths}
     return {name for name in names if not any(part.startswith((".", "__pycache__")) for part in Path(name).parts)}
 
 
-def test_the_wheel_holds_the_reader_and_nothing_else(wheel):
+def test_the_wheel_contains_the_reader_and_nothing_else(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if not name.startswith(f"{PACKAGE}-{VERSION}.dist-info/")}
         about = archive.read(f"{PACKAGE}-{VERSION}.dist-info/METADATA").decode()
@@ -134,7 +136,7 @@ def test_the_source_archive_is_complete(sdist):
 
 
 def find_python(version: str) -> str | None:
-    """A Python of that version on the PATH that runs: the one that runs this, if it is of that version."""
+    """Return the path of a Python of this version that runs: this one, or one on the PATH."""
     if sys.version.startswith(f"{version}."):
         return sys.executable
     found = shutil.which(f"python{version}")
@@ -143,7 +145,7 @@ def find_python(version: str) -> str | None:
 
 @pytest.fixture(scope="module")
 def environments(wheel, tmp_path_factory) -> dict[str, Future[Path]]:
-    """For each version of Python that is here an environment that has the wheel and what it needs, and nothing else."""
+    """For each installed version of Python, an environment with the wheel and its dependencies only."""
 
     def make(python: str, folder: Path) -> Path:
         made = call(python, "-m", "venv", "--without-pip", folder)
@@ -162,14 +164,14 @@ def environments(wheel, tmp_path_factory) -> dict[str, Future[Path]]:
 
 @pytest.fixture(scope="module", params=PYTHONS)
 def installed(request, environments) -> Path:
-    """The folder of one environment's commands."""
+    """The folder with the commands of one environment."""
     if request.param not in environments:
         absent = ", ".join(version for version in PYTHONS if version not in environments)
         pytest.skip(f"no Python {request.param} on the PATH; absent are {absent}")
     return environments[request.param].result()
 
 
-def test_it_works_alone(installed, tmp_path):
+def test_the_reader_works_without_extras(installed, tmp_path):
     def run(*command: str | Path, code: int = 0, **env: str) -> str:
         done = call(installed / command[0], *command[1:], cwd=tmp_path, env={"HOME": str(tmp_path), **env})
         assert done.returncode == code, done.stdout + done.stderr
@@ -178,7 +180,7 @@ def test_it_works_alone(installed, tmp_path):
 
     used, here = json.loads(run("python", "-c", USE)), load_icrl4aht(split="train", layout="coord_simple")
     assert used["histories"] == read_info(MINI).histories
-    assert used["whole"] and used["heavy"] == []
+    assert used["ok"] and used["heavy"] == []
     assert used["return"] == here[0].returns()[-1]
     batch = here.ad(batch_size=2, length=50, seed=0)[0]
     assert used["ad"][0] == list(batch.obs.shape)
@@ -187,19 +189,19 @@ def test_it_works_alone(installed, tmp_path):
     assert run("icrl4aht-data", "--version") == f"{NAME} {VERSION}\n"
     assert "coord_simple" in run("icrl4aht-data", "list")
     assert ": whole; checked" in run("icrl4aht-data", "verify")
-    told = run("icrl4aht-data", "doctor")
-    assert "no problems found" in told
-    assert "generation, baselines  not here: they run from a checkout of the project" in told
-    assert "JAX" not in told.partition("Devices")[2]
-    assert f"jax               not installed: pip install '{NAME}[generation]'" in told
+    report = run("icrl4aht-data", "doctor")
+    assert "no problems found" in report
+    assert "generation, baselines  not here: they run from a checkout of the project" in report
+    assert "JAX" not in report.partition("Devices")[2]
+    assert f"jax               not installed: pip install '{NAME}[generation]'" in report
     assert f"pip install '{NAME}[plot]'" in run("icrl4aht-data", "show", "--plot", "curves.png", code=1)
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_what_needs_more_says_so(installed, tmp_path):
-    """`generation` and `baselines` are not in the wheel; from a checkout they say which extra they need."""
-    alone = call(installed / "python", "-c", "import generation", cwd=tmp_path)
-    assert "No module named 'generation'" in alone.stderr
+def test_commands_name_the_missing_extra(installed, tmp_path):
+    """`generation` and `baselines` are not in the wheel; in a checkout they name the extra they need."""
+    done = call(installed / "python", "-c", "import generation", cwd=tmp_path)
+    assert "No module named 'generation'" in done.stderr
     python = (installed / "python", "-B")
     assert call(*python, "-c", "import generation, baselines", cwd=ROOT).returncode == 0
     for package in ("generation", "baselines"):
@@ -210,21 +212,19 @@ def test_what_needs_more_says_so(installed, tmp_path):
         ("baselines", "evaluate", "--agent", "stay", "--out", tmp_path / "results"),
         ("baselines", "train", "ad", "--layout", "demo_wide", "--out", tmp_path / "run"),
     ):
-        asked = call(*python, "-m", *arguments, cwd=ROOT)
-        assert asked.returncode == 1
-        assert asked.stderr.startswith("error: this needs "), asked.stderr
-        assert asked.stderr.endswith(f", which is not installed: pip install '{NAME}[generation]'\n"), asked.stderr
+        done = call(*python, "-m", *arguments, cwd=ROOT)
+        assert done.returncode == 1
+        assert done.stderr.startswith("error: this needs "), done.stderr
+        assert done.stderr.endswith(f", which is not installed: pip install '{NAME}[generation]'\n"), done.stderr
 
 
-def test_it_is_small(installed, capsys):
+def test_the_installed_size_is_limited(installed, capsys):
     (site,) = installed.parent.glob("lib/python*/site-packages")
-    of_all = {path: path.stat().st_size for path in site.rglob("*") if path.is_file()}
-    ours = sum(size for path, size in of_all.items() if path.relative_to(site).parts[0].startswith(PACKAGE))
+    sizes = {path: path.stat().st_size for path in site.rglob("*") if path.is_file()}
+    own = sum(size for path, size in sizes.items() if path.relative_to(site).parts[0].startswith(PACKAGE))
     with capsys.disabled():
-        print(
-            f"\n{NAME}: {ours:,} bytes installed, {sum(of_all.values()):,} with its dependencies ({site.parent.name})"
-        )
-    release = sum(size for path, size in of_all.items() if path.is_relative_to(site / PACKAGE / "mini"))
-    assert ours - release <= CODE_BYTES
+        print(f"\n{NAME}: {own:,} bytes installed, {sum(sizes.values()):,} with its dependencies ({site.parent.name})")
+    release = sum(size for path, size in sizes.items() if path.is_relative_to(site / PACKAGE / "mini"))
+    assert own - release <= CODE_BYTES
     assert 0 < release <= RELEASE_BYTES
-    assert sum(of_all.values()) <= ENVIRONMENT_BYTES
+    assert sum(sizes.values()) <= ENVIRONMENT_BYTES

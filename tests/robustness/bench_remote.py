@@ -71,7 +71,7 @@ def measure(url: str, local: Path, windows: int, length: int) -> dict[str, Any]:
     plan = plan_download(url, layout=LAYOUTS[1])
     fetch_planned(plan)
     facts["download_bytes"], facts["download_seconds"] = plan.size, round(time.perf_counter() - began, 3)
-    facts["whole"] = verify_release(url, layout=LAYOUTS[1]).ok
+    facts["complete"] = verify_release(url, layout=LAYOUTS[1]).ok
 
     name = load_icrl4aht(url, layout=LAYOUTS[1]).shards[0]
     root = plan.root.folder
@@ -103,7 +103,7 @@ def main(folder: Path, histories: int, windows: int, length: int, kinds: tuple[s
         with remote(kind, release) as url:
             facts = measure(url, release, windows, length)
         over = {name: facts[name] for name, most in TARGETS.items() if facts[name] > most}
-        wrong = [name for name in ("equal", "whole", "repaired") if not facts[name]]
+        wrong = [name for name in ("equal", "complete", "repaired") if not facts[name]]
         missed |= bool(over or wrong)
         click.echo(
             json.dumps({"benchmark": "remote", "remote": kind, **facts, "targets": TARGETS, "missed": [*over, *wrong]})

@@ -1,6 +1,6 @@
-"""Hostile releases, published files and servers: an error of ours that names the fault, or a finding, and nothing else.
+"""Hostile releases, published files and servers end in one of our errors or a finding that names the fault.
 
-The cases of a kind run in one process of their own, whose memory is bounded: see `hostile_run`.
+They run in one process of their own, whose memory is bounded: see `hostile.run`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,70 +25,46 @@ from icrl4aht_data.format.manifest import parse_manifest
 from icrl4aht_data.remote.download import ORIGIN, repair
 from icrl4aht_data.utils.files import atomic_write, parse_json
 from tests.helpers.paths import ROOT
-from tests.robustness.hostile_folders import CASES, TERABYTE
-from tests.robustness.hostile_published import PUBLISHED_CASES
-from tests.robustness.hostile_served import SERVED
+from tests.robustness.hostile.cases import CASES
+from tests.robustness.hostile.spoil import TERABYTE
 
-TOGETHER = 480  # seconds for all cases of a kind
-TAKEN = 64 * 2**20  # bytes of disk
+SECONDS = 480
+"""Time for all cases together."""
+DISK_BYTES = 64 * 2**20
+"""Most that the steps of a case may write."""
 
 
-def outcomes(kind: str, folder: Path) -> dict[str, dict[str, Any]]:
-    """What came of each case; a case that is missing killed the process, or held it up."""
+@pytest.fixture(scope="module")
+def outcomes(request, tmp_path_factory) -> dict[str, dict[str, Any]]:
+    """The outcomes of the selected cases; a missing case ended the process or exceeded the time."""
+    names = [item.callspec.params["name"] for item in request.session.items if item.originalname == test_case.__name__]
+    folder = tmp_path_factory.mktemp("hostile")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tests.robustness.hostile_run", kind, str(folder)]
+    command = [sys.executable, "-m", "tests.robustness.hostile.run", str(folder)]
     with (folder / "out.jsonl").open("wb") as out, (folder / "errors.txt").open("wb") as errors:
-        process = subprocess.Popen(command, stdout=out, stderr=errors, env=environment)
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=environment)
         try:
-            process.wait(TOGETHER)
+            process.communicate(json.dumps(names).encode(), SECONDS)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
     lines = [json.loads(line) for line in (folder / "out.jsonl").read_text().splitlines()]
-    found = {line["case"]: line for line in lines}
-    return found | {"": {"died": (folder / "errors.txt").read_text()[-2000:]}}
+    return {line["case"]: line for line in lines} | {"": {"errors": (folder / "errors.txt").read_text()[-2000:]}}
 
 
-@pytest.fixture(scope="module")
-def releases(tmp_path_factory) -> dict[str, dict[str, Any]]:
-    return outcomes("releases", tmp_path_factory.mktemp("hostile"))
-
-
-@pytest.fixture(scope="module")
-def published(tmp_path_factory) -> dict[str, dict[str, Any]]:
-    return outcomes("published", tmp_path_factory.mktemp("hostile"))
-
-
-@pytest.fixture(scope="module")
-def served(tmp_path_factory) -> dict[str, dict[str, Any]]:
-    return outcomes("served", tmp_path_factory.mktemp("hostile"))
-
-
-def check(found: dict[str, dict[str, Any]], name: str, message: str) -> None:
-    assert name in found, f"the process ended before: {found['']['died']}"
-    came = found[name]
-    foreign = {step: outcome["said"] for step, outcome in came["steps"].items() if not outcome["ours"]}
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if n % 8 == 0 else pytest.mark.slow) for n, name in enumerate(CASES)]
+)
+def test_case(outcomes, name):
+    assert name in outcomes, f"the process ended before: {outcomes['']['errors']}"
+    found = outcomes[name]
+    foreign = {step: outcome["said"] for step, outcome in found["steps"].items() if not outcome["ours"]}
     assert not foreign, foreign
-    assert not came["touched"], "something outside, or of the release, was changed"
-    assert not came["leaked"], f"what lies outside was read: {came['leaked']}"
-    assert came["taken"] < TAKEN
-    said = [outcome["said"] for outcome in came["steps"].values()]
-    assert any(re.search(message, text) for text in said), said
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_a_hostile_release(releases, name):
-    check(releases, name, CASES[name][1])
-
-
-@pytest.mark.parametrize("name", PUBLISHED_CASES)
-def test_hostile_published_files(published, name):
-    check(published, name, PUBLISHED_CASES[name][1])
-
-
-@pytest.mark.parametrize("name", SERVED)
-def test_a_hostile_server(served, name):
-    check(served, name, SERVED[name][1])
+    assert not found["touched"], "a file of the release or outside of it was changed"
+    assert not found["leaked"], f"a secret outside of the release was read: {found['leaked']}"
+    assert found["taken"] < DISK_BYTES
+    said = [outcome["said"] for outcome in found["steps"].values()]
+    assert any(re.search(CASES[name].message, text) for text in said), said
 
 
 def card(**changes: Any) -> str:
@@ -138,7 +113,7 @@ def test_a_pipe_for_a_checkpoint(tmp_path):
 @pytest.mark.parametrize(
     "url", ["local:///etc", "reference://x", "simplecache::https://host/x", "memory://x", "git://x/y", "python://"]
 )
-def test_a_note_does_not_choose_a_protocol(damaged, url):
+def test_the_origin_file_does_not_choose_a_protocol(damaged, url):
     (damaged / ORIGIN).write_text(json.dumps({"url": url, "files": []}))
     with pytest.raises(OptionError, match="give --from"):
         repair(damaged, ["README.md"])
@@ -152,20 +127,20 @@ def test_a_link_is_not_written_through(tmp_path):
     assert ((tmp_path / "mine").read_text(), (tmp_path / "file").read_text()) == ("mine", "new")
 
 
-def test_names_are_no_markup(damaged):
+def test_names_are_not_read_as_markup(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
     result = CliRunner().invoke(cli, ["list", str(damaged)], catch_exceptions=False)
     assert "[/b][link=file:///]" in result.output
 
 
-def test_depth_of_json():
+def test_the_depth_of_json_is_limited():
     assert parse_json('{"a": [[1]]}') == {"a": [[1]]}
     with pytest.raises(IndexFormatError, match="levels deep"):
         parse_json("[" * 65 + "]" * 65)
 
 
-def test_names_that_windows_keeps(tmp_path):
+def test_reserved_names_of_windows(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
             parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")

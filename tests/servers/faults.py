@@ -1,4 +1,4 @@
-"""What a test's server may do wrong, and when."""
+"""Faults of a test server, and rules for when they happen."""
 
 from __future__ import annotations
 
@@ -11,11 +11,20 @@ from fnmatch import fnmatchcase
 
 @dataclass
 class Request:
-    """One request, as a server's log keeps it; all but sent is there before the first byte of its answer goes out.
+    """One request in a server's log. All but `sent` is logged before the first byte of the answer is sent.
 
-    path is decoded and has no query, target is what the client sent; start and stop are the bytes [start, stop) asked
-    for, None without a Range that the body can satisfy; sent counts the bytes of the body handed to the socket; began
-    is of time.monotonic(). Rules see method, path, target, headers and began only: the answer is not known yet.
+    Rules see method, path, target, headers and began only, because the answer is not known yet.
+
+    Args:
+        method: GET, HEAD, ...
+        path: decoded and without the query.
+        start: first byte of the requested range; None without a Range header that the body can satisfy.
+        stop: end of the requested range, exclusive.
+        status: of the answer.
+        sent: bytes of the body that were written to the socket.
+        target: path and query as the client sent them.
+        headers: of the request.
+        began: time.monotonic() at its arrival.
     """
 
     method: str
@@ -31,14 +40,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Cut:
-    """The right headers, `after` bytes of the body, then a closed socket."""
+    """Correct headers and `after` bytes of the body, then a closed socket."""
 
     after: int = 0
 
 
 @dataclass(frozen=True)
 class Status:
-    """Another status, with a line of text for a body."""
+    """Another status, with a line of text as the body."""
 
     code: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -46,7 +55,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Slow:
-    """`delay` seconds before the answer, then no more than `bytes_per_second`."""
+    """A wait of `delay` seconds before the answer, then at most `bytes_per_second`."""
 
     delay: float = 0.0
     bytes_per_second: float | None = None
@@ -54,22 +63,21 @@ class Slow:
 
 @dataclass(frozen=True)
 class Short:
-    """`by` bytes less than asked, in headers that agree with one another."""
+    """`by` bytes less than requested, in headers that agree with one another."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
 class Long:
-    """`by` bytes more than asked, in headers that agree with one another: the file's own, zeros past its end."""
+    """`by` bytes more than requested, in headers that agree with one another; zeros past the end of the file."""
 
     by: int = 1
 
 
 @dataclass(frozen=True)
 class Flip:
-    """The right length; `bits` of the byte at `position` of this body are inverted. Negative positions count from its
-    end."""
+    """A body of the right length, with `bits` of the byte at `position` inverted; negative ones count from the end."""
 
     position: int = 0
     bits: int = 0xFF
@@ -77,19 +85,19 @@ class Flip:
 
 @dataclass(frozen=True)
 class Etag:
-    """`value` is the ETag of this path from now on."""
+    """Another ETag of this path from now on."""
 
     value: str
 
 
 @dataclass(frozen=True)
 class IgnoreRange:
-    """200 and the whole body, whatever range was asked for."""
+    """Status 200 and the complete body, whatever range was requested."""
 
 
 @dataclass(frozen=True)
 class Redirect:
-    """To another path of this server, or to a URL."""
+    """A redirect to another path of this server, or to a URL."""
 
     to: str
     code: int = 302
@@ -100,9 +108,9 @@ Rule = Callable[[Request], Fault | None]
 
 
 class Faults:
-    """Rules asked in their order: the first that answers decides what goes wrong with a request. Thread safe.
+    """Rules in order: the first that returns a fault decides what goes wrong with a request. Thread safe.
 
-    path is a pattern of fnmatch (`*` crosses `/`); method None is any method.
+    `path` is a pattern of fnmatch (`*` crosses `/`); `method` None is any method.
     """
 
     def __init__(self, *rules: Rule) -> None:
@@ -114,12 +122,12 @@ class Faults:
             return next((fault for rule in self._rules if (fault := rule(request)) is not None), None)
 
     def add(self, rule: Rule) -> None:
-        """A rule of the caller's own, asked under a lock: it may count without one."""
+        """Add a rule of the caller's own. Rules are called under a lock, so they may count."""
         with self._lock:
             self._rules.append(rule)
 
     def next(self, fault: Fault, times: int = 1, path: str = "*", method: str | None = "GET") -> None:
-        """The next `times` requests that match."""
+        """Add a fault of the next `times` requests that match."""
         left = times
 
         def rule(request: Request) -> Fault | None:
@@ -132,7 +140,7 @@ class Faults:
         self.add(rule)
 
     def every(self, k: int, fault: Fault, path: str = "*", method: str | None = "GET") -> None:
-        """The k-th request that matches, the 2k-th, and so on; all of them where k is 1."""
+        """Add a fault of the k-th request that matches, the 2k-th, and so on."""
         seen = 0
 
         def rule(request: Request) -> Fault | None:
@@ -145,7 +153,7 @@ class Faults:
         self.add(rule)
 
     def clear(self) -> None:
-        """Nothing goes wrong any more; ETags that were changed stay."""
+        """Remove all rules; ETags that were changed stay changed."""
         with self._lock:
             self._rules.clear()
 

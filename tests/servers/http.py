@@ -1,4 +1,4 @@
-"""A folder over HTTP on 127.0.0.1, and the server under it that other protocols build on."""
+"""A folder served over HTTP on 127.0.0.1, and the server that the Hub and S3 build on."""
 
 from __future__ import annotations
 
@@ -39,7 +39,14 @@ PACE = 0.02  # seconds between the blocks of a slow body
 
 @dataclass(frozen=True)
 class Answer:
-    """What a route gives back. A body with an etag is served in ranges."""
+    """A route's answer.
+
+    Args:
+        body: content, or the file that has it.
+        status: HTTP status.
+        headers: besides Content-Length and what an etag adds.
+        etag: with its quotes; a body with one is served in ranges.
+    """
 
     body: bytes | Path = b""
     status: int = 200
@@ -51,7 +58,7 @@ Route = Callable[[Request, bytes], Answer]
 
 
 class Server(ThreadingHTTPServer):
-    """Answers by a route, logs every request, does wrong what the faults say; `close` leaves no thread behind."""
+    """A server that answers by a route, logs every request, and does wrong what the faults say."""
 
     request_queue_size = 128
 
@@ -83,7 +90,7 @@ class Server(ThreadingHTTPServer):
             self._errors.append(error)
 
     def close(self) -> None:
-        """Ends every connection; raises the first error that was the server's own."""
+        """End every connection and every thread; raise the first error of the server itself."""
         self.closing.set()
         self.shutdown()
         self._serving.join()
@@ -128,7 +135,11 @@ class Handler(BaseHTTPRequestHandler):
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer
 
     def _read_body(self) -> bytes:
-        """What the client sends, whole; one that is killed sends less, and then there is no request."""
+        """The complete body.
+
+        Raises:
+            ConnectionAbortedError: if the client was killed before it had sent everything.
+        """
         if self.headers.get("Transfer-Encoding", "").lower() != "chunked":
             return self._read(int(self.headers.get("Content-Length") or 0))
         chunks = []
@@ -157,13 +168,12 @@ class Handler(BaseHTTPRequestHandler):
             self.owner.etags[request.path] = f'"{fault.value}"'
         if request.path in self.owner.etags:
             etag = etag and self.owner.etags[request.path]
-            headers |= {name: self.owner.etags[request.path] for name in headers if name == "X-Linked-Etag"}
         with _opened(answer.body) as file:
             size = os.fstat(file.fileno()).st_size if isinstance(answer.body, Path) else len(answer.body)
             status, start, stop = answer.status, 0, size
             if etag is not None:
                 headers |= {"ETag": etag, "Accept-Ranges": "bytes"}
-                status, start, stop = self._chosen(size, etag, isinstance(fault, IgnoreRange))
+                status, start, stop = self._selected(size, isinstance(fault, IgnoreRange))
             if status == 206:
                 request.start, request.stop = start, stop
             if status == 416:
@@ -182,23 +192,12 @@ class Handler(BaseHTTPRequestHandler):
                 file.seek(start)
                 self._send_body(request, file, stop - start, fault)
 
-    def _chosen(self, size: int, etag: str, whole: bool) -> tuple[int, int, int]:
-        """Status, start, stop of what the conditions and the range of this request select."""
-        wanted, unwanted = self.headers.get("If-Match"), self.headers.get("If-None-Match")
-        if wanted not in (None, "*", etag):
-            return 412, 0, 0
-        if unwanted is not None and unwanted in ("*", etag):
-            return 304, 0, 0
-        found = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers.get("Range", ""))
-        if whole or found is None or self.headers.get("If-Range", etag) != etag:
+    def _selected(self, size: int, ignore_range: bool) -> tuple[int, int, int]:
+        """Status, first byte and end of what this request's range selects."""
+        found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+        if ignore_range or found is None:
             return 200, 0, size
-        first, last = (int(number) if number else None for number in found.groups())
-        if first is None:
-            if last is None:
-                return 200, 0, size
-            start, stop = max(0, size - last), size
-        else:
-            start, stop = first, size if last is None else min(last + 1, size)
+        start, stop = int(found[1]), min(int(found[2] or size) + 1, size)
         return (206, start, stop) if start < stop else (416, 0, 0)
 
     def _send_body(self, request: Request, file: BinaryIO, length: int, fault: Fault | None) -> None:
@@ -224,7 +223,7 @@ def _opened(body: bytes | Path) -> BinaryIO:
 
 
 def file_answer(path: Path) -> Answer:
-    """A file, as nginx would describe it."""
+    """A file with the headers that nginx would send."""
     stat = path.stat()
     headers = {
         "Last-Modified": formatdate(stat.st_mtime, usegmt=True),
@@ -235,7 +234,7 @@ def file_answer(path: Path) -> Answer:
 
 @contextmanager
 def http_server(folder: Path, faults: Faults | None = None) -> Iterator[Server]:
-    """The files of a folder at `.url`; `.log` and `.faults`. No listings, nothing outside of the folder."""
+    """Serve the files of a folder; without listings, and nothing outside of the folder."""
     root = folder.resolve()
 
     def route(request: Request, body: bytes) -> Answer:

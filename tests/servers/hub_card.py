@@ -1,4 +1,4 @@
-"""The check of a card's metadata, as far as the Hub's own is known: same answers, for the fields that matter here."""
+"""Validation of a card's metadata with the answers of the Hub, for the fields that our cards have."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TEXTS_OR_LISTS = ("license", "language", "base_model")
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML where a key given twice is an error, as it is to the Hub."""
+    """YAML loader that refuses a duplicate key, as the Hub does."""
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
@@ -39,7 +39,11 @@ _Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping
 
 
 def metadata(content: str) -> dict[str, Any] | None:
-    """A card's front matter, None where it has none. Raises yaml.YAMLError, which includes what is no mapping."""
+    """The card's front matter, None without one.
+
+    Raises:
+        yaml.YAMLError: if it is not valid YAML or no mapping.
+    """
     found = re.match(r"\ufeff?\s*---[ \t]*\r?\n(.*?)^---[ \t]*\r?$", content, re.DOTALL | re.MULTILINE)
     data = yaml.load(found[1], _Loader) if found else None
     if data is not None and not isinstance(data, dict):
@@ -48,7 +52,7 @@ def metadata(content: str) -> dict[str, Any] | None:
 
 
 def card_errors(content: str) -> tuple[list[str], list[str]]:
-    """Errors and warnings."""
+    """Errors and warnings that the Hub's validation returns for a card."""
     try:
         data = metadata(content)
     except yaml.YAMLError as error:

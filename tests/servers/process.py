@@ -1,4 +1,4 @@
-"""What clients in this process hold on to: the environment, fsspec's instances, huggingface_hub's constants."""
+"""State that clients keep in this process: the environment, fsspec's instances, huggingface_hub's constants."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import fsspec
 import huggingface_hub
 import pytest
-from huggingface_hub import constants, hf_api, hf_file_system
+from huggingface_hub import constants, hf_api
 from huggingface_hub.utils import _http
 
 MISSING = object()
@@ -23,7 +23,7 @@ uploads = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")
 
 @contextmanager
 def environment(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """These variables for a while; None is unset."""
+    """Set variables for a while; None removes one."""
     before = {name: os.environ.get(name) for name in changes}
     try:
         _set(changes)
@@ -40,13 +40,13 @@ def _set(changes: Mapping[str, str | None]) -> None:
 
 
 def forget_filesystems(*protocols: str) -> None:
-    """No filesystem of fsspec outlives the server that it talked to, nor the settings it was made from."""
+    """Drop fsspec's cached filesystems, which would outlive the server and the settings they were made for."""
     for protocol in protocols:
         fsspec.get_filesystem_class(protocol).clear_instance_cache()
 
 
 def hub_environment(endpoint: str, home: Path, token: str) -> dict[str, str]:
-    """What sends another process to this hub. Without HF_HUB_DISABLE_XET the client uploads by Xet or not at all."""
+    """Variables that direct another process to a Hub. Xet is disabled, which the client would use for uploads."""
     return {
         "HF_ENDPOINT": endpoint,
         "HF_HOME": str(home),
@@ -55,23 +55,22 @@ def hub_environment(endpoint: str, home: Path, token: str) -> dict[str, str]:
         "HF_HUB_DISABLE_XET": "1",
         "HF_HUB_DISABLE_TELEMETRY": "1",
         "HF_HUB_DISABLE_UPDATE_CHECK": "1",
-        "HF_UPDATE_DOWNLOAD_COUNTS": "0",  # `datasets` counts at another address
     }
 
 
-NOT_FOR_A_TEST = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE", "HUGGINGFACE_HUB_CACHE", "HF_TOKEN_PATH", "HF_XET_CACHE")
-NOT_FOR_A_TEST += ("HF_OIDC_RESOURCE", "HF_HUB_DISABLE_IMPLICIT_TOKEN", "HUGGINGFACE_CO_STAGING", "HF_DATASETS_OFFLINE")
+REMOVED = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE", "HUGGINGFACE_HUB_CACHE", "HF_TOKEN_PATH", "HF_XET_CACHE")
+REMOVED += ("HF_OIDC_RESOURCE", "HF_HUB_DISABLE_IMPLICIT_TOKEN", "HUGGINGFACE_CO_STAGING")
 
 
 @contextmanager
 def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
-    """The environment of `hub_environment`, in a process that has imported huggingface_hub already.
+    """Apply `hub_environment` to a process that has already imported huggingface_hub.
 
-    Its constants are replaced in every module that has copied them, and the endpoint of the two clients that it makes
-    on import; its HTTP session and the cached filesystems are dropped on the way in and out.
+    The client's constants are replaced in every module that has copied them, and the endpoint of the API object that it
+    makes on import; its HTTP session is closed on the way in and out.
     """
     changes, before = _changes(variables), constants.ENDPOINT
-    with environment({**variables, **dict.fromkeys(NOT_FOR_A_TEST)}):
+    with environment({**variables, **dict.fromkeys(REMOVED)}):
         try:
             _replace(changes)
             _restart(variables["HF_ENDPOINT"])
@@ -82,7 +81,7 @@ def hub_settings(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def _changes(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
-    """Old and new values of constants, by name."""
+    """Name -> (old value, new value) of the client's constants."""
     endpoint, home = variables["HF_ENDPOINT"], variables["HF_HOME"]
     values = {
         "ENDPOINT": endpoint,
@@ -100,20 +99,13 @@ def _changes(variables: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
         "HF_HUB_DISABLE_TELEMETRY": True,
         "HF_HUB_OFFLINE": False,
     }
-    path, counts = "/datasets/{repo_id}/resolve/{revision}/{path}", "HF_UPDATE_DOWNLOAD_COUNTS"
-    of_datasets = {
-        "HF_ENDPOINT": (constants.ENDPOINT, endpoint),
-        "HUB_DATASETS_URL": (constants.ENDPOINT + path, endpoint + path),
-        counts: (getattr(sys.modules.get("datasets.config"), counts, True), False),
-    }
     origins = _http._HUB_ORIGINS, _http._HUB_ORIGINS | {_http._url_origin(endpoint)}
-    replaced = {name: (getattr(constants, name), value) for name, value in values.items()}
-    return replaced | of_datasets | {"_HUB_ORIGINS": origins}
+    return {name: (getattr(constants, name), value) for name, value in values.items()} | {"_HUB_ORIGINS": origins}
 
 
 def _replace(changes: Mapping[str, tuple[Any, Any]]) -> None:
     for name, module in list(sys.modules.items()):
-        if name.split(".")[0] in ("huggingface_hub", "datasets"):
+        if name.split(".")[0] == "huggingface_hub":
             for constant, (old, new) in changes.items():
                 if vars(module).get(constant, MISSING) == old:
                     vars(module)[constant] = new
@@ -122,7 +114,4 @@ def _replace(changes: Mapping[str, tuple[Any, Any]]) -> None:
 def _restart(endpoint: str) -> None:
     hf_api.api.endpoint = endpoint
     hf_api.api._whoami_cache.clear()
-    hf_file_system.hffs.endpoint = hf_file_system.hffs._api.endpoint = endpoint
-    hf_file_system.hffs.invalidate_cache()
     huggingface_hub.close_session()
-    forget_filesystems("hf")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import boto3
 from moto.server import ThreadedMotoServer
@@ -17,32 +16,15 @@ from tests.servers.process import environment, forget_filesystems
 
 @dataclass(frozen=True)
 class Bucket:
-    """`.url` is its root for fsspec, `.endpoint` its server, `.environment` what reaches it from another process."""
+    """A served bucket: `url` is its root for fsspec, `endpoint` the address of its server."""
 
     url: str
     endpoint: str
-    environment: Mapping[str, str]
-    client: Any
-
-    @property
-    def name(self) -> str:
-        return self.url.removeprefix("s3://")
-
-    def put(self, key: str, data: bytes) -> None:
-        """A new object, or another in its place."""
-        self.client.put_object(Bucket=self.name, Key=key, Body=data)
-
-    def delete(self, key: str) -> None:
-        self.client.delete_object(Bucket=self.name, Key=key)
-
-    def keys(self) -> list[str]:
-        """What the bucket holds, in order; the first 1000."""
-        return [entry["Key"] for entry in self.client.list_objects_v2(Bucket=self.name).get("Contents", ())]
 
 
 @contextmanager
 def s3_server(folder: Path, bucket: str = "data") -> Iterator[Bucket]:
-    """A bucket with the files of a folder, where `fsspec.filesystem("s3")` finds it without an option."""
+    """A bucket with the files of a folder, which `fsspec.filesystem("s3")` finds without options."""
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     endpoint = f"http://127.0.0.1:{server.get_host_and_port()[1]}"
@@ -58,14 +40,14 @@ def s3_server(folder: Path, bucket: str = "data") -> Iterator[Bucket]:
         # A profile or a session of the user's own would be preferred to the keys above.
         with environment({**variables, "AWS_PROFILE": None, "AWS_SESSION_TOKEN": None}):
             client = boto3.Session().client("s3")
-            store = Bucket(f"s3://{bucket}", endpoint, variables, client)
             client.create_bucket(Bucket=bucket)
             for path in sorted(folder.rglob("*")):
                 if path.is_file():
-                    store.put(path.relative_to(folder).as_posix(), path.read_bytes())
+                    key = path.relative_to(folder).as_posix()
+                    client.put_object(Bucket=bucket, Key=key, Body=path.read_bytes())
             forget_filesystems("s3")
             try:
-                yield store
+                yield Bucket(f"s3://{bucket}", endpoint)
             finally:
                 forget_filesystems("s3")
                 client.close()

@@ -170,13 +170,13 @@ def test_processes_may_build_at_once(long, folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"T": 0}, "expected positive numbers"),
+        ({"T": 0}, r"Expected `int` >= 1 - at `\$\.T`"),
         ({"episodes": 99999}, "99999 episodes in"),
         ({"has_teammate_actions": False}, "has_teammate_actions true"),
         ({"layout": "test_wide"}, "obs_shape|unknown layout of"),
-        ({"seed": 2**63}, "at most 64 bits"),
-        ({"env_idx": True}, "expected int, found True"),
-        ({"score": "high"}, "expected float"),
+        ({"seed": 2**63}, r"Expected `int` <= 9223372036854775807 - at `\$\.seed`"),
+        ({"env_idx": True}, r"Expected `int`, got `bool` - at `\$\.env_idx`"),
+        ({"score": "high"}, r"Expected `float`, got `str` - at `\$\.score`"),
         ({"history_id": 5000}, "ids count up"),
     ],
 )

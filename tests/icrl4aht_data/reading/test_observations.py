@@ -176,7 +176,7 @@ class TestFaults:
             (say(2, layout="demo_simple"), None),  # as many channels: nothing in the files says otherwise
             (say(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
             (say(1, teammate_kind="other"), r"index\.jsonl: history 1 is of .*'other'.*, its task 'task_a' of"),
-            (say(1, T="many"), r"index\.jsonl, line 2: field 'T': expected int, found 'many'"),
+            (say(1, T="many"), r"index\.jsonl, line 2: field 'T': Expected `int`, got `str`, found 'many'"),
             (say(3, layout="kitchen"), r"index\.jsonl, line 4: unknown layout"),
             (say(3, teammate_family="H9"), r"index\.jsonl, line 4: unknown teammate_family 'H9'"),
         ],

@@ -1,11 +1,13 @@
-"""Releases at an address: opened, streamed, downloaded in part, gone on with, verified and repaired; over HTTP, S3 and
-the Hub's protocol, all served on loopback."""
+"""Remote releases: opening, streaming, partial and resumed downloads, verifying and repairing; over HTTP, S3 and the
+Hub's protocol, all served on loopback."""
 
 from __future__ import annotations
 
 import json
 import pickle
 import shutil
+import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,47 +24,49 @@ from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download, 
 from icrl4aht_data.remote.store import RetryPolicy, Store
 from tests.helpers.batches import assert_equal
 from tests.robustness import bench_remote
-from tests.servers.common import Cut, http_server, hub_server
+from tests.servers.common import Cut, Flip, http_server, hub_server
+from tests.servers.process import hub_environment, hub_settings
 
-HASTY = RetryPolicy(attempts=2, first=0.01)
+QUICK = RetryPolicy(attempts=2, first_wait=0.01)
 
 
 @pytest.fixture(autouse=True)
 def folders(tmp_path, monkeypatch) -> Path:
-    """Nothing has been fetched before."""
+    """The data folder, empty at first."""
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     return tmp_path / "data"
 
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory) -> Path:
-    """Two layouts, some histories of full length each. Read only."""
+    """A release of two layouts with some histories of full length each. Read only."""
     return write_many(tmp_path_factory.mktemp("many") / "release", bench_remote.LAYOUTS, 24)
 
 
-@pytest.fixture(params=["http", "s3", "hub"])
+@pytest.fixture(params=["http", pytest.param("s3", marks=pytest.mark.slow), "hub"])
 def served(request, lite) -> Iterator[str]:
-    """`lite` at an address of each kind in turn."""
+    """Address of `lite` on a server of each kind in turn."""
     with bench_remote.remote(request.param, lite[0]) as url:
         yield url
 
 
-def in_part(folder: Path) -> dict[str, bytes]:
+def contents(folder: Path) -> dict[str, bytes]:
+    """File name -> content of all files below a folder."""
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize(("first", "told"), [(0.001, []), (2.0, ["2 s", "4 s"])])
-def test_a_long_wait_is_told(first, told, monkeypatch, caplog):
+@pytest.mark.parametrize(("first", "logged"), [(0.001, []), (2.0, ["2 s", "4 s"])])
+def test_a_long_wait_is_logged(first, logged, monkeypatch, caplog):
     monkeypatch.setattr("tenacity.nap.time.sleep", lambda seconds: None)
-    store = Store("https://nowhere.test/release", RetryPolicy(attempts=3, first=first))
+    store = Store("https://nowhere.test/release", RetryPolicy(attempts=3, first_wait=first))
 
     def refuse():
         raise ConnectionError("no such host")
 
     with pytest.raises(RemoteError, match=r"no such host \(3 attempts\)"):
-        store.patiently("meta/info.json", refuse)
+        store.with_retries("meta/info.json", refuse)
     start = "https://nowhere.test/release/meta/info.json: ConnectionError: no such host; trying again in "
-    assert caplog.messages == [start + wait for wait in told]
+    assert caplog.messages == [start + wait for wait in logged]
 
 
 def test_a_remote_release_reads_as_its_local_twin(served, lite):
@@ -72,36 +76,36 @@ def test_a_remote_release_reads_as_its_local_twin(served, lite):
     for ours, theirs in zip(remote, local, strict=True):
         assert np.array_equal(ours.obs[3:17], theirs.obs[3:17])
         assert np.array_equal(ours.expert_actions[:], theirs.expert_actions[:])
-    assert not list((remote.root / "data").rglob("*.h5")), "nothing was downloaded whole"
+    assert not list((remote.root / "data").rglob("*.h5")), "no shard was downloaded"
 
 
 @pytest.mark.parametrize("cache", ["auto", "ram", "mmap", "stream"])
-def test_batches_are_the_same_however_held(lite, cache):
+def test_batches_are_the_same_with_every_cache(lite, cache):
     for layout in bench_remote.LAYOUTS:
         with http_server(lite[0]) as server:
             local = load_icrl4aht(lite[0], layout=layout)
             remote = load_icrl4aht(server.url, layout=layout, cache=cache)
             if cache == "auto":
                 assert remote.cache.cache == "stream" and "are not downloaded" in remote.cache.reason
-            asked = {"batch_size": 16, "seed": 3, "teammate_actions": True}
+            options = {"batch_size": 16, "seed": 3, "teammate_actions": True}
             for i in range(2):
-                assert_equal(remote.ad(length=30, **asked)[i], local.ad(length=30, **asked)[i])
+                assert_equal(remote.ad(length=30, **options)[i], local.ad(length=30, **options)[i])
                 for order in ("contiguous", "random"):
-                    options = {"context": 25, "order": order, **asked}
-                    assert_equal(remote.dpt(**options)[i], local.dpt(**options)[i])
+                    shown = {"context": 25, "order": order, **options}
+                    assert_equal(remote.dpt(**shown)[i], local.dpt(**shown)[i])
 
 
 @pytest.mark.parametrize("kind", ["http", "s3", "hub"])
-def test_what_it_costs(many, kind, folders):
-    """The benchmark's measurements on fewer histories: shares of so small a shard say little, all else must hold."""
+def test_requests_and_bytes(many, kind, folders):
+    """The benchmark's measurements on fewer histories, where only the share of streamed bytes says little."""
     with bench_remote.remote(kind, many) as url:
         facts = bench_remote.measure(url, many, windows=8, length=500)
-    assert facts["equal"] and facts["whole"] and facts["repaired"]
+    assert facts["equal"] and facts["complete"] and facts["repaired"]
     assert facts["requests_a_window"] <= 1.5 and facts["repaired_share"] <= 0.01
     assert facts["bytes"] < 8 * 6000, "a window's chunks and little else"
 
 
-def test_a_batch_asks_for_exactly_the_ranges_it_counts(many):
+def test_a_batch_requests_exactly_the_ranges_it_counts(many):
     with http_server(many) as server:
         dataset = load_icrl4aht(server.url, layout="demo_wide", obs="state")
         _ = dataset.storage
@@ -112,15 +116,15 @@ def test_a_batch_asks_for_exactly_the_ranges_it_counts(many):
         assert traffic.requests == len(server.log) - seen > 0
         assert traffic.bytes == sum(request.sent for request in server.log[seen:])
         sampler[0]
-        assert dataset.traffic - before == traffic, "what has come is not asked for again"
+        assert dataset.traffic - before == traffic, "downloaded chunks are not requested again"
         again = load_icrl4aht(server.url, layout="demo_wide", obs="state")
         _ = again.storage
         before = again.traffic
         again.ad(batch_size=8, length=500, seed=1)[0]
-        assert (again.traffic - before).requests == 0, "nor by another process: it is kept on disk"
+        assert (again.traffic - before).requests == 0, "nor by another process: they are on disk"
 
 
-def test_datasets_travel_between_processes(lite):
+def test_datasets_can_be_pickled(lite):
     with http_server(lite[0]) as server:
         remote = pickle.loads(pickle.dumps(load_icrl4aht(server.url, layout="demo_wide")))
         local = load_icrl4aht(lite[0], layout="demo_wide")
@@ -148,20 +152,20 @@ def test_a_part_is_downloaded(served, lite, folders):
     assert report.ok and report.notes == [] and report.histories == 12
 
 
-def test_a_download_into_a_folder_of_its_own(served, lite, tmp_path):
+def test_a_download_into_a_given_folder(served, lite, tmp_path):
     target = tmp_path / "mine"
     fetch_planned(plan_download(served, to=target, layout="coord_simple"))
-    assert verify_release(target).ok, "it has the part that was asked for"
+    assert verify_release(target).ok, "it has the part that was requested"
     fetch_planned(plan_download(served, to=target, layout="demo_wide"))
     assert verify_release(target, deep=True).notes == []
     (target / ORIGIN).unlink()
-    assert in_part(target) == in_part(lite[0])
+    assert contents(target) == contents(lite[0])
     shard = load_icrl4aht(target).shards[0]
     (target / shard).unlink()
     assert verify_release(target).files_at_fault == {shard}
 
 
-def test_another_version_does_not_mix_with_this_one(lite, full, tmp_path):
+def test_versions_are_not_mixed_in_a_folder(lite, full, tmp_path):
     with http_server(lite[0]) as server:
         fetch_planned(plan_download(server.url, to=tmp_path / "mine"))
     with http_server(full[0]) as server, pytest.raises(OptionError, match="holds another release or version than http"):
@@ -181,21 +185,21 @@ def test_a_new_version_at_the_same_address(lite, full, tmp_path):
             first[0].actions[:]
 
 
-def test_a_cut_download_goes_on_where_it_was_cut(many, folders):
+def test_a_cut_download_resumes_at_the_missing_chunks(many, folders):
     name = load_icrl4aht(many, layout="demo_wide").shards[0]
     with http_server(many) as server:
         server.faults.next(Cut(1000), times=10**6, path=f"*{Path(name).name}", method="GET")
-        with pytest.raises(RemoteError, match="what has arrived is kept: try again to go on"):
-            fetch_planned(plan_download(server.url, patience=HASTY))
+        with pytest.raises(RemoteError, match="what has arrived is kept: repeat the command to resume"):
+            fetch_planned(plan_download(server.url, retry=QUICK))
         server.faults.clear()
         size = (many / name).stat().st_size
         root = load_icrl4aht(server.url).origin
         assert root.remote is not None
         part = root.remote.part(name)
         with (many / name).open("rb") as stream:
-            part.put(0, stream.read(size // 2))  # half of it had arrived
+            part.put(0, stream.read(size // 2))  # the first half has arrived
         seen = len(server.log)
-        fetch_planned(plan_download(server.url, layout="demo_wide", patience=HASTY))
+        fetch_planned(plan_download(server.url, layout="demo_wide", retry=QUICK))
         again = sum(r.sent for r in server.log[seen:] if r.path.endswith(name) and r.method == "GET")
         assert size // 2 <= again <= size // 2 + 4096
         assert verify_release(server.url, layout="demo_wide").ok
@@ -227,7 +231,7 @@ def test_offline(served, lite, monkeypatch, variable):
     )
     missing = load_icrl4aht(served, layout="coord_simple", cache="ram")
     with pytest.raises(
-        OfflineError, match=r"offline, and not here: data/teammate/coord_simple/train-00000-of-00001\.h5"
+        OfflineError, match=r"offline, and not downloaded: data/teammate/coord_simple/train-00000-of-00001\.h5"
     ):
         missing.ad(batch_size=4, length=30)[0]
 
@@ -249,24 +253,24 @@ def test_repair(lite, tmp_path, what):
     shards = load_icrl4aht(lite[0]).shards
     with http_server(lite[0]) as server:
         fetch_planned(plan_download(server.url, to=root))
-        whole = in_part(root)
+        intact = contents(root)
 
-        def spoil(path: Path) -> None:
+        def flip_bit(path: Path) -> None:
             data = bytearray(path.read_bytes())
             data[len(data) // 2] ^= 8
             path.write_bytes(data)
 
         if what in ("shard", "two shards", "table and shard", "all"):
-            spoil(root / shards[0])
+            flip_bit(root / shards[0])
         if what == "two shards":
-            spoil(root / shards[1])
+            flip_bit(root / shards[1])
         if what in ("missing", "all"):
             (root / shards[1]).unlink()
         if what in ("index", "all"):
-            spoil(root / "meta" / "histories.jsonl")
-            spoil(root / "meta" / "info.json")
+            flip_bit(root / "meta" / "histories.jsonl")
+            flip_bit(root / "meta" / "info.json")
         if what == "table and shard":
-            spoil(chunk_table_path(root, shards[0]))
+            flip_bit(chunk_table_path(root, shards[0]))
         if what in ("manifest", "all"):
             (root / "MANIFEST.sha256").write_text("nonsense\n")
         result = CliRunner().invoke(cli, ["verify", str(root), "--json"])
@@ -275,27 +279,27 @@ def test_repair(lite, tmp_path, what):
         assert result.exit_code == 0, result.output
         report = json.loads(result.output)
         assert report["ok"] and report["repaired"]
-        assert in_part(root) == whole
+        assert contents(root) == intact
 
 
 def test_repair_needs_the_right_source(lite, full, tmp_path, monkeypatch):
     root = tmp_path / "copy"
     shutil.copytree(lite[0], root)
     monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
-    with pytest.raises(OptionError, match="needs the address of a whole copy"):
+    with pytest.raises(OptionError, match="needs the address of a complete copy"):
         repair(root, ["README.md"])
-    before = in_part(root)
+    before = contents(root)
     with http_server(full[0]) as server, pytest.raises(OptionError, match="it has another release or version"):
         repair(root, ["README.md"], source=server.url)
-    assert in_part(root) == before
+    assert contents(root) == before
     (root / "README.md").write_text("?")
     with http_server(lite[0]) as server:
         monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
         assert repair(root, ["README.md"])[0] == {"README.md": None}
-    assert in_part(root) == before
+    assert contents(root) == before
 
 
-def test_a_source_that_is_damaged_itself_damages_nothing(lite, tmp_path):
+def test_a_damaged_source_changes_nothing(lite, tmp_path):
     for name in ("here", "there"):
         shutil.copytree(lite[0], tmp_path / name)
     shard = load_icrl4aht(lite[0]).shards[0]
@@ -303,14 +307,14 @@ def test_a_source_that_is_damaged_itself_damages_nothing(lite, tmp_path):
         data = bytearray((lite[0] / shard).read_bytes())
         data[len(data) // 2] ^= 8
         (tmp_path / name / shard).write_bytes(data)
-    before = in_part(tmp_path / "here")
+    before = contents(tmp_path / "here")
     with http_server(tmp_path / "there") as server:
-        outcome, _ = repair(tmp_path / "here", [shard], source=server.url, patience=HASTY)
+        outcome, _ = repair(tmp_path / "here", [shard], source=server.url, retry=QUICK)
     assert "expected crc32" in str(outcome[shard])
-    assert in_part(tmp_path / "here") == before
+    assert contents(tmp_path / "here") == before
 
 
-def test_quick_looks_at_sizes_alone(served, lite, tmp_path):
+def test_quick_verification_compares_sizes_only(served, lite, tmp_path):
     report = verify_release(served, quick=True)
     assert report.ok and report.chunks == 0
     root = tmp_path / "copy"
@@ -320,7 +324,7 @@ def test_quick_looks_at_sizes_alone(served, lite, tmp_path):
     assert [finding.problem[:8] for finding in verify_release(root, quick=True).findings] == ["expected"]
 
 
-def test_command(lite, tmp_path, monkeypatch):
+def test_download_command(lite, tmp_path, monkeypatch):
     run = CliRunner()
     with http_server(lite[0]) as server:
         result = run.invoke(cli, ["download", server.url, "--layout", "demo_wide", "--dry-run", "--json"])
@@ -331,7 +335,7 @@ def test_command(lite, tmp_path, monkeypatch):
         monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
         result = run.invoke(cli, ["download", "--to", str(tmp_path / "mine")])
         assert result.exit_code == 0 and "bytes have come" in result.output
-        assert in_part(lite[0]).items() <= in_part(tmp_path / "mine").items()
+        assert contents(lite[0]).items() <= contents(tmp_path / "mine").items()
         result = run.invoke(cli, ["convert", server.url, str(tmp_path / "full"), "--to", "full"])
         assert result.exit_code == 0 and verify_release(tmp_path / "full", deep=True).ok
     monkeypatch.delenv("ICRL4AHT_REMOTE")
@@ -348,7 +352,7 @@ def test_command(lite, tmp_path, monkeypatch):
     ],
 )
 def test_bad_addresses(lite, url, error, message, monkeypatch):
-    monkeypatch.setattr("icrl4aht_data.remote.store.RetryPolicy", lambda: HASTY)
+    monkeypatch.setattr("icrl4aht_data.remote.store.RetryPolicy", lambda: QUICK)
     with http_server(lite[0]) as server, pytest.raises(error, match=message):
         load_icrl4aht(url.format(server=server.url))
 
@@ -368,3 +372,62 @@ def test_repositories_without_a_release(tmp_path):
         for name in ("org/empty", "org/absent", "org/empty@v9"):
             with pytest.raises(RootNotFoundError, match=r"no release there, expected MANIFEST\.sha256"):
                 load_icrl4aht(f"hf://datasets/{name}")
+
+
+@pytest.mark.parametrize("silent", [False, True], ids=["refuses connections", "accepts and never answers"])
+def test_an_unreachable_hub_is_reported_at_once(tmp_path, monkeypatch, silent):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_ETAG_TIMEOUT", 1)  # 10 s by default
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        if silent:
+            server.listen()
+        endpoint = f"http://127.0.0.1:{server.getsockname()[1]}"
+        began = time.monotonic()
+        with hub_settings(hub_environment(endpoint, tmp_path, "token")), pytest.raises(RemoteError) as caught:
+            load_icrl4aht("hf://datasets/org/name")
+    assert time.monotonic() - began < 10
+    assert "hf://datasets/org/name/MANIFEST.sha256: " in str(caught.value) and not caught.value.missing
+
+
+def test_a_hub_that_has_become_unreachable_serves_its_cache(lite, tmp_path):
+    with hub_server(tmp_path / "hub") as hub:
+        hub.add_repo("org/name", lite[0])
+        url = "hf://datasets/org/name"
+        fetch_planned(plan_download(url, layout="demo_wide"))
+        hub.close()
+        assert load_icrl4aht(url, layout="demo_wide")[0].actions[:].shape
+        with pytest.raises(RemoteError, match=r"/data/teammate/coord_simple/train-00000-of-00001\.h5.*: ConnectError"):
+            fetch_planned(plan_download(url, layout="coord_simple"))
+
+
+@pytest.mark.parametrize("to", [None, "mine"])
+def test_a_download_from_the_hub(lite, tmp_path, to):
+    with hub_server(tmp_path / "hub") as hub:
+        hub.add_repo("org/name", lite[0])
+        plan = plan_download("hf://datasets/org/name", to=to and tmp_path / to)
+        advanced: list[int] = []
+        traffic = fetch_planned(plan, advanced.append)
+        assert sum(advanced) == plan.size == traffic.bytes
+        assert traffic.requests == len(plan.absent)
+        assert contents(lite[0]).items() <= contents(plan.root.folder).items()
+        load_icrl4aht("hf://datasets/org/name", cache="stream")[0].actions[:]
+        sent = {(request.path.startswith("/cdn/"), request.headers["Authorization"]) for request in hub.log}
+        assert sent == {(False, f"Bearer {hub.token}"), (True, None)}, "the token must not leave the Hub"
+
+
+@pytest.mark.parametrize("to", [None, "mine"])
+def test_a_file_that_the_hub_serves_damaged_is_refused(lite, tmp_path, to):
+    url, folder = "hf://datasets/org/name", to and tmp_path / to
+    with hub_server(tmp_path / "hub") as hub:
+        hub.add_repo("org/name", lite[0])
+        hub.faults.next(Flip(100), path="/cdn/*.h5")  # has the right length: only the manifest's hash finds it
+        with pytest.raises(RemoteError, match=r"\.h5: expected sha256 \w+, found \w+: fetch it again"):
+            fetch_planned(plan_download(url, to=folder))
+        plan = plan_download(url, to=folder)
+        assert [Path(name).suffix for name in plan.absent] == [".h5"], "the other files are kept"
+        fetch_planned(plan)
+        shutil.rmtree(tmp_path / "hub" / "home")
+        hub.faults.next(Flip(50), path="*/MANIFEST.sha256")
+        with pytest.raises(RemoteError, match=r"MANIFEST\.sha256: arrived damaged"):
+            load_icrl4aht(url)
+        assert verify_release(url).ok

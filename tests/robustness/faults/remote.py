@@ -1,4 +1,4 @@
-"""Faults of remotes: what servers and the lines to them do wrong."""
+"""Faults of servers and connections."""
 
 from __future__ import annotations
 
@@ -8,20 +8,25 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from email.utils import formatdate
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import patch
 
+import numpy as np
+from huggingface_hub import constants, file_download
+from huggingface_hub.utils import _http
+from huggingface_hub.utils import logging as hub_logging
+
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.remote import store as transport
-from tests.robustness.faults.scene import Ordered, Scene, Target, Try, check, length
+from icrl4aht_data.remote import store
+from tests.robustness.faults.workspace import Attempt, FaultRule, Target, Workspace, body_length, check
 from tests.servers.common import (
     Cut,
     Etag,
+    Fault,
     Flip,
     IgnoreRange,
     Long,
@@ -38,42 +43,33 @@ from tests.servers.process import environment, forget_filesystems
 
 ALWAYS = 10**9
 ANY = ("GET", "HEAD")
-BUSY = (500, 502, 503, 504)
 
 
 @contextmanager
-def on_http(scene: Scene, folder: Path | None = None) -> Iterator[Target]:
-    with http_server(folder or scene.release) as server:
+def on_http(workspace: Workspace, folder: Path | None = None) -> Iterator[Target]:
+    """Serve a folder, by default the release, over HTTP."""
+    with http_server(folder or workspace.release) as server:
         yield Target(server.url, server.faults, server.log)
 
 
 @contextmanager
-def on_hub(scene: Scene) -> Iterator[Target]:
-    with hub_server(scene.new()) as hub, _hurried():
-        hub.add_repo("org/release", scene.release)
-        yield Target("hf://datasets/org/release", hub.faults, hub.log)
-
-
-@contextmanager
-def _hurried() -> Iterator[None]:
-    """The Hub's client has a patience of its own, 23 seconds a request."""
-    from huggingface_hub import file_download
-    from huggingface_hub.utils import _http
-    from huggingface_hub.utils import logging as hub_logging
-
-    said = hub_logging.get_verbosity()
+def on_hub(workspace: Workspace) -> Iterator[Target]:
+    """Serve the release as a dataset of the Hub, whose client waits 1/500 of its usual time between retries."""
+    verbosity = hub_logging.get_verbosity()
     hub_logging.set_verbosity(logging.CRITICAL)
     hurried = SimpleNamespace(**vars(time) | {"sleep": lambda seconds: time.sleep(seconds / 500)})
-    with patch.object(_http, "time", hurried), patch.object(file_download, "time", hurried):
-        yield
-    hub_logging.set_verbosity(said)
+    with hub_server(workspace.new_path()) as hub:
+        hub.add_repo("org/release", workspace.release)
+        with patch.object(_http, "time", hurried), patch.object(file_download, "time", hurried):
+            yield Target("hf://datasets/org/release", hub.faults, hub.log)
+    hub_logging.set_verbosity(verbosity)
 
 
 @contextmanager
-def on_s3(scene: Scene) -> Iterator[Target]:
-    """A bucket behind a server that may do wrong: moto's own cannot."""
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # moto tells of every request
-    with s3_server(scene.release, "bucket") as bucket:
+def on_s3(workspace: Workspace) -> Iterator[Target]:
+    """Serve the release from a bucket, through a server that can inject faults, which moto's own cannot."""
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # moto logs every request
+    with s3_server(workspace.release, "bucket") as bucket:
         server = Server(partial(_forward, bucket.endpoint))
         try:
             with environment({"AWS_ENDPOINT_URL": server.url, "AWS_ENDPOINT_URL_S3": server.url}):
@@ -84,187 +80,194 @@ def on_s3(scene: Scene) -> Iterator[Target]:
 
 
 def _forward(endpoint: str, request: Request, body: bytes) -> Answer:
-    """The whole object, of which the server gives the range."""
+    """Return the complete object, from which the server cuts the range."""
     headers = {name: value for name, value in request.headers.items() if name not in ("Range", "Host")}
-    asked = urllib.request.Request(endpoint + request.target, headers=headers)  # a GET for a HEAD, too
+    forwarded = urllib.request.Request(endpoint + request.target, headers=headers)  # a GET for a HEAD, too
     try:
-        with urllib.request.urlopen(asked) as answer:
+        with urllib.request.urlopen(forwarded) as answer:
             kept = {name: answer.headers[name] for name in ("Last-Modified", "Content-Type") if answer.headers[name]}
             return Answer(answer.read(), headers=kept, etag=answer.headers["ETag"])
     except urllib.error.HTTPError as error:
         return Answer(error.read(), error.code)
 
 
-Place = Callable[[Scene], Any]
+Family = Callable[[Workspace, int], Iterator[Attempt]]
+"""Yields n attempts."""
+Serve = Callable[[Workspace], AbstractContextManager[Target]]
+AnyFault = Fault | Callable[[Request], Fault | None]
 
 
-def cuts(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
-    """A connection that is cut at a random byte, once or from then on; in downloads and in streams."""
-
-    def order(share: float) -> Callable[[Request], Cut]:
-        return lambda request: Cut(int(share * length(request)))
-
-    yield from _anywhere(scene, n, place, lambda: order(scene.rng.random()))
+def cut(rng: np.random.Generator) -> AnyFault:
+    """A connection that is closed at a random byte of the body."""
+    share = rng.random()
+    return lambda request: Cut(int(share * body_length(request)))
 
 
-def busy(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
-    """Errors 5xx of any request: bursts shorter than our patience, or without end."""
-    yield from _anywhere(scene, n, place, lambda: Status(int(scene.rng.choice(BUSY))), longest=3, methods=ANY)
+def busy(rng: np.random.Generator) -> AnyFault:
+    """One of the errors 5xx."""
+    return Status(int(rng.choice((500, 502, 503, 504))))
 
 
-def flips(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
-    """Bodies of the right length in which one bit is another."""
-    yield from _anywhere(scene, n, place, lambda: Flip(int(scene.rng.integers(10**6)), 1 << int(scene.rng.integers(8))))
+def flip(rng: np.random.Generator) -> Flip:
+    """A body of the right length with one inverted bit."""
+    return Flip(int(rng.integers(10**6)), 1 << int(rng.integers(8)))
 
 
-def manifests(scene: Scene, n: int, place: Place = on_http) -> Iterator[Try]:
-    """The same of the manifest, for which no hash vouches."""
-
-    def attempt(target: Target, rule: Ordered, stream: bool, cached: bool) -> None:
-        _forget(cached)
-        scene.meet(target, rule, passing=False, stream=stream, hub=cached)
-
-    with place(scene) as target:
-        for number in range(n):
-            flip = Flip(int(scene.rng.integers(10**6)), 1 << int(scene.rng.integers(8)))
-            rule = Ordered(flip, path="*MANIFEST.sha256")
-            cached = target.url.startswith("hf://") and number % 2 > 0
-            yield partial(attempt, target, rule, number % 4 > 1, cached)
+def wrong_length(rng: np.random.Generator) -> AnyFault:
+    """A body, or its announced length, that is a little or much too short or too long."""
+    by = int(rng.choice([1, 7, 1000, 10**6]))
+    return Short(by) if rng.random() < 0.5 else Long(by)
 
 
-def lengths(scene: Scene, n: int) -> Iterator[Try]:
-    """Bodies, or what is said of their length, that are a little or much too short or too long."""
-
-    def order() -> Short | Long:
-        by = int(scene.rng.choice([1, 7, 1000, 10**6]))
-        return Short(by) if scene.rng.random() < 0.5 else Long(by)
-
-    yield from _anywhere(scene, n, on_http, order, methods=ANY)
-
-
-def no_ranges(scene: Scene, n: int) -> Iterator[Try]:
-    """A server that gives the whole file whatever is asked for, once or always."""
-    with on_http(scene) as target:
-        for number in range(n):
-            stream = number % 4 > 1
-            rule = Ordered(IgnoreRange(), _some(scene, target, stream), ALWAYS if number % 2 else 1)
-            yield partial(scene.meet, target, rule, passing=True, stream=stream)
-
-
-def _some(scene: Scene, target: Target, stream: bool) -> int:
-    """The number of one of the requests for a body."""
-    return int(scene.rng.integers(scene.requests(target, ("GET",), stream)))
-
-
-def _anywhere(
-    scene: Scene,
-    n: int,
-    place: Place,
-    order: Callable[[], Any],
+def anywhere(
+    make: Callable[[np.random.Generator], AnyFault],
+    serve: Serve = on_http,
     longest: int = 1,
     methods: tuple[str, ...] = ("GET",),
-) -> Iterator[Try]:
-    """A fault from a random request on: for at most `longest` requests, or for all that follow."""
-    with place(scene) as target:
-        hub = target.url.startswith("hf://")
-        kinds = [(False, False), (True, False), (False, True)] if hub else [(False, False), (True, False)]
-        requests = {kind: scene.requests(target, methods, *kind) for kind in kinds if _forget(hub)}
-        for number in range(n):
-            stream, cached = kinds[number % len(kinds)]
-            passing = number // len(kinds) % 2 == 0
-            times = int(scene.rng.integers(1, longest + 1)) if passing else ALWAYS
-            rule = Ordered(order(), int(scene.rng.integers(requests[stream, cached])), times, methods=methods)
-            yield partial(_attempt, scene, target, rule, passing, stream, cached)
+    hub_retries: bool = True,
+) -> Family:
+    """Return the family of a fault from a random request on: for at most `longest` requests, or for all that follow.
+
+    Args:
+        make: makes a fault from random numbers.
+        serve: the server.
+        longest: most requests that meet a fault that passes.
+        methods: HTTP methods that meet the fault.
+        hub_retries: whether a download from the Hub succeeds in spite of a fault that passes.
+    """
+
+    def family(workspace: Workspace, n: int) -> Iterator[Attempt]:
+        with serve(workspace) as target:
+            # download, stream, and on the Hub a download into the Hub's own cache
+            uses = [(False, False), (True, False), (False, True)][: 3 if target.is_hub else 2]
+            _empty_hub_cache(target.is_hub)
+            requests = {use: workspace.count_requests(target, methods, *use) for use in uses}
+            for number in range(n):
+                use, succeeds = uses[number % len(uses)], number // len(uses) % 2 == 0
+                times = int(workspace.rng.integers(1, longest + 1)) if succeeds else ALWAYS
+                first = int(workspace.rng.integers(requests[use]))
+                path = "/[!a]*" if target.is_hub and methods == ("GET",) else "*"  # no hash protects answers of /api
+                rule = FaultRule(make(workspace.rng), first, times, path, methods)
+                yield partial(attempt, workspace, target, rule, succeeds and (hub_retries or not target.is_hub), *use)
+
+    def attempt(
+        workspace: Workspace, target: Target, rule: FaultRule, succeeds: bool, stream: bool, default_folder: bool
+    ) -> None:
+        while not rule.hit:  # the Hub's client caches some answers, so that there may be fewer requests than counted
+            _empty_hub_cache(target.is_hub)
+            rule.seen = 0
+            workspace.use_with_fault(target, rule, succeeds=succeeds, stream=stream, default_folder=default_folder)
+            rule.first //= 2
+
+    return family
 
 
-def _attempt(scene: Scene, target: Target, rule: Ordered, passing: bool, stream: bool, cached: bool) -> None:
-    while not rule.hit:  # the Hub's client remembers some answers: there may be fewer requests than there were
-        _forget(target.url.startswith("hf://"))
-        rule.seen = 0
-        scene.meet(target, rule, passing=passing, stream=stream, hub=cached)
-        rule.first //= 2
-
-
-def _forget(hub: bool) -> bool:
-    """Empty the Hub's own cache."""
+def _empty_hub_cache(hub: bool = True) -> None:
     if hub:
-        from huggingface_hub import constants
-
         shutil.rmtree(constants.HF_HUB_CACHE, ignore_errors=True)
-    return True
 
 
-def too_many(scene: Scene, n: int) -> Iterator[Try]:
-    """429 with Retry-After, seconds or a date: the same request comes again, but not before."""
+def flipped_manifest(serve: Serve = on_http) -> Family:
+    """Return the family of manifests with one inverted bit, which no hash protects."""
 
-    def attempt(target: Target, first: int, stream: bool, by_date: bool) -> None:
+    def family(workspace: Workspace, n: int) -> Iterator[Attempt]:
+        with serve(workspace) as target:
+            for number in range(n):
+                rule = FaultRule(flip(workspace.rng), path="*MANIFEST.sha256")
+                yield partial(attempt, workspace, target, rule, number % 4 > 1, target.is_hub and number % 2 > 0)
+
+    def attempt(workspace: Workspace, target: Target, rule: FaultRule, stream: bool, default_folder: bool) -> None:
+        _empty_hub_cache(default_folder)
+        workspace.use_with_fault(target, rule, succeeds=False, stream=stream, default_folder=default_folder)
+
+    return family
+
+
+def varied(*faults: tuple[AnyFault, float, bool], timeout: float = store._TIMEOUT) -> Family:
+    """Return the family of given faults, each from a random request on, in downloads and in streams.
+
+    Args:
+        faults: fault, number of requests that meet it, whether the first attempt has to succeed.
+        timeout: seconds that the client waits for an answer.
+    """
+
+    def family(workspace: Workspace, n: int) -> Iterator[Attempt]:
+        with on_http(workspace) as target:
+            for number in range(n):
+                fault, times, succeeds = faults[number // 2 % len(faults)]
+                stream = number % 2 > 0
+                rule = FaultRule(fault, _random_request(workspace, target, stream), times)
+                yield partial(attempt, workspace, target, rule, succeeds, stream)
+
+    def attempt(workspace: Workspace, target: Target, rule: FaultRule, succeeds: bool, stream: bool) -> None:
+        with patch.object(store, "_TIMEOUT", timeout):
+            workspace.use_with_fault(target, rule, succeeds=succeeds, stream=stream)
+
+    return family
+
+
+def _random_request(workspace: Workspace, target: Target, stream: bool) -> int:
+    """Return the number of one of the requests for a body."""
+    return int(workspace.rng.integers(workspace.count_requests(target, stream=stream)))
+
+
+slow = varied(
+    (Slow(0.2), 3, True),
+    (Slow(0, 20_000), 3, True),
+    (Slow(3), 3, True),  # longer than the timeout
+    (Slow(3), ALWAYS, False),
+    timeout=0.4,
+)
+ignored_ranges = varied((IgnoreRange(), 1, True), (IgnoreRange(), ALWAYS, True))
+changed_etags = varied((lambda request: Etag(f"{request.began}"), ALWAYS, True))
+
+
+def too_many_requests(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """429 with Retry-After as seconds or date: the request is repeated, but not earlier."""
+
+    def attempt(target: Target, first: int, stream: bool, as_date: bool) -> None:
         def refuse(request: Request) -> Status:
-            asked = formatdate(time.time() + 2, usegmt=True) if by_date else "1"  # whole seconds, cut
-            return Status(429, {"Retry-After": asked})
+            # a date has full seconds, so that two seconds ahead is more than one
+            return Status(429, {"Retry-After": formatdate(time.time() + 2, usegmt=True) if as_date else "1"})
 
-        rule = Ordered(refuse, first)
+        rule = FaultRule(refuse, first)
         began = len(target.log)
-        scene.meet(target, rule, passing=True, stream=stream)
+        workspace.use_with_fault(target, rule, succeeds=True, stream=stream)
         refused = rule.hit[0]
         key = refused.method, refused.path, refused.headers.get("Range")
         same = [r for r in target.log[began:] if (r.method, r.path, r.headers.get("Range")) == key]
         waited = same[same.index(refused) + 1].began - refused.began
-        check(waited >= 0.9, f"asked again after {waited:.2f} s, not after 1 s")
+        check(waited >= 0.9, f"repeated after {waited:.2f} s, not after 1 s")
 
-    with on_http(scene) as target:
+    with on_http(workspace) as target:
         for number in range(n):
             stream = number % 2 > 0
-            yield partial(attempt, target, _some(scene, target, stream), stream, number % 3 > 1)
+            yield partial(attempt, target, _random_request(workspace, target, stream), stream, number % 3 > 1)
 
 
-def slow(scene: Scene, n: int) -> Iterator[Try]:
-    """Answers that come late, or a few bytes at a time, or not at all for longer than we wait."""
-
-    def attempt(target: Target, rule: Ordered, passing: bool, stream: bool) -> None:
-        with patch.object(transport, "_TIMEOUT", 0.4):
-            scene.meet(target, rule, passing=passing, stream=stream)
-
-    with on_http(scene) as target:
-        for number in range(n):
-            kind = number % 4
-            fault = [Slow(0.2), Slow(0, 20_000), Slow(3), Slow(3)][kind]
-            stream = bool(scene.rng.random() < 0.5)
-            rule = Ordered(fault, _some(scene, target, stream), ALWAYS if kind == 3 else 3)
-            yield partial(attempt, target, rule, kind < 3, stream)
-
-
-def etags(scene: Scene, n: int) -> Iterator[Try]:
-    """Files whose ETag changes between two requests, their content does not."""
-    with on_http(scene) as target:
-        for number in range(n):
-            stream = number % 2 > 0
-            rule = Ordered(lambda request: Etag(f"{len(target.log)}"), _some(scene, target, stream), ALWAYS)
-            yield partial(scene.meet, target, rule, passing=True, stream=stream)
-
-
-def versions(scene: Scene, n: int) -> Iterator[Try]:
-    """Another version of the release takes the place of the one that is being read, for a while."""
+def replaced_release(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Another release replaces the one that is being read, for a while."""
 
     def attempt(first: int, stream: bool) -> None:
-        served = scene.new()
-        shutil.copytree(scene.release, served)
+        served = workspace.new_path()
+        shutil.copytree(workspace.release, served)
 
         def replace(request: Request) -> None:
-            shutil.copytree(scene.other, served, dirs_exist_ok=True)
+            shutil.copytree(workspace.other, served, dirs_exist_ok=True)
 
-        use = scene.stream if stream else scene.download
-        with on_http(scene, served) as target, scene.met() as to:
-            target.faults.add(Ordered(replace, first))
+        use = workspace.stream if stream else workspace.download
+        with on_http(workspace, served) as target, workspace.fresh_folders() as to:
+            target.faults.add(FaultRule(replace, first))
             try:
                 use(target.url, to)
             except Icrl4ahtError as error:
-                scene.check_error(error)
-                scene.check_arrived(to)
+                workspace.check_error(error)
+                workspace.check_files(to)
             target.faults.clear()
-            shutil.copytree(scene.release, served, dirs_exist_ok=True)
+            shutil.copytree(workspace.release, served, dirs_exist_ok=True)
             use(target.url, to)
 
-    with on_http(scene) as target:
-        places = [max(1, _some(scene, target, number % 2 > 0)) for number in range(n)]
-    for number, first in enumerate(places):
+    with on_http(workspace) as target:
+        firsts = [max(1, _random_request(workspace, target, number % 2 > 0)) for number in range(n)]
+    for number, first in enumerate(firsts):
         yield partial(attempt, first, number % 2 > 0)

@@ -1,4 +1,4 @@
-"""What the families of faults share: releases, what is right of them, and how a faulty remote is met."""
+"""Releases to inject faults into, and the checks that every family of faults shares."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from icrl4aht_data.dataset import Dataset, open_dataset
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.schema import MANIFEST, held_fields
 from icrl4aht_data.reading.selection import ReadOptions
-from icrl4aht_data.remote import partial_file as blocks
+from icrl4aht_data.remote import partial_file
 from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
 from icrl4aht_data.remote.store import RetryPolicy
@@ -29,26 +29,35 @@ from tests.servers.common import Fault, Faults, Flip, Long, Request, Short
 from tests.servers.process import environment
 
 PIECE = 2**14
-"""Bytes asked for at once, so that the files of a small release come in many parts."""
+"""Bytes of one range request, small enough that the files of a small release take many."""
 
-PATIENCE = RetryPolicy(attempts=4, first=0.01, longest=5)
+RETRIES = RetryPolicy(attempts=4, first_wait=0.01, longest_wait=5)
 
-Try = Callable[[], str | None]
-"""Meets one fault. Raises if something is lost; may say what was odd, which is counted."""
+Attempt = Callable[[], str | None]
+"""Injects one fault. Raises LostError if data or progress is lost; may return a remark, which is counted."""
 
 
 class LostError(Exception):
-    """What was lost."""
+    """A fault led to wrong data, to an error without a file's name, or to repeated work."""
 
 
-def check(right: object, otherwise: str) -> None:
-    if not right:
-        raise LostError(otherwise)
+def check(condition: object, message: str) -> None:
+    """Raise LostError unless a condition holds."""
+    if not condition:
+        raise LostError(message)
 
 
 @dataclass
-class Ordered:
-    """A rule of a server: a fault for the matching requests number `first` to `first + times`, and which they were."""
+class FaultRule:
+    """Rule of a server: a fault for the matching requests number `first` to `first + times`.
+
+    Attributes:
+        fault: the fault, or a function of the request.
+        path: pattern of the request's path.
+        methods: HTTP methods that match.
+        seen: matching requests so far.
+        hit: the requests that met the fault.
+    """
 
     fault: Fault | Callable[[Request], Fault | None]
     first: int = 0
@@ -68,27 +77,31 @@ class Ordered:
         return self.fault(request) if callable(self.fault) else self.fault
 
     @property
-    def misled(self) -> bool:
-        """Whether it changed what no hash vouches for: the manifest, or how long a file is said to be."""
+    def changed_unhashed(self) -> bool:
+        """Whether the fault changed what no hash protects: the manifest, or the announced length of a file."""
         manifest = isinstance(self.fault, Flip) and self.hit[0].path.endswith(MANIFEST)
         return manifest or (isinstance(self.fault, Short | Long) and self.hit[0].method == "HEAD")
 
 
 @dataclass(frozen=True)
 class Target:
-    """A release on a server."""
+    """A release on a server: URL, rules of the server, log of the requests."""
 
     url: str
     faults: Faults
     log: list[Request]
 
+    @property
+    def is_hub(self) -> bool:
+        return self.url.startswith("hf://")
 
-class Scene:
-    """Releases of random play, folders for what happens to them, and random numbers.
+
+class Workspace:
+    """Releases of random play, empty folders, and random numbers.
 
     Args:
-        folder: an empty one.
-        seed: of the random numbers.
+        folder: an empty folder.
+        seed: seed of the random numbers.
     """
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
@@ -97,114 +110,126 @@ class Scene:
 
     @cached_property
     def release(self) -> Path:
-        """Of some hundred kilobytes: shards of many pieces."""
+        """A release of some hundred kilobytes, its shards of many pieces."""
         random_release(self.folder / "release", "full", teammates=1, streams=3, episodes=80, length=25)
         return self.folder / "release"
 
     @cached_property
     def other(self) -> Path:
-        """Another version of it."""
+        """A release with the files of `release` and other content."""
         random_release(self.folder / "other", "full", teammates=1, streams=3, episodes=80, length=25, seed=1)
         return self.folder / "other"
 
     @cached_property
     def small(self) -> Path:
-        """That is verified in a moment."""
+        """A release that is verified within milliseconds."""
         random_release(self.folder / "small", teammates=2, streams=1, episodes=6, length=15)
         return self.folder / "small"
 
     @cached_property
     def content(self) -> dict[str, bytes]:
-        """Of `release`."""
+        """Content of each file of `release`."""
         return contents(self.release)
 
     @cached_property
     def batches(self) -> bytes:
-        """Of `release`."""
-        return batches(load_icrl4aht(self.release, obs="uint8", cache="ram"))
+        """Hash of batches of `release`."""
+        return hash_batches(load_icrl4aht(self.release, obs="uint8", cache="ram"))
 
-    def new(self) -> Path:
-        """A path where nothing is."""
+    def new_path(self) -> Path:
+        """Return a path where nothing exists."""
         return self.folder / f"try-{next(self._numbers)}"
 
     def download(self, url: str, to: Path | None) -> None:
-        """All of it, whole."""
-        plan = plan_download(url, to=to, patience=PATIENCE)
+        """Download a complete release and check it."""
+        plan = plan_download(url, to=to, retry=RETRIES)
         fetch_planned(plan)
-        self.check_arrived(plan.root.folder, everything=True)
+        self.check_files(plan.root.folder, complete=True)
+
+    def open_stream(self, url: str) -> Dataset:
+        """Open a remote release for streaming through the default cache folder."""
+        return open_dataset(open_root(url, None, RETRIES), ReadOptions("uint8", "stream", 1))
 
     def stream(self, url: str, to: Path | None) -> None:
-        """A few batches, the right ones; what comes goes to the default folder."""
-        dataset = open_dataset(open_root(url, None, PATIENCE), ReadOptions("uint8", "stream", 1))
-        check(batches(dataset) == self.batches, "other batches than those of the release")
+        """Stream a few batches and check them."""
+        self.check_batches(self.open_stream(url))
 
-    def check_arrived(self, folder: Path, everything: bool = False) -> None:
-        """Whether a folder has files of the release alone, each as it should be."""
+    def check_batches(self, dataset: Dataset) -> None:
+        """Check that batches are those of `release`."""
+        check(hash_batches(dataset) == self.batches, "other batches than those of the release")
+
+    def check_files(self, folder: Path, complete: bool = False) -> None:
+        """Check that a folder has no files but those of the release, each with the right content."""
         found = contents(folder) if folder.exists() else {}
         found = {name: data for name, data in found.items() if name != ORIGIN and not name.endswith(".partial")}
-        wrong = [name for name in found if found[name] != self.content.get(name)]
-        # which manifest is right cannot be known, see `remote`
-        check(everything or MANIFEST not in wrong or wrong == [MANIFEST], f"files that are not the release's: {wrong}")
-        wrong = [name for name in wrong if everything or name != MANIFEST]
-        check(not wrong, f"files that are not the release's: {wrong}")
-        check(not everything or found.keys() == self.content.keys(), "files are missing")
+        wrong = {name for name in found if found[name] != self.content.get(name)}
+        # no hash protects the manifest; only with a wrong one may a partial download have a wrong file, the manifest
+        check(not wrong or (wrong == {MANIFEST} and not complete), f"files that are not the release's: {wrong}")
+        check(not complete or found.keys() == self.content.keys(), "files are missing")
 
     @contextmanager
-    def met(self) -> Iterator[Path]:
-        """A folder for what comes, with our own folders beside it."""
-        to = self.new()
+    def fresh_folders(self) -> Iterator[Path]:
+        """Redirect cache and data folders to empty ones; yields a path for a download."""
+        to = self.new_path()
         folders = {"ICRL4AHT_DATA_DIR": str(to / "data"), "ICRL4AHT_CACHE_DIR": str(to / "cache")}
-        with environment(folders), patch.object(blocks, "_PIECE", PIECE):
+        with environment(folders), patch.object(partial_file, "_REQUEST_BYTES", PIECE):
             yield to / "release"
 
-    def meet(self, target: Target, rule: Ordered, *, passing: bool, stream: bool = False, hub: bool = False) -> None:
-        """Download or stream while a rule does something wrong; if that fails, again without it.
+    def use_with_fault(
+        self, target: Target, rule: FaultRule, *, succeeds: bool, stream: bool = False, default_folder: bool = False
+    ) -> None:
+        """Download or stream under a fault; after an error again without it, which may fetch nothing twice.
 
         Args:
-            passing: whether the first attempt has to succeed.
-            hub: download into the Hub's own cache.
+            target: the release.
+            rule: when the fault happens.
+            succeeds: whether the first attempt has to succeed.
+            stream: stream batches instead of downloading.
+            default_folder: download into the default folder, on the Hub its own cache.
         """
         use = self.stream if stream else self.download
-        with self.met() as to:
-            to = None if hub else to
+        with self.fresh_folders() as folder:
+            to = None if default_folder else folder
             target.faults.clear()
             target.faults.add(rule)
             began = len(target.log)
             try:
                 use(target.url, to)
             except Icrl4ahtError as error:
-                check(not passing or rule.misled, f"given up: {error}")
-                self.check_error(error, target.url if rule.misled else "")
+                check(not succeeds or rule.changed_unhashed, f"given up: {error}")
+                self.check_error(error, target.url if rule.changed_unhashed else "")
                 if to is not None:
-                    self.check_arrived(to)
+                    self.check_files(to)
                 target.faults.clear()
                 arrived, again = received(target.log[began:], rule.hit), len(target.log)
                 use(target.url, to)
                 twice = arrived & received(target.log[again:])
-                check(not twice or rule.misled, f"fetched again: {sorted(twice)[:3]}")
+                check(not twice or rule.changed_unhashed, f"fetched again: {sorted(twice)[:3]}")
             finally:
                 target.faults.clear()
 
     def check_error(self, error: Exception, url: str = "") -> None:
-        """Whether it names a file, be it one of a wrong manifest at `url`."""
+        """Check that an error names a file of the release, or `url`."""
         named = any(name in str(error) for name in [*self.content, ORIGIN]) or (url and url in str(error))
         check(named, f"no file is named: {error}")
 
-    def requests(self, target: Target, methods: tuple[str, ...], stream: bool = False, hub: bool = False) -> int:
-        """How many there are where nothing goes wrong."""
-        rule = Ordered(lambda request: None, times=np.inf, methods=methods)
-        self.meet(target, rule, passing=True, stream=stream, hub=hub)
+    def count_requests(
+        self, target: Target, methods: tuple[str, ...] = ("GET",), stream: bool = False, default_folder: bool = False
+    ) -> int:
+        """Return the number of requests without a fault."""
+        rule = FaultRule(lambda request: None, times=np.inf, methods=methods)
+        self.use_with_fault(target, rule, succeeds=True, stream=stream, default_folder=default_folder)
         return rule.seen
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file."""
+    """Return the content of each file below a folder, by relative path."""
     paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
 def received(log: Iterable[Request], spoiled: Iterable[Request] = ()) -> set[tuple[str, int, int]]:
-    """The byte ranges of files that a client got whole."""
+    """Return the byte ranges (path, start, stop) that a client received completely, without the spoiled ones."""
     bad = set(map(id, spoiled))
     return {
         (request.path, request.start, request.stop)
@@ -214,31 +239,30 @@ def received(log: Iterable[Request], spoiled: Iterable[Request] = ()) -> set[tup
     }
 
 
-def length(request: Request) -> int:
-    """Of the body that is asked for, about."""
+def body_length(request: Request) -> int:
+    """Return the number of bytes that a request's range has; 1000 without a range."""
     found = re.fullmatch(r"bytes=(\d+)-(\d+)", request.headers.get("Range", ""))
     return int(found[2]) - int(found[1]) + 1 if found else 1000
 
 
-def batches(dataset: Dataset) -> bytes:
-    """A hash of batches of both kinds, of part of the episodes and of all."""
+def hash_batches(dataset: Dataset) -> bytes:
+    """Return a hash of batches of both kinds, from all episodes and from some."""
     samplers = []
     for part in (dataset.filter(layout=layout.name) for layout in dataset.layouts):
         samplers.append(part.ad(batch_size=8, length=20, teammate_actions=True))
         samplers.append(part.ad(batch_size=4, length=7, seed=1, episodes=(1, 4)))
         samplers.append(part.dpt(batch_size=4, context=20))
-    arrays = (array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None)
-    return _hash(arrays)
+    return _hash(array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None)
 
 
-def arrays(dataset: Dataset) -> bytes:
-    """A hash of every stored array and of observations."""
+def hash_arrays(dataset: Dataset) -> bytes:
+    """Return a hash of every stored array and of the observations."""
     names = [stored.name for stored in held_fields(dataset.info.kind)]
     return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names)] for h in dataset))
 
 
-def _hash(some: Iterable[np.ndarray]) -> bytes:
+def _hash(arrays: Iterable[np.ndarray]) -> bytes:
     digest = hashlib.blake2b()
-    for array in some:
+    for array in arrays:
         digest.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())
     return digest.digest()

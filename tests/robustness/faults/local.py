@@ -1,0 +1,389 @@
+"""Faults of the local machine: full disks, killed processes, concurrent processes, damaged files."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.format import columns
+from icrl4aht_data.format.chunks import chunk_table_name, read_table
+from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.remote.download import fetch_planned, plan_download
+from icrl4aht_data.remote.partial_file import PartialFile
+from icrl4aht_data.remote.store import Store
+from tests.helpers.paths import ROOT
+from tests.robustness.faults.remote import ALWAYS, ANY, on_http
+from tests.robustness.faults.workspace import (
+    PIECE,
+    RETRIES,
+    Attempt,
+    FaultRule,
+    Target,
+    Workspace,
+    check,
+    hash_arrays,
+    hash_batches,
+    received,
+)
+from tests.robustness.limits import PAGE, can_mount, file_size_limit, memory_limit, small_disk, time_limit
+from tests.servers.common import Request, Slow
+from tests.servers.process import environment
+
+
+def full_disk(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """A download fills the disk, or its files reach a limit of size; it is resumed when there is room."""
+
+    def attempt(target: Target, share: float, mounted: bool) -> None:
+        sizes = [len(data) for data in workspace.content.values()]
+        size = int(share * (sum(sizes) if mounted else max(sizes))) // PAGE * PAGE + PAGE
+        began = len(target.log)
+        with workspace.fresh_folders() as to, _limited(to.parent, size, mounted) as enlarge:
+            try:
+                workspace.download(target.url, to)
+            except (Icrl4ahtError, OSError) as error:
+                workspace.check_error(error)
+                check(isinstance(error, Icrl4ahtError) or error.errno in (errno.ENOSPC, errno.EFBIG), repr(error))
+                workspace.check_files(to)
+                enlarge()
+                _resume(workspace, target, to)
+            check(len(target.log) > began, "no request was sent")
+
+    with on_http(workspace) as target:
+        for number in range(n):
+            yield partial(attempt, target, workspace.rng.random(), number % 2 > 0 and can_mount())
+
+
+def _limited(folder: Path, size: int, mounted: bool) -> AbstractContextManager[Callable[[], None]]:
+    """Limit the bytes of a folder if disks can be mounted, else of each file."""
+    return small_disk(folder, size) if mounted else file_size_limit(size)
+
+
+def _resume(workspace: Workspace, target: Target, to: Path) -> None:
+    """Download again, and check that nothing is fetched that the folder has."""
+    kept, again = _kept_ranges(workspace, to), len(target.log)
+    workspace.download(target.url, to)
+    for path, start, stop in received(target.log[again:]):
+        twice = [part for part in kept.get(path, []) if start <= part[0] and part[1] <= stop]
+        check(not twice, f"fetched again: {path}, {twice[:3]}")
+
+
+def _kept_ranges(workspace: Workspace, to: Path) -> dict[str, list[tuple[int, int]]]:
+    """Return the byte ranges (start, stop) of each file that a complete or interrupted download has."""
+    found = {f"/{name}": [(0, len(data))] for name, data in workspace.content.items() if (to / name).exists()}
+    for name in (name for name in workspace.content if name.startswith("data/") and f"/{name}" not in found):
+        table = np.array(read_table(workspace.release / chunk_table_name(name)))
+        part = PartialFile(Store("file://"), name, to.with_name(f"{to.name}.partial") / name)
+        missing = set(part.missing_chunks(table)["offset"].tolist())
+        chunks = table[["offset", "size"]].tolist()
+        found[f"/{name}"] = [(start, start + size) for start, size in chunks if start not in missing]
+    return found
+
+
+def full_cache(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """A stream has no room for its cache: it keeps chunks in memory and fetches none twice."""
+
+    def attempt(target: Target, size: int, mounted: bool) -> None:
+        with workspace.fresh_folders() as to:
+            dataset = workspace.open_stream(target.url)
+            for history in dataset:
+                history.read("dones", 0, 1)  # fetches the chunk table
+            began = len(target.log)
+            with _limited(to.parent, 64 * 2**20 if mounted else size, mounted):
+                if mounted:
+                    _fill(to.parent / "filler")
+                workspace.check_batches(dataset)
+            _check_fetched_once(target.log[began:])
+
+    with on_http(workspace) as target:
+        for number in range(n):
+            yield partial(attempt, target, int(workspace.rng.integers(PIECE)), number % 2 > 0 and can_mount())
+
+
+def _fill(path: Path) -> None:
+    try:
+        with path.open("wb", buffering=0) as stream:
+            while True:
+                stream.write(bytes(PAGE))
+    except OSError:
+        return
+
+
+def _check_fetched_once(log: list[Request]) -> None:
+    counts = Counter((r.path, r.start) for r in log if r.method == "GET" and not r.path.endswith(MANIFEST))
+    check(max(counts.values()) == 1, f"fetched again: {counts.most_common(1)}")
+
+
+_DOWNLOAD = """
+import sys
+from pathlib import Path
+from icrl4aht_data.remote import partial_file
+from icrl4aht_data.remote.download import fetch_planned, plan_download
+
+partial_file._REQUEST_BYTES = int(sys.argv[3])
+fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2])))
+"""
+
+_OPEN = """
+import sys
+from icrl4aht_data.remote.remote_release import open_root
+
+print(flush=True)
+sys.stdin.readline()
+for _ in range(20):
+    open_root(sys.argv[1])
+"""
+
+_BUILD = """
+import itertools, os, sys
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.format import columns
+from icrl4aht_data.utils import cache
+
+columns._UNCACHED = cache._SMALL = 0
+for number in itertools.count():
+    os.environ["ICRL4AHT_CACHE_DIR"] = f"{sys.argv[2]}/{number}"
+    print(number, flush=True)
+    load_icrl4aht(sys.argv[1], cache="mmap").storage
+"""
+
+
+def _start(code: str, *arguments: object, wait: bool = False) -> subprocess.Popen[str]:
+    """Start a Python process that runs `code`, and wait for its first line if told to."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=ROOT)
+    if wait and process.stdout is not None:
+        process.stdout.readline()
+    return process
+
+
+def _check_success(processes: list[subprocess.Popen[str]], text: str | None = None) -> None:
+    errors = [process.communicate(text)[1] for process in processes]
+    check([process.returncode for process in processes] == [0] * len(processes), "\n".join(errors))
+
+
+def killed_downloads(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """kill -9 of a download at a random moment; the next download resumes it."""
+
+    def attempt(target: Target, requests: int, moment: float) -> None:
+        target.faults.clear()
+        target.faults.add(FaultRule(Slow(0.02), times=ALWAYS))
+        began = len(target.log)
+        with workspace.fresh_folders() as to:
+            process = _start(_DOWNLOAD, target.url, to, PIECE)
+            while len(target.log) - began < requests and process.poll() is None:
+                time.sleep(0.001)
+            time.sleep(moment)
+            process.kill()
+            _, errors = process.communicate()
+            check(process.returncode in (0, -signal.SIGKILL), errors)
+            target.faults.clear()
+            workspace.check_files(to)
+            _resume(workspace, target, to)
+
+    with on_http(workspace) as target:
+        most = workspace.count_requests(target, ANY)
+        for _ in range(n):
+            yield partial(attempt, target, int(workspace.rng.integers(1, most)), 0.03 * workspace.rng.random())
+
+
+def killed_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """kill -9 of a process that builds the caches of index and arrays; another process uses what it left."""
+
+    def attempt(moment: float) -> None:
+        caches = workspace.new_path()
+        process = _start(_BUILD, workspace.release, caches, wait=True)
+        time.sleep(moment)
+        process.kill()
+        numbers, errors = process.communicate()
+        check(process.returncode == -signal.SIGKILL, errors)
+        last = caches / (numbers.split() or ["0"])[-1]
+        with environment({"ICRL4AHT_CACHE_DIR": str(last)}), patch.object(columns, "_UNCACHED", 0):
+            for _ in range(2):  # the first builds what is missing, the second finds it
+                workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
+        left = [path.name for path in last.iterdir() if path.name.startswith(".") and path.suffix == ".partial"]
+        check(not left, f"left behind: {left}")
+
+    for _ in range(n):
+        yield partial(attempt, 0.5 * workspace.rng.random())
+
+
+def two_readers(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Two processes open the same release at the same time, 20 times."""
+
+    def attempt(target: Target) -> None:
+        with workspace.fresh_folders():
+            _check_success([_start(_OPEN, target.url, wait=True) for _ in range(2)], "\n")
+
+    with on_http(workspace) as target:
+        for _ in range(n):
+            yield partial(attempt, target)
+
+
+def two_downloads(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Two processes download the same release into the same folder at the same time."""
+
+    def attempt(target: Target) -> None:
+        began = len(target.log)
+        with workspace.fresh_folders() as to:
+            _check_success([_start(_DOWNLOAD, target.url, to, PIECE) for _ in range(2)])
+            workspace.check_files(to, complete=True)
+            _check_fetched_once(target.log[began:])
+
+    with on_http(workspace) as target:
+        target.faults.add(FaultRule(Slow(0.01), times=ALWAYS))
+        for _ in range(n):
+            yield partial(attempt, target)
+
+
+class DamagedCopy:
+    """A copy of the small release, and what reading it gave before it was damaged."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.root = workspace.new_path()
+        shutil.copytree(workspace.small, self.root)
+        self.before = self.read()
+
+    def read(self, root: Path | None = None) -> tuple[bytes, str]:
+        """Return a hash of all arrays and of batches, and the metadata as text."""
+        dataset = load_icrl4aht(root or self.root, obs="uint8", cache="ram", threads=1)
+        histories = [(repr(h.entry), dataset.recover_teammate(h.entry.history_id)) for h in dataset]
+        return hash_arrays(dataset) + hash_batches(dataset), f"{histories} {dataset.info}"
+
+    @contextmanager
+    def damaged(self, path: Path, data: bytes) -> Iterator[None]:
+        """Replace the content of a file for a while."""
+        right = path.read_bytes()
+        path.write_bytes(data)
+        try:
+            yield
+        finally:
+            path.write_bytes(right)
+
+    def check(self) -> str | None:
+        """Check that `verify` finds the damage, and that reading raises one of our errors or gives the right data."""
+        check(not verify_release(self.root).ok, "verify finds nothing")
+        try:
+            after = self.read()
+        except Icrl4ahtError:
+            return None
+        check(after[0] == self.before[0], "other data without an error")
+        return None if after[1] == self.before[1] else "metadata unnoticed"
+
+
+def bit_flips(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """One bit of one file of a release is inverted."""
+    release = DamagedCopy(workspace)
+    paths = sorted(path for path in release.root.rglob("*") if path.is_file())
+
+    def attempt(path: Path, position: int, bit: int) -> str | None:
+        data = bytearray(path.read_bytes())
+        data[position] ^= 1 << bit
+        with release.damaged(path, bytes(data)):
+            return release.check()
+
+    for number in range(n):
+        path, rng = paths[number % len(paths)], workspace.rng
+        yield partial(attempt, path, int(rng.integers(path.stat().st_size)), int(rng.integers(8)))
+
+
+def mutations(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Text files of a release, also the manifest, have other lines, values or bytes; time and memory are bounded."""
+    release = DamagedCopy(workspace)
+    lines = _manifest(release.root)
+
+    def attempt(name: str, seed: int) -> str | None:
+        data, rng = (release.root / name).read_bytes(), np.random.default_rng(seed)
+        mutated = data
+        while mutated == data:
+            mutated = _mutated(data, rng, name)
+        with release.damaged(release.root / name, mutated), time_limit(20), memory_limit(2 * 2**30):
+            return release.check() if name != MANIFEST else check_manifest()
+
+    def check_manifest() -> str | None:
+        with on_http(workspace, release.root) as target, workspace.fresh_folders() as to:
+            try:
+                fetch_planned(plan_download(target.url, to=to, retry=RETRIES))
+                check(release.read(to) == release.before, "other data, downloaded")
+            except Icrl4ahtError:
+                pass
+        return "same meaning" if _manifest(release.root) == lines else release.check()
+
+    names = (HISTORIES, INFO, MANIFEST, TASKS, PROVENANCE)
+    for number in range(n):
+        yield partial(attempt, names[number % len(names)], int(workspace.rng.integers(2**32)))
+
+
+def _manifest(root: Path) -> dict[str, str] | None:
+    try:
+        return read_manifest(root)
+    except Icrl4ahtError:
+        return None
+
+
+_VALUES = [0, -1, 2**31, 2**63, 10**400, 1e300, -0.5, None, True, "", "x", "\0", "../x", "/etc", "ü" * 9, [], [[]], {}]
+_RAW = [b"NaN", b"1e999", b"[" * 100_000, b'{"a":' * 50_000, b'"' + b"x" * 10_000_000 + b'"', b"\xff\xfe", b"\\ud800"]
+
+
+def _mutated(data: bytes, rng: np.random.Generator, name: str) -> bytes:
+    """Return `data` with one random change."""
+    lines = data.splitlines(keepends=True)
+    one, other = rng.integers(len(lines), size=2)
+    low, high = sorted(rng.integers(len(data) + 1, size=2).tolist())
+    changes: list[Callable[[], bytes]] = [
+        lambda: data[:low],
+        lambda: data[:low] + data[high:],
+        lambda: data[:low] + rng.bytes(5) + data[low:],
+        lambda: data[:low] + _RAW[rng.integers(len(_RAW))] + data[low + 1 :],
+        lambda: b"".join([*lines[:one], *lines[one + 1 :]]),
+        lambda: b"".join([*lines[: one + 1], *lines[one:]]),
+        lambda: b"".join([lines[other if k == one else one if k == other else k] for k in range(len(lines))]),
+        lambda: data.replace(b"\n", rng.choice([b"\r\n", b"\r", b"\n\n", b"\x0b", b""]).item()),
+        lambda: b"\xef\xbb\xbf" + data,
+        lambda: data.replace(b"meta/", rng.choice([b"/meta/", b"../meta/", b"meta//", b"C:/meta/"]).item(), 1),
+        lambda: data.upper(),
+    ]
+    values = 0 if name == MANIFEST else 3 * len(changes)  # of JSON, most changes are of values
+    choice = int(rng.integers(len(changes) + values))
+    return changes[choice]() if choice < len(changes) else _other_value(data, rng, by_line=name.endswith(".jsonl"))
+
+
+def _other_value(data: bytes, rng: np.random.Generator, by_line: bool) -> bytes:
+    """Return JSON with one value or key changed or removed."""
+    lines = data.splitlines() if by_line else [data]
+    row = int(rng.integers(len(lines)))
+    content: Any = json.loads(lines[row])
+    inner = content
+    while True:
+        keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
+        key = keys[rng.integers(len(keys))]
+        if not isinstance(inner[key], dict | list) or not inner[key] or rng.random() < 0.3:
+            break
+        inner = inner[key]
+    kind = rng.random()
+    if kind < 0.7:
+        inner[key] = _VALUES[rng.integers(len(_VALUES))]
+    elif kind < 0.85 or isinstance(inner, list):
+        del inner[key]
+    else:
+        inner[f"{key}s"] = inner.pop(key)
+    lines[row] = json.dumps(content).encode()
+    return b"".join(line + b"\n" for line in lines)

@@ -1,0 +1,443 @@
+"""Hostile releases, folders of published files and servers, by what some message about them says.
+
+The hashes of a hostile release are right unless the case is about the manifest or its file cannot be hashed.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.remote.download import ORIGIN
+from tests.helpers.random_play import SHARD
+from tests.robustness.hostile.spoil import (
+    TABLE,
+    TERABYTE,
+    ChangeFile,
+    Spoil,
+    actions,
+    content,
+    dataset,
+    deep,
+    entry,
+    folder_link_out,
+    hdf5,
+    info,
+    json_file,
+    lines,
+    link,
+    link_out,
+    listed,
+    npy,
+    outside,
+    pipe,
+    replaced,
+    sparse,
+    table,
+    teammate,
+    theta,
+    typed,
+)
+from tests.servers.common import Fault, IgnoreRange, Long, Redirect
+
+
+class Case(NamedTuple):
+    """A hostile input.
+
+    Attributes:
+        kind: "release", "published" or "served".
+        message: a regular expression that some message about it matches.
+        spoil: changes a valid release or folder of published files.
+        rules: faults of the server by path pattern, for a served release.
+    """
+
+    kind: str
+    message: str
+    spoil: Spoil
+    rules: Mapping[str, Fault] = {}
+
+
+CASES: dict[str, Case] = {}
+
+
+def add(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
+    """Add cases of one kind that have one message."""
+    for name, spoil in spoils.items():
+        add_case(f"{kind}: {name}", Case(kind, message, spoil))
+
+
+def add_hashed(message: str, spoils: Mapping[str, Spoil]) -> None:
+    """Add releases whose manifest has the right hashes, which an attacker can write, too."""
+
+    def hashed(spoil: Spoil) -> Spoil:
+        return lambda root: (spoil(root), write_manifest(root))
+
+    add("release", message, {name: hashed(spoil) for name, spoil in spoils.items()})
+
+
+def add_case(name: str, case: Case) -> None:
+    assert name not in CASES, name
+    CASES[name] = case
+
+
+# Paths
+
+_NAMES = {
+    "up": "../outside/new",
+    "up within": "meta/../../outside/new",
+    "absolute": "/tmp/new",
+    "backslash": "..\\outside\\new",
+    "drive": "C:/new",
+    "control": "meta/\x1b[2J",
+    "long": "x" * 300,
+    "device": "meta/NUL.json",
+    "ends in a dot": "meta/info.json.",
+}
+add("release", "leads out of the release", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
+add("release", "are one file on some systems", {"manifest: upper case": listed("meta/INFO.json")})
+add("release", "is a file by another line", {"manifest: file as folder": listed("meta/info.json/x")})
+_many = "".join(f"d/{number}\n{number:064}  " for number in range(50_000)) + "d/last"
+add("release", "listed in the manifest, but missing", {"manifest: many lines": listed(_many)})
+
+for _file in (INFO, HISTORIES, TASKS, PROVENANCE, TABLE, SHARD, "README.md", teammate, MANIFEST, ORIGIN):
+    _label = _file if isinstance(_file, str) else "teammate"
+    add("release", "leads out of the release", {f"link out: {_label}": replaced(_file, link_out)})
+    add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, pipe)})
+    _too_large = r"expected at most|more than|truncated|twice|chunk table"
+    add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, sparse)})
+
+
+def socket_at(path: Path, root: Path) -> None:
+    working_directory = Path.cwd()
+    os.chdir(path.parent)  # the address of a socket is at most about 100 bytes
+    try:
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(path.name)
+    finally:
+        os.chdir(working_directory)
+
+
+def chain_of_links(path: Path, root: Path) -> None:
+    path.symlink_to("two")
+    (path.parent / "two").symlink_to("three")
+    (path.parent / "three").symlink_to("../../outside/secret.txt")
+
+
+def deep_folder(root: Path) -> None:
+    working_directory = Path.cwd()
+    os.chdir(root / "meta")
+    try:
+        for _ in range(1500):
+            Path("d").mkdir()
+            os.chdir("d")
+        Path("file").touch()
+    finally:
+        os.chdir(working_directory)
+
+
+_folders = ("data", "teammates", "meta/chunks", "meta")
+add(
+    "release",
+    "leads out of the release",
+    {f"folder linked out: {name}": replaced(name, folder_link_out) for name in _folders}
+    | {"chain of links": replaced(TASKS, chain_of_links)},
+)
+_circle = replaced(TASKS, lambda path, root: path.symlink_to(path.name))
+add("release", "cannot be followed", {"circle of links": _circle})
+add("release", "neither a file nor a folder", {"socket": replaced(TASKS, socket_at)})
+add("release", "leads out", {"device": replaced(TASKS, lambda path, root: path.symlink_to("/dev/zero"))})
+add("release", "extra: not listed", {"unlisted pipe": replaced("extra", pipe)})
+add("release", "not listed in the manifest", {"folders too deep": deep_folder})
+
+
+def _terminal_codes(root: Path) -> None:
+    Path(os.fsdecode(os.fsencode(root) + b"/\x1b]0;owned\x07\xff")).touch()
+
+
+add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _terminal_codes})
+
+_hashes, _paths = (
+    {"above": "../../outside", "absolute": "/etc"},
+    {"backslash": "..\\..\\outside", "surrogate": "\ud800"},
+)
+add_hashed("expected 64 digits", {f"checkpoint's hash: {name}": theta(sha256=path) for name, path in _hashes.items()})
+add_hashed(
+    "expected a path within",
+    {f"checkpoint's path: {name}": theta(checkpoint=path) for name, path in (_hashes | _paths).items()},
+)
+
+# Numbers, sizes and text
+
+_integers = {"T": 2**62, "episodes": 2**62, "env_idx": 2**70, "seed": 10**4000}
+add_hashed("Expected `int` <=", {f"index: large {name}": entry(**{name: value}) for name, value in _integers.items()})
+add_hashed("the index implies", {"rows: 2**39": entry(T=2**39)})
+add_hashed("at most 64 bits", {"tasks: seed of 4,000 digits": entry(TASKS, seed=10**4000)})
+add_hashed("histories", {"info: histories 2**62": info(histories=2**62)})
+_steps = json_file(INFO, lambda value: value["environment"].update(kept_steps=2**200))
+add_hashed("environment", {"info: steps 2**200": _steps})
+_size = json_file(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
+add_hashed("shards: expected", {"info: shard of 2**61 bytes": _size, "info: no shards": info(shards={})})
+_digits = content('{"format_version": ' + "9" * 10**6 + "}")
+add_hashed("malformed", {"info: too deep": replaced(INFO, deep(100_000)), "info: many digits": replaced(INFO, _digits)})
+add_hashed("printable characters", {"info: version with terminal codes": info(data_version="\x1b[2J")})
+
+
+def nested(levels: int) -> list:
+    """Return lists in lists."""
+    value: list = []
+    for _ in range(levels):
+        value = [value]
+    return value
+
+
+def many_names(values: list[dict[str, Any]]) -> list:
+    """Return lines with many short task ids and one long one; an array of them would take gigabytes."""
+    ids = [f"t{number}" for number in range(20_000)] + ["x" * 200_000]
+    return [values[0] | {"history_id": number, "task_id": name} for number, name in enumerate(ids)]
+
+
+def many_sets_of_shards(root: Path) -> None:
+    """Let each line name another set of 99,999 shards."""
+
+    def change(values: list[dict[str, Any]]) -> list:
+        names = (f"data/teammate/coord_simple/train-{k:05}-of-{99_999 - k:05}.h5" for k in range(500))
+        return [values[0] | {"history_id": number, "shard": name} for number, name in enumerate(names)]
+
+    lines(change)(root)
+    info(histories=500)(root)
+
+
+_deep_theta = lines(lambda values: values[0]["teammate"]["theta"].update(x=nested(400)), TASKS)
+_deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
+add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
+_endless_line = content(b"a" * 2**24)
+add_hashed("a line has more than", {"index: one endless line": replaced(HISTORIES, _endless_line)})
+add_hashed("expected at most", {"tasks: one endless line": replaced(TASKS, _endless_line)})
+add_hashed("of length <= 512", {"index: wide names": lines(many_names)})
+add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
+add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
+add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
+add_hashed("promises this shard", {"index: many sets of shards": many_sets_of_shards})
+_lists = json_file(PROVENANCE, lambda value: value.update({name: [] for name in value}))
+add_hashed(
+    "an object of objects",
+    {"provenance: a list": replaced(PROVENANCE, content("[]")), "provenance: an object of lists": _lists},
+)
+_words = json_file(PROVENANCE, lambda value: [note.update(streams_recorded="many") for note in value.values()])
+add_hashed("statistics", {"provenance: text as number": _words})
+
+# Chunk tables and chunks
+
+
+class Bomb:
+    """Object that creates a folder when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.target),)
+
+
+def pickled(path: Path, root: Path) -> None:
+    np.save(path, np.array([Bomb(outside(root) / "executed")], object), allow_pickle=True)
+
+
+def archive(path: Path, root: Path) -> None:
+    np.savez(path.with_suffix(".npz"), np.zeros(4, CHUNK_DTYPE))
+    path.with_suffix(".npz").rename(path)
+
+
+def gigabyte_of_zeros() -> bytes:
+    """Return a gigabyte of zeros, deflated."""
+    compressor = zlib.compressobj(9)
+    return b"".join(compressor.compress(bytes(2**24)) for _ in range(64)) + compressor.flush()
+
+
+def inflating(root: Path) -> None:
+    """Replace the first chunk by one that inflates to a gigabyte."""
+    data, path, rows = gigabyte_of_zeros(), root / SHARD, np.load(root / TABLE)
+    rows["offset"][0], rows["size"][0], rows["crc32"][0] = path.stat().st_size, len(data), zlib.crc32(data)
+    with path.open("ab") as stream:
+        stream.write(data)
+    np.save(root / TABLE, rows)
+
+
+def inflating_within_bounds(root: Path) -> None:
+    """Replace the first chunk by one of its size that inflates to more than a chunk has."""
+    rows = np.load(root / TABLE)
+    data = zlib.compress(bytes(300 * int(rows["size"][0])), 9)
+    assert len(data) <= rows["size"][0]
+    with (root / SHARD).open("r+b") as stream:
+        stream.seek(int(rows["offset"][0]))
+        stream.write(data.ljust(int(rows["size"][0]), b"\0"))
+        stream.seek(int(rows["offset"][0]))
+        rows["crc32"][0] = zlib.crc32(stream.read(int(rows["size"][0])))
+    np.save(root / TABLE, rows)
+
+
+_HEADER = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"
+_ROWS = str(CHUNK_DTYPE.descr)
+_TABLES = {
+    "2**50 rows": npy(_HEADER.format(_ROWS, f"({2**50},)")),
+    "2**70 rows": npy(_HEADER.format(_ROWS, f"({2**70},)")),
+    "long header": npy("{", b"\x03\x00", 2**32 - 1),
+    "objects": npy(_HEADER.format("[('offset', '|O'), ('size', '<u4')]", "(4,)")),
+    "calls": npy(_HEADER.format("__import__('os').system('true')", "(4,)")),
+    "pickle": pickled,
+    "archive": archive,
+    "columns first": lambda path, root: np.save(path, np.asfortranarray(np.zeros((4, 4)))),
+}
+add_hashed("chunk table|expected rows of", {f"table: {name}": replaced(TABLE, make) for name, make in _TABLES.items()})
+add_hashed("covers more than", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
+add_hashed("cover|crc32", {"table: one offset": table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
+add_hashed("cannot be", {"table: no bytes": table(lambda rows: rows["size"].__setitem__(0, 0))})
+_many_rows = table(lambda rows: np.concatenate([rows, np.zeros(10**6, CHUNK_DTYPE)]))
+add_hashed("cover", {"table: many empty rows": _many_rows})
+add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating})
+add_hashed("does not inflate to", {"chunk that inflates a little": inflating_within_bounds})
+
+# Structures that libhdf5 would follow, load or believe
+
+
+def virtual(group: Any, out: Path) -> None:
+    layout = h5py.VirtualLayout((4, 120), "i1")
+    layout[0] = h5py.VirtualSource(str(out / "secret.h5"), "secret", (120,))
+    group.create_virtual_dataset("actions", layout)
+
+
+def external(group: Any, out: Path) -> None:
+    group.create_dataset("actions", (480,), "i1", external=[(str(out / "secret.txt"), 0, 480)])
+
+
+def filtered(group: Any, out: Path) -> None:
+    """Create a dataset whose filter libhdf5 would load from a plugin."""
+    low: Any = h5py
+    properties = low.h5p.create(low.h5p.DATASET_CREATE)
+    properties.set_chunk((1, 120))
+    properties.set_filter(32_004, low.h5z.FLAG_OPTIONAL, (1,))
+    space = low.h5s.create_simple((4, 120))
+    low.h5d.create(group.id, b"actions", low.h5t.NATIVE_INT8, space, properties)
+
+
+def another_name(file: Any, out: Path) -> None:
+    file["0"]["more"] = h5py.ExternalLink(str(out / "secret.h5"), "/secret")
+
+
+def group_link_out(file: Any, out: Path) -> None:
+    file.move("0", "kept")
+    file["0"] = h5py.ExternalLink(str(out / "secret.h5"), "/")
+
+
+def endless_heap(root: Path) -> None:
+    """Set the size of the free space in the heap of texts to zero."""
+    data = bytearray((root / SHARD).read_bytes())
+    left = data.index(b"GCOL") + 16 + 16 + 16  # after the heap's header and "coord_simple" with its own
+    assert data[left : left + 2] == b"\0\0"
+    data[left + 8 : left + 16] = bytes(8)
+    (root / SHARD).write_bytes(data)
+
+
+_SHARED: dict[str, dict[str, ChangeFile]] = {
+    "lead out of the file": {
+        "soft link": link(lambda out: h5py.SoftLink("/0/state")),
+        "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
+        "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
+    },
+    "in other files": {"external storage": actions(external), "virtual": actions(virtual)},
+    r"filters \[32004\]": {"a plugin's filter": actions(filtered)},
+    "expected numbers": {
+        "texts": typed(h5py.string_dtype()),
+        "references": typed(h5py.ref_dtype),
+        "lists": typed(h5py.vlen_dtype("i4")),
+        "records": typed([("a", "i4"), ("b", "i4")]),
+    },
+    "groups: expected|lead out of the file": {"group linked out": group_link_out},
+}
+"""Message -> changes of the first group, of shards and of published files."""
+_OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
+    "expected": {"endless rows": dataset((2**50,), chunks=(120,), compression="gzip")},
+    "chunks": {"huge chunks": dataset(chunks=(1, 2**30), maxshape=(4, None), compression="gzip")},
+    "not a dataset|expected": {"circle of groups": actions(lambda group, out: group.__setitem__("actions", group))},
+    r"expected \[.*found \[.*'more'": {"one name more": another_name},
+    "attribute": {
+        "attribute of texts": lambda file, out: file.attrs.create("layout", ["x"] * 9),
+        "attribute of references": lambda file, out: file.attrs.create("layout", file.ref, dtype=h5py.ref_dtype),
+    },
+}
+for _message, _changes in (_SHARED | _OF_SHARDS).items():
+    add_hashed(_message, {f"shard: {name}": hdf5(change) for name, change in _changes.items()})
+add_hashed("not stored as libhdf5", {"shard: endless heap of texts": endless_heap})
+
+# Published files
+
+
+def endless_history(root: Path) -> None:
+    """Let all datasets of the first published history have 2**39 rows, as its line states."""
+    entry("histories_index.jsonl", T=2**39)(root)
+    with h5py.File(root / "histories.h5", "r+") as file:
+        group: Any = file["0"]
+        for name, old in list(group.items()):
+            rest, dtype = old.shape[1:], old.dtype
+            del group[name]
+            group.create_dataset(name, (2**39, *rest), dtype, chunks=(100, *rest), compression="gzip")
+
+
+def inflating_published(file: Any, out: Path) -> None:
+    """Replace the first chunks of the first published history by ones that inflate to a gigabyte."""
+    data = gigabyte_of_zeros()
+    for name in ("dones", "actions", "obs", "state"):
+        stored = file["0"][name].id
+        stored.write_direct_chunk((0,) * stored.rank, data)
+
+
+_H5, _INDEX = "histories.h5", "histories_index.jsonl"
+for _message, _changes in _SHARED.items():
+    _spoils = {name: hdf5(change, _H5) for name, change in _changes.items()}
+    add("published", f"group /0.*({_message})|cannot be read: .*{_message}", _spoils)
+_PUBLISHED = (_H5, _INDEX, "tasks.jsonl", "provenance.json")
+for _message, _make in {"leads out": link_out, "neither a file": pipe, "at most|HDF5": sparse}.items():
+    add("published", _message, {f"{_make.__name__}: {name}": replaced(name, _make) for name in _PUBLISHED})
+_endless = hdf5(dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
+add("published", "expected numbers of shape", {"endless rows": _endless})
+add("published", "cannot hold them|memory", {"endless history": endless_history})
+_huge = dataset((120,), "i4", chunks=(2**28,), maxshape=(None,), compression="gzip")
+add("published", "cannot hold|chunks of", {"huge chunks": hdf5(_huge, _H5)})
+_lzf = dataset((120,), data=np.zeros(120, "i4"), dtype="i4", compression="lzf")
+add("published", "filters", {"a built-in filter that needs a library": hdf5(_lzf, _H5)})
+add("published", "not stored as|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published, _H5)})
+add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
+add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
+add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
+add("published", "Expected `int` <=", {"env_idx of 100 digits": entry(_INDEX, env_idx=10**100)})
+add("published", "printable", {"task id of surrogates": entry(_INDEX, task_id="\ud800")})
+add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
+add("published", "an object of objects", {"provenance: a list": replaced("provenance.json", content("[]"))})
+
+# Servers
+
+add("served", "expected at most", {f"a terabyte: {name}": replaced(name, sparse) for name in (MANIFEST, TASKS, TABLE)})
+add("served", "sha256|cover|crc32", {"a terabyte: shard": replaced(SHARD, sparse)})
+add("served", "leads out of the release", {"names above": listed("../../new")})
+add("served", "one file on some systems", {"names that collide": listed("readme.md")})
+add("served", "is a file by another line", {"a file that is a folder": listed("README.md/x")})
+for _name, _message, _rules in (
+    ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
+    ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
+    ("endless shard", "more came", {"*.h5": Long(TERABYTE)}),
+    ("to a local file", "info.json", {f"*/{INFO}": Redirect("file:///etc/passwd")}),
+    ("to another protocol", "h5", {"*.h5": Redirect("ftp://127.0.0.1/x")}),
+    ("in a circle", "info.json", {f"*/{INFO}": Redirect(f"/{INFO}")}),
+):
+    add_case(f"served: {_name}", Case("served", _message, lambda root: None, _rules))
+_no_ranges = Case("served", "more came", replaced(SHARD, sparse), {"*.h5": IgnoreRange()})
+add_case("served: no ranges, and no end", _no_ranges)

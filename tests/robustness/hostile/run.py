@@ -1,0 +1,196 @@
+"""Reads hostile inputs in a process of its own, whose memory is bounded; prints a JSON line for each.
+
+python -m tests.robustness.hostile.run FOLDER < NAMES (a JSON list)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.tasks import make_task
+from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import FIELDS, TEAMMATES
+from icrl4aht_data.remote.download import fetch_planned, plan_download
+from icrl4aht_data.remote.store import RetryPolicy
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.paths import files_below
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.random_play import make_tasks, play
+from tests.robustness.hostile.cases import CASES, Case
+from tests.robustness.limits import memory_limit, time_limit
+from tests.servers.common import Faults, http_server
+
+SECRET = "text outside of the release"
+MEMORY = 3 * 2**30
+SECONDS = 60
+
+LARGE = 2**26  # bytes; larger files are not searched for the secret
+Steps = dict[str, Callable[[], Any]]
+
+
+def make_release(root: Path) -> None:
+    """Write two histories with a heuristic and two with a learned teammate."""
+    files = {"policy.safetensors": b"weights", "policy.json": b"{}"}
+    for name, data in files.items():
+        (root.parent / name).write_bytes(data)
+    digest = file_hash(root.parent / "policy.safetensors")
+    theta = {"checkpoint": "m0/c4", "sha256": digest}
+    mate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
+    heuristic = make_tasks(["coord_simple"])[0]
+    learned = make_task("teammate", "train", "coord_simple", mate, 1)
+    rng = np.random.default_rng(0)
+    tasks = []
+    for task in (heuristic, learned):
+        histories = [NewHistory(k, play(task.layout, 6, 20, rng)) for k in range(2)]
+        kept = {f"{TEAMMATES}/{digest}/{name}": root.parent / name for name in files} if task is learned else {}
+        tasks.append(NewTask(task, Provenance(streams_recorded=2), 2, lambda histories=histories: histories, kept))
+    write_release(root, "lite", tasks, data_version="0.0.1", card="# hostile\n", kept_steps=20)
+
+
+def make_outside(folder: Path) -> None:
+    """Create the files that no release may touch or reveal."""
+    folder.mkdir()
+    (folder / "secret.txt").write_text(SECRET)
+    (folder / "policy.json").write_text(SECRET)
+    os.mkfifo(folder / "pipe")
+    with h5py.File(folder / "secret.h5", "w") as file:
+        file["secret"] = np.frombuffer(SECRET.encode().ljust(120), "i1")
+
+
+def file_states(folder: Path) -> dict[str, tuple]:
+    """Return mode, size, time and inode of all files below a folder, without opening any."""
+    states = {}
+    for name in files_below(folder):
+        try:
+            status = os.lstat(folder / name)
+        except OSError:
+            continue
+        states[name] = status.st_mode, status.st_size, status.st_mtime_ns, status.st_ino
+    return states
+
+
+def outcome(step: Callable[[], Any]) -> dict[str, Any]:
+    """Return whether a step ended well or in one of our errors, its text, and its seconds."""
+    began = time.monotonic()
+    try:
+        with time_limit(SECONDS):
+            ours, text = True, str(step() or "")
+    except Icrl4ahtError as error:
+        ours, text = True, str(error)
+    except BaseException as error:
+        ours, text = False, f"{error!r}\n{traceback.format_exc()[-3000:]}"
+    return {"ours": ours, "said": text, "seconds": round(time.monotonic() - began, 2)}
+
+
+def read(root: Path) -> None:
+    """Read every field of every history."""
+    dataset = load_icrl4aht(root, threads=1)
+    for history in dataset:
+        for name in FIELDS:
+            history.read(name)
+        history.returns()
+        dataset.recover_environment(history.entry.history_id)
+        dataset.recover_teammate(history.entry.history_id)
+
+
+def sample(root: Path) -> None:
+    """Sample a batch of each kind from memory and from a stream."""
+    for cache in ("ram", "stream"):
+        dataset = load_icrl4aht(root, cache=cache, threads=1)
+        dataset.ad(batch_size=4, length=8)[0]
+        dataset.dpt(batch_size=4, context=8)[0]
+
+
+def findings(root: Path) -> str:
+    """Return what `verify` finds, which must be something."""
+    report = verify_release(root, deep=True)
+    assert not report.ok, "verify finds nothing"
+    return "\n".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:1000])
+
+
+def download(root: Path, out: Path, case: Case) -> None:
+    """Download from a server with the faults of a case, with two attempts for each request."""
+    faults = Faults()
+    for path, fault in case.rules.items():
+        faults.every(1, fault, path=path, method=None)
+    with http_server(root, faults) as server:
+        fetch_planned(plan_download(server.url, to=out / "mirror", retry=RetryPolicy(2, 0.01)))
+
+
+def steps_of(case: Case, root: Path, out: Path) -> Steps:
+    """Return what is done with a hostile input."""
+    if case.kind == "served":
+        return {"download": lambda: download(root, out, case)}
+    if case.kind == "published":
+        return {
+            "lite": lambda: from_published(root, out / "lite", kept_steps=20),
+            "observations": lambda: from_published(root, out / "observations", "observations", kept_steps=20),
+        }
+    return {
+        "read": lambda: read(root),
+        "sample": lambda: sample(root),
+        "verify": lambda: findings(root),
+        "quick": lambda: verify_release(root, quick=True),
+        "convert": lambda: to_release(load_icrl4aht(root), out / "full", "full"),
+        "published": lambda: to_published(load_icrl4aht(root), out / "published"),
+        "combine": lambda: combine_releases(out / "combined", [root]),
+    }
+
+
+def run(folder: Path, base: Path, case: Case) -> dict[str, Any]:
+    """Return the outcome of each step of a case, and what it left behind."""
+    folder.mkdir()
+    root, out = folder / "root", folder / "out"
+    shutil.copytree(base, root)
+    make_outside(folder / "outside")
+    out.mkdir()
+    case.spoil(root)
+    before = file_states(root), file_states(folder / "outside"), sorted(folder.iterdir())
+    os.chdir(out)
+    outcomes = {name: outcome(step) for name, step in steps_of(case, root, out).items()}
+    touched = before != (file_states(root), file_states(folder / "outside"), sorted(folder.iterdir()))
+    written = [out / name for name in files_below(out)]
+    leaked = [str(path) for path in written if path.is_symlink() or not path.is_file() or _reveals(path)]
+    taken = sum(path.lstat().st_blocks * 512 for path in written)
+    leaked += [step for step, outcome in outcomes.items() if SECRET in outcome["said"]]
+    os.chdir(folder.parent)
+    subprocess.run(["rm", "-rf", str(folder)], check=True)  # shutil.rmtree recurses, which deep folders exhaust
+    return {"steps": outcomes, "touched": touched, "leaked": leaked, "taken": taken}
+
+
+def _reveals(path: Path) -> bool:
+    return path.stat().st_size < LARGE and SECRET.encode() in path.read_bytes()
+
+
+def main(folder: Path) -> None:
+    """Run the cases whose names standard input lists."""
+    warnings.simplefilter("error")
+    release, published = folder / "release", folder / "published"
+    make_release(release)
+    to_published(load_icrl4aht(release), published)
+    with memory_limit(MEMORY):
+        for number, name in enumerate(json.load(sys.stdin)):
+            base = published if CASES[name].kind == "published" else release
+            print(json.dumps({"case": name} | run(folder / f"case{number}", base, CASES[name])), flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

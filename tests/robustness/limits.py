@@ -1,0 +1,83 @@
+"""Limits on a process or folder: seconds, memory, file size, disk size."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+PAGE = 4096
+
+
+class HungError(Exception):
+    """A block ran into its time limit. No OSError, which the code under test may handle."""
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise HungError in a block that takes longer."""
+
+    def stop(*_: Any) -> None:
+        raise HungError(f"not done after {seconds} s")
+
+    handler = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+@contextmanager
+def _resource_limit(kind: int, value: int) -> Iterator[Callable[[], None]]:
+    before = resource.getrlimit(kind)
+    remove = partial(resource.setrlimit, kind, before)
+    resource.setrlimit(kind, (value, before[1]))
+    try:
+        yield remove
+    finally:
+        remove()
+
+
+def memory_limit(size: int) -> AbstractContextManager[object]:
+    """Let allocations fail that take more than `size` bytes of address space in addition to what is in use."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    return _resource_limit(resource.RLIMIT_AS, used + size)
+
+
+def file_size_limit(size: int) -> AbstractContextManager[Callable[[], None]]:
+    """Let writes fail behind `size` bytes of a file, as with a quota; yields a function that removes the limit."""
+    return _resource_limit(resource.RLIMIT_FSIZE, size)
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[Callable[[], None]]:
+    """Mount a disk of `size` bytes at a folder; yields a function that makes it large."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _mount(folder, f"size={size}")
+    try:
+        yield lambda: _mount(folder, "remount,size=64m")
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def _mount(folder: Path, options: str) -> None:
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], check=True, capture_output=True)
+
+
+@cache
+def can_mount() -> bool:
+    """Return whether this user may mount disks."""
+    try:
+        with TemporaryDirectory() as folder, small_disk(Path(folder), PAGE):
+            return True
+    except (OSError, subprocess.CalledProcessError):
+        return False
