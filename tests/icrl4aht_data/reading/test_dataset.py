@@ -64,7 +64,7 @@ def test_other_options_share_index_and_shards(lite, ours):
         dataset.with_options(obs="float16")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="threads = 0"):
         dataset.with_options(threads=0)
-    with pytest.raises(OptionError, match='obs = "state": .* has observations only'):
+    with pytest.raises(OptionError, match=r'obs = "state": .* has observations only'):
         load_icrl4aht(ours).with_options(obs="state")
 
 

@@ -116,7 +116,7 @@ def test_resuming_continues_exactly(lite, sampler):
         dataset[1:].ad(batch_size=3, length=9, seed=3).batches().load_state_dict(state)
 
 
-@pytest.mark.parametrize("cache", [pytest.param(c, marks=pytest.mark.slow) if c != "stream" else c for c in CACHES])
+@pytest.mark.parametrize("cache", CACHES)
 def test_memory_stays_flat(lite, cache):
     def resident() -> int:
         gc.collect()

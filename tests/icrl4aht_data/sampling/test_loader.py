@@ -189,6 +189,7 @@ class TestOptions:
         [
             ((6, 9), r"episodes = \(6, 9\): a history of 6 episodes has none"),
             ((0, 1, 2), "expected a pair"),
+            ((), "expected a pair"),
             ([0, 1], "expected a pair"),
             ((0, 1.5), "expected a pair"),
         ],
