@@ -60,7 +60,7 @@ class _Renderer:
         self._first: int = fixed.stop  # of the channels of what changes on a cell
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.unique(np.array([0, *layout.recipe_items], np.uint8))
-        self._relative = layout.place_in_window.astype(np.intp)
+        self._relative = layout.window_position.astype(np.intp)
         self._background = self._make_background()
         self._bodies = _as_items(self._make_bodies())
         self._patches = _as_items(self._make_patches())
