@@ -26,11 +26,11 @@ class OptionError(Icrl4ahtError, ValueError):
 
 
 class LabelsMissingError(Icrl4ahtError):
-    """Expert or teammate actions were asked of histories that carry none."""
+    """Expert or teammate actions were requested from histories that have none."""
 
 
 class NotStoredError(Icrl4ahtError):
-    """State records, or tasks, were asked of a release of observations that has none."""
+    """State records or tasks were requested from a release of observations that has none."""
 
 
 class ReleaseError(Icrl4ahtError):
@@ -66,7 +66,7 @@ class ShardMismatchError(ReleaseError):
 
 
 class PublishedFormatError(ReleaseError):
-    """Files of the published code are missing, malformed, or lack what a release needs."""
+    """Files of the published code are missing, malformed, or without what a release needs."""
 
 
 class FormatTooNewError(ReleaseError):
@@ -78,7 +78,7 @@ class FormatTooOldError(ReleaseError):
 
 
 class RemoteError(ReleaseError, OSError):
-    """A remote did not give what was asked of it, for longer than we try, or what came is not what its manifest lists.
+    """A remote failed after all retries, or returned something else than its manifest lists.
 
     Args:
         message: names the address.
@@ -91,7 +91,7 @@ class RemoteError(ReleaseError, OSError):
 
 
 class OfflineError(ReleaseError):
-    """Something is not here and may not be fetched: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE is set."""
+    """A file is not on this machine and may not be fetched: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE is set."""
 
 
 class UnsafePathError(ReleaseError):
@@ -99,14 +99,14 @@ class UnsafePathError(ReleaseError):
 
 
 class UploadError(Icrl4ahtError):
-    """A Hub repository did not take a release, or holds something else than it; names the repository."""
+    """A Hub repository refused a release, or contains something else than it; names the repository."""
 
 
 class TaskFormatError(Icrl4ahtError, ValueError):
     """A task line is malformed."""
 
 
-_LISTED, _COMPARED = 50, 1000  # names that an error lists, and looks at for the nearest
+_LISTED, _COMPARED = 50, 1000  # names that an error lists, and names compared to find the nearest
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:

@@ -1,1 +1,1 @@
-"""The benchmark: tracks, splits, teammate families, tasks, reference returns."""
+"""The benchmark: facts from the paper, tasks and their manifests, returns of reference egos."""

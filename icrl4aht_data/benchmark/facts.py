@@ -1,4 +1,4 @@
-"""Facts of the benchmark: actions, tracks, splits, teammate families, and which layout belongs where."""
+"""Facts of the benchmark: tracks, splits, teammate families, lengths, and which layouts belong to which split."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 """track -> split -> layouts (paper, App. A)."""
 
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
-"""Every layout of the benchmark, in the paper's order; its place here goes into seeds."""
+"""Every layout of the benchmark, in the paper's order; the position in this tuple enters seeds."""
 
 SPLITS = ("train", "test", "heldout")
 """`heldout` has the training layouts and learned teammates that `train` does not have (paper, App. F)."""
@@ -31,7 +31,7 @@ HEURISTIC_KINDS = {
 """teammate kind -> family, for the heuristics."""
 
 ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
-"""What makes the learned teammates; the teammate kinds of family `rl` (paper, App. B.1)."""
+"""The teammate kinds of family `rl`: algorithms that train teammates (paper, App. B.1)."""
 
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""
@@ -50,7 +50,11 @@ PAPER_TEAMMATES = 20
 
 
 def track_of(layout: str) -> str:
-    """The track whose train or test layouts include `layout` (short name)."""
+    """The track whose train or test layouts include `layout` (short name).
+
+    Raises:
+        UnknownNameError: if there is none.
+    """
     for track, splits in TRACKS.items():
         if any(layout in layouts for layouts in splits.values()):
             return track
@@ -58,7 +62,7 @@ def track_of(layout: str) -> str:
 
 
 def check_membership(track: object, split: object, layout: object) -> None:
-    """Whether a layout (short name) belongs to that split of that track.
+    """Check that a layout (short name) belongs to a split of a track.
 
     Raises:
         UnknownNameError: lists the valid names and the nearest.

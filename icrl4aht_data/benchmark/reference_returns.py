@@ -1,4 +1,4 @@
-"""What the benchmark leaves an ego to do: the mean returns of the reference egos in every test cell."""
+"""Mean returns of the reference egos in every test cell: the headroom that the benchmark leaves to an ego."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ REFERENCES = ("stay", "random", "oracle")
 HEURISTICS = FAMILIES[1:]
 """The teammate families of the test tasks."""
 
-_NO_HEADROOM = 1.0  # a cell where `oracle` is within this of `stay` leaves an ego nothing to do
+_NO_HEADROOM = 1.0  # an ego cannot improve a cell where `oracle` exceeds `stay` by no more than this
 
 Cell = tuple[str, str]
 """(layout, family)."""
@@ -27,20 +27,22 @@ def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
 
 
 def has_headroom(references: Mapping[str, float]) -> bool:
-    """Whether the oracle gets more in this cell than an ego that only stays, by over a point."""
+    """Whether the oracle's return exceeds that of an ego that only stays by more than one point."""
     return references["oracle"] - references["stay"] > _NO_HEADROOM
 
 
 def headroom_table(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> str:
-    """Markdown: a row a family, a column a layout, `stay / random / oracle` in each cell, bold where there is headroom,
-    and a line that names the cells where there is none."""
-    rows = [[family, *(_in_words(cells.get((layout, family))) for layout in layouts)] for family in HEURISTICS]
+    """A Markdown table of `stay / random / oracle`, and a line that names the cells without headroom.
+
+    One row per family, one column per layout; cells with headroom are bold.
+    """
+    rows = [[family, *(_cell_text(cells.get((layout, family))) for layout in layouts)] for family in HEURISTICS]
     known = [(layout, family) for layout in layouts for family in HEURISTICS if (layout, family) in cells]
     flat = ["/".join(cell) for cell in known if not has_headroom(cells[cell])]
     return f"{markdown_table(['family', *layouts], rows)}\n\nNo headroom: {', '.join(flat) or 'none'}."
 
 
-def _in_words(references: Mapping[str, float] | None) -> str:
+def _cell_text(references: Mapping[str, float] | None) -> str:
     if references is None:
         return ""
     text = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)

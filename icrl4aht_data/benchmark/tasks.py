@@ -3,7 +3,7 @@
     {"task_id": ..., "track": "teammate", "split": "train", "layout_name": "demo_cook_wide", "seed": 0,
      "teammate": {"kind": "heuristic", "family": "utility_greedy", "theta_id": 0, "base_seed": 0, "theta": {...}}}
 
-The id ends in a hash of the rest, so a task cannot change and keep its name.
+The id ends in a hash of the rest, so that a task cannot change and keep its name.
 """
 
 from __future__ import annotations
@@ -23,17 +23,22 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import parse_json, read_lines
 from icrl4aht_data.utils.paths import is_inside
 
-_FIELDS = ("task_id", "track", "split", "layout_name", "seed", "teammate")
+_FIELDS = {"task_id": str, "track": str, "split": str, "layout_name": str, "seed": int, "teammate": dict}
 _HASHED = ("kind", "family", "theta_id", "base_seed", "theta")
 
 
 @dataclass(frozen=True)
 class Task:
-    """One task. `layout_name` is the environment name, as in the published manifests.
+    """One task.
 
     Args:
-        teammate: kind, family, theta_id, base_seed and theta. Kind "heuristic": theta has the parameters. Kind "rl":
-            the checkpoint's folder within its suite, and the sha256 of its weights.
+        task_id: name of the task, made from the other fields by `task_id`.
+        track: "teammate" or "layout".
+        split: "train", "test" or "heldout".
+        layout_name: the layout's environment name, as in the published manifests.
+        seed: seed of the ego's training.
+        teammate: kind, family, theta_id, base_seed and theta. For kind "heuristic", theta contains the parameters; for
+            kind "rl", the checkpoint's folder within its suite and the sha256 of its weights.
     """
 
     task_id: str
@@ -60,7 +65,7 @@ class Task:
 
 @dataclass(frozen=True)
 class NamedTask(Task):
-    """A task of which only what an index line says is known: no parameters of its teammate, and -1 for its seed.
+    """A task known only from index lines: without the parameters of its teammate, and with seed -1.
 
     Args:
         teammate: the line's teammate_kind and teammate_family.
@@ -103,7 +108,7 @@ def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], see
 def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], seed: int) -> str:
     """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
 
-    hash8: the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`.
+    hash8 is the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`.
     """
     spec = {name: teammate[name] for name in _HASHED if name in teammate}
     text = f"{track}:{split}:{layout_name}:{spec!r}:{seed}"
@@ -112,7 +117,7 @@ def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], 
 
 
 def manifest_path(track: str, split: str) -> Path:
-    """The bundled manifest of a track's tasks.
+    """Path of the bundled manifest of a track's tasks.
 
     Raises:
         UnknownNameError: for an unknown track or split.
@@ -143,33 +148,32 @@ def read_tasks(path: Path) -> list[Task]:
 
 
 def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
-    """One line per task."""
+    """Write one JSON line per task."""
     path.write_text("".join(json.dumps(asdict(task)) + "\n" for task in tasks), encoding="utf-8")
 
 
 def _parse(line: str) -> Task:
     fields = parse_json(line)
-    if not isinstance(fields, dict) or set(fields) != set(_FIELDS):
+    if not isinstance(fields, dict) or fields.keys() != _FIELDS.keys():
         found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
         raise TaskFormatError(f"expected the fields {sorted(_FIELDS)}, found {found}")
-    for name, kind in (("task_id", str), ("layout_name", str), ("seed", int), ("teammate", dict)):
+    for name, kind in _FIELDS.items():
         if not isinstance(fields[name], kind):
             raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
     if abs(fields["seed"]) >= 2**63:
         raise TaskFormatError(f"seed: expected at most 64 bits, found {fields['seed']}")
-    check_membership(fields["track"], fields["split"], get_layout(fields["layout_name"]).name)
-    teammate = fields["teammate"]
-    if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
-        raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
-    _check_teammate(teammate)
     task = Task(**fields)
-    expected = task_id(task.track, task.split, task.layout_name, teammate, task.seed)
+    check_membership(task.track, task.split, task.layout.name)
+    _check_teammate(task.teammate)
+    expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed)
     if task.task_id != expected:
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
     return task
 
 
 def _check_teammate(teammate: dict[str, Any]) -> None:
+    if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
+        raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
     kinds = tuple(HEURISTIC_KINDS) if teammate["kind"] == "heuristic" else ALGORITHMS
     if teammate["family"] not in kinds:
         raise unknown(f"{teammate['kind']} family", teammate["family"], kinds)
@@ -184,9 +188,10 @@ def _check_teammate(teammate: dict[str, Any]) -> None:
     if teammate["kind"] == "rl":
         if set(theta) != {"checkpoint", "sha256"} or not all(isinstance(value, str) for value in theta.values()):
             raise TaskFormatError(f"teammate.theta: expected the strings checkpoint and sha256, found {theta!r}")
-        if not is_inside(theta["checkpoint"]):
+        checkpoint, digest = theta["checkpoint"], theta["sha256"]
+        if not is_inside(checkpoint):
             raise TaskFormatError(
-                f"teammate.theta.checkpoint: expected a path within the suite, found {theta['checkpoint'][:200]!r}"
+                f"teammate.theta.checkpoint: expected a path within the suite, found {checkpoint[:200]!r}"
             )
-        if not re.fullmatch("[0-9a-f]{64}", theta["sha256"]):
-            raise TaskFormatError(f"teammate.theta.sha256: expected 64 digits, found {theta['sha256'][:200]!r}")
+        if not re.fullmatch("[0-9a-f]{64}", digest):
+            raise TaskFormatError(f"teammate.theta.sha256: expected 64 digits, found {digest[:200]!r}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from icrl4aht_data.errors import ShardCorruptError
 from icrl4aht_data.format import safe_hdf5
-from icrl4aht_data.format.chunks import BETWEEN, chunk_places
+from icrl4aht_data.format.chunks import BETWEEN, chunk_locations
 from icrl4aht_data.format.schema import FORMAT_VERSION, Entry, Field
 from icrl4aht_data.reading.shard import Shard
 
@@ -70,7 +70,7 @@ def _structure_faults(shard: Shard, file: h5py.File) -> list[str]:
         for field in entry.stored_fields(shard.kind):
             faults += _dataset_faults(shard, file, entry, field, groups[entry.h5_group])
         if not faults:
-            chunks += chunk_places(file, shard.kind, entry)
+            chunks += chunk_locations(file, shard.kind, entry)
     table = list(zip(*(shard.table[name].tolist() for name in ("offset", "size", "rows")), strict=True))
     wrong = [row for row, (a, b) in enumerate(zip(chunks, table, strict=False)) if a != b]
     if wrong and not faults:

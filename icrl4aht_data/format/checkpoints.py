@@ -1,4 +1,4 @@
-"""TODO."""
+"""Checkpoints of learned teammates in a release or in a suite of populations."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.format.schema import (
-    TEAMMATES,
-)
+from icrl4aht_data.format.schema import TEAMMATES
 from icrl4aht_data.utils.files import plain_size
 from icrl4aht_data.utils.paths import resolve_inside
 
 CHECKPOINT_BYTES = 64 * 2**20
-"""Of each file of a learned teammate: sixty times what the paper's network takes."""
+"""Most bytes of each file of a learned teammate, sixty times the paper's network."""
 
 
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
-    """Where the checkpoint of a learned teammate is: named by its hash in a release, by its path in a suite.
+    """Folder of a learned teammate's checkpoint: named by its hash in a release, by its path in a suite.
 
     Args:
         folder: TEAMMATES of a release, or a suite.
@@ -29,14 +27,19 @@ def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
 
 
 def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict[str, Path]:
-    """The files of a task's learned teammate by their path in a release; none for a heuristic, or where there are none.
+    """The files of a task's learned teammate.
 
     Args:
         folder: see `checkpoint_folder`.
-        root: the release that the folder is in, out of which no link may lead.
+        task: the task; a heuristic teammate has no files.
+        root: the release that the folder is in; symbolic links must not lead out of it.
+
+    Returns:
+        Path in a release -> file; empty if the folder has no checkpoint.
 
     Raises:
-        UnsafePathError, IndexFormatError: for what is none of the release's files, or too large for a checkpoint.
+        UnsafePathError: if a file is outside the release.
+        IndexFormatError: if a file is not a regular file, or too large.
     """
     if task.teammate.get("kind") != "rl":
         return {}

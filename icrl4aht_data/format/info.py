@@ -144,7 +144,10 @@ class ReleaseInfo:
             info = msgspec.convert(content, cls)
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
-        check_name(info.data_version)
+        try:
+            check_name(info.data_version)
+        except IndexFormatError as error:
+            raise IndexFormatError(f"data_version: {error}") from error
         if len(content["environment"]) != 2:
             raise IndexFormatError("environment: expected max_steps and kept_steps only")
         return info
@@ -177,7 +180,7 @@ def read_info(root: Path) -> ReleaseInfo:
 
 
 def _instead(root: Path) -> str:
-    """What to do about a folder that is not a release."""
+    """Advice for a folder that is not a release."""
     if not root.is_dir():
         hint = "there is no such folder: check the path"
     elif below := sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}")):

@@ -1,4 +1,4 @@
-"""MANIFEST.sha256: every file of a release and its hash, in sha256sum's format; and paths that stay in a release."""
+"""MANIFEST.sha256: every file of a release with its hash, in sha256sum's format."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
 def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
-    """File -> SHA-256.
+    """File, a path in the release -> SHA-256.
+
+    Args:
+        text: content of the manifest.
+        path: its path or address, for errors.
 
     Raises:
         IndexFormatError: names the line.
@@ -25,7 +29,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
     if text and not text.endswith("\n"):
         raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
     listed: dict[str, str] = {}
-    folded: dict[str, str] = {}  # as a disk sees names that does not tell upper from lower case
+    folded: dict[str, str] = {}  # names as a disk compares them that ignores case
     for number, line in enumerate(text.splitlines(), start=1):
         match = _LINE.fullmatch(line)
         if match is None:
@@ -33,29 +37,29 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         digest, name = match.groups()
         if not is_inside(name):
             raise UnsafePathError(
-                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and tell whoever sent it"
+                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn its publisher"
             )
         if name in listed:
-            raise IndexFormatError(f"{path}, line {number}: {name!r} stands twice")
+            raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice")
         twin = folded.setdefault(unicodedata.normalize("NFC", name).casefold(), name)
         if twin != name:
             raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
         listed[name] = digest
     for key, name in folded.items():
-        ends = (place for place, character in enumerate(key) if character == "/")
-        if any(key[:end] in folded for end in ends):
-            raise IndexFormatError(f"{path}: {name!r} lies in what is a file by another line")
+        slashes = (position for position, character in enumerate(key) if character == "/")
+        if any(key[:end] in folded for end in slashes):
+            raise IndexFormatError(f"{path}: {name!r} is in a folder that is a file by another line")
     return listed
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """The same of a release folder."""
+    """The manifest of a release folder, see `parse_manifest`."""
     path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
 
 
 def write_manifest(root: Path) -> None:
-    """MANIFEST.sha256 over every other file of the folder."""
+    """Write MANIFEST.sha256 with every other file of the folder."""
     files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != MANIFEST)
     lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
     with atomic_write(root / MANIFEST) as partial:

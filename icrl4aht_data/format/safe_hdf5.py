@@ -1,7 +1,7 @@
-"""Looking into HDF5 files of others: libhdf5 follows links to other files, loads plugins and believes sizes.
+"""Inspecting untrusted HDF5 files: libhdf5 follows links to other files, loads plugins and trusts sizes.
 
-Nothing is asked of it here before that is ruled out. What is refused is a ValueError, what is broken any error that
-h5py raises; whoever calls names the file.
+Every check here comes before the call of libhdf5 that it protects. Rejected content raises ValueError, damaged content
+any error of h5py; callers add the file's name.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ import numpy as np
 from icrl4aht_data.format.chunks import DEFLATE_RATIO, decode_chunk
 from icrl4aht_data.utils.memory import new_array
 
-_low: Any = h5py  # whose types do not know its lower half
+_low: Any = h5py  # its types do not declare the low-level interface
 h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
 OLDEST_HDF5 = (1, 10, 5)
-"""The first libhdf5 that says where chunks lie."""
+"""The first libhdf5 that reports the positions of chunks."""
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
-_HEAP = b"GCOL\x01"  # how a heap of texts begins
+_HEAP = b"GCOL\x01"  # first bytes of a global heap, which stores texts
 _HEAPS, _HEAP_BYTES = 16, 2**16
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
@@ -34,28 +34,28 @@ _ATTRIBUTES = 16
 
 
 def exists(group: Any, path: str) -> bool:
-    """Whether there is something at a path, to which the file's own links lead.
+    """Whether the file's own links lead to something at a path.
 
     Raises:
         ValueError: if a link on the way may lead out of the file.
     """
-    return _at(group, path) is not None
+    return _find(group, path) is not None
 
 
 def member(group: Any, path: str) -> Any:
     """The group or dataset at a path.
 
     Raises:
-        ValueError: the same.
+        ValueError: if a link on the way may lead out of the file.
         KeyError: if there is none.
     """
-    found = _at(group, path)
+    found = _find(group, path)
     if found is None:
         raise KeyError(f"{path} is missing")
     return found
 
 
-def _at(group: Any, path: str) -> Any:
+def _find(group: Any, path: str) -> Any:
     for part in path.strip("/").split("/"):
         name = part.encode()
         if part in ("", ".") or not isinstance(group, h5py.Group) or not group.id.links.exists(name):
@@ -67,7 +67,7 @@ def _at(group: Any, path: str) -> Any:
 
 
 def attributes(file: h5py.File) -> dict[str, Any]:
-    """The file's attributes, if they are few single numbers and texts.
+    """The file's attributes, if they are few and each is one number or text.
 
     Raises:
         ValueError: if they are not.
@@ -75,69 +75,75 @@ def attributes(file: h5py.File) -> dict[str, Any]:
     found = {}
     for number, name in enumerate(file.attrs):
         attribute = file.attrs.get_id(name)
-        if number == _ATTRIBUTES or attribute.shape or _kind(attribute) not in (h5t.INTEGER, h5t.STRING):
+        if number == _ATTRIBUTES or attribute.shape or _type_class(attribute) not in (h5t.INTEGER, h5t.STRING):
             raise ValueError(f"attribute {name!r}: expected few attributes, single numbers and texts")
-        if _kind(attribute) == h5t.STRING:
+        if _type_class(attribute) == h5t.STRING:
             _check_heaps(Path(file.filename))
         found[name] = file.attrs[name]
     return found
 
 
 def _check_heaps(path: Path) -> None:
-    """Whether the heaps of texts are small and sound: libhdf5 stays for ever at an object whose size adds up to 0.
+    """Check that the heaps of texts are small and consistent: libhdf5 loops for ever at an object of size 0.
 
     Raises:
         ValueError: if they are not.
     """
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        at, heaps = data.find(_HEAP), 0
-        while at >= 0:
-            size = int.from_bytes(data[at + 8 : at + 16], "little")
-            if size <= len(data) - at:  # else these bytes are no heap
+        start, heaps = data.find(_HEAP), 0
+        while start >= 0:
+            size = int.from_bytes(data[start + 8 : start + 16], "little")
+            if size <= len(data) - start:  # otherwise these bytes are not a heap
                 heaps += 1
-                if heaps > _HEAPS or size > _HEAP_BYTES or not _is_sound(data[at : at + size]):
-                    raise ValueError(f"texts at byte {at}: not stored as libhdf5 stores them")
-            at = data.find(_HEAP, at + 1)
+                if heaps > _HEAPS or size > _HEAP_BYTES or not _is_consistent(data[start : start + size]):
+                    raise ValueError(f"texts at byte {start}: not stored as libhdf5 stores them")
+            start = data.find(_HEAP, start + 1)
 
 
-def _is_sound(heap: bytes) -> bool:
-    """Each object is a number (2 bytes), 6 more, its size (8 bytes) and itself; number 0 is the room that is left."""
-    place = 16
-    while place + 16 <= len(heap):
-        number, size = (int.from_bytes(heap[place + low : place + high], "little") for low, high in ((0, 2), (8, 16)))
+def _is_consistent(heap: bytes) -> bool:
+    """Whether the sizes of a heap's objects add up.
+
+    An object is its number (2 bytes), 6 other bytes, its size (8 bytes) and its content; number 0 is the free space.
+    """
+    offset = 16
+    while offset + 16 <= len(heap):
+        number = int.from_bytes(heap[offset : offset + 2], "little")
+        size = int.from_bytes(heap[offset + 8 : offset + 16], "little")
         if number == 0:
-            return place + size == len(heap)
-        place += 16 + -(-size // 8) * 8
-    return place <= len(heap)
+            return offset + size == len(heap)
+        offset += 16 + -(-size // 8) * 8
+    return offset <= len(heap)
 
 
 def filters(dataset: Any) -> list[int]:
-    """The ids of a dataset's filters, if all that it is made of lies in the file, in numbers or arrays of numbers.
+    """Ids of a dataset's filters, if all its values are in this file and are numbers or arrays of numbers.
 
     Raises:
-        ValueError: if it is no dataset, or made of anything else.
+        ValueError: if they are not, or it is not a dataset.
     """
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"{dataset.name}: not a dataset")
-    made = dataset.id.get_create_plist()
-    if made.get_layout() == h5d.VIRTUAL or made.get_external_count():
+    properties = dataset.id.get_create_plist()
+    if properties.get_layout() == h5d.VIRTUAL or properties.get_external_count():
         raise ValueError(f"{dataset.name}: keeps its values in other files")
-    if _kind(dataset.id) not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) or dataset.id.get_type().get_size() > _ELEMENT_BYTES:
+    is_number = _type_class(dataset.id) in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM)
+    if not is_number or dataset.id.get_type().get_size() > _ELEMENT_BYTES:
         raise ValueError(f"{dataset.name}: expected numbers, or small arrays of them, found {dataset.dtype}")
-    return [made.get_filter(number)[0] for number in range(made.get_nfilters())]
+    return [properties.get_filter(number)[0] for number in range(properties.get_nfilters())]
 
 
-def _kind(what: Any) -> int:
-    """The class of an object's type, or of what its arrays hold."""
+def _type_class(what: Any) -> int:
+    """The class of an object's type, or of the elements of an array type."""
     kind = what.get_type()
     return kind.get_super().get_class() if kind.get_class() == h5t.ARRAY else kind.get_class()
 
 
 def read_dataset(dataset: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A dataset of that shape, chunks inflated here: libhdf5 would inflate one to any length.
+    """A dataset of that shape, with chunks inflated here: libhdf5 would inflate one to any length.
 
     Raises:
-        ValueError: if it has another shape, filters but for shuffle and deflate, or more rows than its bytes can hold.
+        ValueError: if it has another shape, filters other than shuffle and deflate, or more rows than its bytes can
+            contain.
         OptionError: if it does not fit into memory.
     """
     used = filters(dataset)
@@ -158,13 +164,12 @@ def read_dataset(dataset: Any, shape: tuple[int, ...]) -> np.ndarray:
     length = math.prod(chunk) * dataset.dtype.itemsize
     if length > _CHUNK_BYTES:
         raise ValueError(f"{dataset.name}: chunks of {length:,} bytes, expected at most {_CHUNK_BYTES:,}")
-    for place in product(*(range(0, rows, step) for rows, step in zip(shape, chunk, strict=True))):
-        info = dataset.id.get_chunk_info_by_coord(place)
+    for corner in product(*(range(0, rows, step) for rows, step in zip(shape, chunk, strict=True))):
+        info = dataset.id.get_chunk_info_by_coord(corner)
         if info.byte_offset is None or info.filter_mask or info.size > 2 * length + 64:
-            raise ValueError(f"{dataset.name}: the chunk at {place} is missing, or not stored as the dataset says")
-        data = dataset.id.read_direct_chunk(place)[1]
+            raise ValueError(f"{dataset.name}: the chunk at {corner} is missing, or not stored as the dataset says")
+        data = dataset.id.read_direct_chunk(corner)[1]
         raw = decode_chunk(data, length, dataset.dtype.itemsize if SHUFFLE in used else 1)
-        region = tuple(slice(low, low + step) for low, step in zip(place, chunk, strict=True))
-        part = out[region]
+        part = out[tuple(slice(low, low + step) for low, step in zip(corner, chunk, strict=True))]
         part[...] = np.frombuffer(raw, dataset.dtype).reshape(chunk)[tuple(slice(n) for n in part.shape)]
     return out

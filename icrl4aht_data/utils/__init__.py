@@ -1,1 +1,1 @@
-"""Helpers without knowledge of the dataset: files, paths, hashes, threads, memory, the cache folder."""
+"""Files, paths, hashes, threads, memory, the cache folder and checks of options."""

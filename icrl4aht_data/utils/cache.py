@@ -1,8 +1,8 @@
-"""Arrays made once and kept in a cache folder as plain .npy files, shared by processes, bounded in size.
+"""Arrays built once and kept in a cache folder as plain .npy files, shared by processes, bounded in size.
 
-The folder is $ICRL4AHT_CACHE_DIR, else icrl4aht below $XDG_CACHE_HOME or ~/.cache; its size limit is
-$ICRL4AHT_CACHE_BYTES (100 GB by default). It is never the release folder: a release holds what its manifest lists and
-nothing else, and is often read-only. Deleting the folder loses nothing but time.
+The folder is $ICRL4AHT_CACHE_DIR, else the user's cache folder (`platformdirs`); its size limit is
+$ICRL4AHT_CACHE_BYTES (100 GB by default). It is never the release folder: a release contains what its manifest lists
+and nothing else, and is often read-only. Deleting the folder costs nothing but time.
 """
 
 from __future__ import annotations
@@ -17,40 +17,40 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import platformdirs
 from filelock import FileLock, Timeout
 
 from icrl4aht_data.errors import OptionError
 
 _DEFAULT_LIMIT = 100 * 10**9
 _TICK_NS = 10**8  # a file changed this recently may change again within one tick of its clock
-_COARSE_TICK_NS = 2 * 10**9  # where the clock shows no parts of a millisecond
-_SMALL = 2**20  # hashing this is quicker than remembering
+_COARSE_TICK_NS = 2 * 10**9  # the tick of file systems whose times have no parts of a millisecond
+_SMALL = 2**20  # bytes; hashing fewer is faster than looking up their hash
 
 CACHE_VARIABLES = ("ICRL4AHT_CACHE_DIR", "XDG_CACHE_HOME")
+"""Environment variables that set the cache folder; below the second one it is called icrl4aht."""
+
 DATA_VARIABLES = ("ICRL4AHT_DATA_DIR", "XDG_DATA_HOME")
-"""Environment variables that say where a folder is; below the second one it is called icrl4aht."""
+"""Environment variables that set the data folder; below the second one it is called icrl4aht."""
 
 Arrays = dict[str, np.ndarray]
 
 
 def cache_folder() -> Path:
-    """Where arrays are kept; read from the environment at each call."""
-    return _folder(CACHE_VARIABLES, "~/.cache")
+    """The folder of cached arrays, read from the environment at each call; ~/.cache/icrl4aht by default on Linux."""
+    own = os.environ.get(CACHE_VARIABLES[0])
+    return Path(own).expanduser() if own else platformdirs.user_cache_path("icrl4aht", appauthor=False)
 
 
 def data_folder() -> Path:
-    """Where remote releases come to: $ICRL4AHT_DATA_DIR, else icrl4aht below $XDG_DATA_HOME or ~/.local/share; read
-    from the environment at each call. It is no cache: what is in it stays."""
-    return _folder(DATA_VARIABLES, "~/.local/share")
-
-
-def _folder(variables: tuple[str, str], default: str) -> Path:
-    own, shared = map(os.environ.get, variables)
-    return Path(own).expanduser() if own else Path(shared or default).expanduser() / "icrl4aht"
+    """The folder of fetched releases, read from the environment at each call; ~/.local/share/icrl4aht by default on
+    Linux. It is not a cache: nothing in it is removed."""
+    own = os.environ.get(DATA_VARIABLES[0])
+    return Path(own).expanduser() if own else platformdirs.user_data_path("icrl4aht", appauthor=False)
 
 
 def cache_limit() -> int:
-    """Bytes that the cache folder may hold.
+    """Most bytes that the cache folder may contain.
 
     Raises:
         OptionError: if the environment variable is not a number of bytes.
@@ -68,27 +68,27 @@ def cache_limit() -> int:
 
 
 def cache_room() -> int:
-    """Bytes that one more set of arrays may have: what the limit and the disk allow; 0 where nothing can be written."""
+    """Bytes that one more set of arrays may take: what the limit and the disk allow; 0 if the folder is read-only."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             return 0
-        reusable = sum(_size(kept) for kept in _kept(folder))
+        reusable = sum(size for _, size in _cached_sets(folder))
         return min(cache_limit(), shutil.disk_usage(folder).free + reusable)
     except OSError:
         return 0
 
 
 def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
-    """The arrays of that key, memory-mapped read-only, built first if they are not there.
+    """The arrays of a key, memory-mapped read-only, built first if they are not cached.
 
-    Two processes that ask at once build once: the other one waits. Sets that were not used for longest are removed
-    while the folder would exceed its limit; whoever has them mapped keeps them.
+    If two processes need the same arrays, one builds them and the other waits. Sets that were not used for longest are
+    removed while the folder would exceed its limit; processes that have them mapped can still read them.
 
     Args:
-        key: names the content, so that another content has another key; a file name.
-        size: about how many bytes the arrays have.
+        key: identifies the content; a file name.
+        size: approximate size of the arrays in bytes.
         build: called with a new folder, into which it writes `<name>.npy` files.
 
     Raises:
@@ -125,70 +125,54 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
 
 
 def _open(folder: Path) -> Arrays | None:
-    """The arrays of a finished folder, and a mark that they were used; None where there are none."""
+    """The arrays of a finished folder, which is marked as used; None if there are none."""
     try:
         paths = sorted(folder.glob("*.npy"))
         arrays: Arrays = {path.stem: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False)) for path in paths}
-    except (OSError, ValueError):  # removed or replaced while we looked, or damaged
+    except (OSError, ValueError):  # removed or replaced meanwhile, or damaged
         return None
     if not arrays:
         return None
-    with suppress(OSError):  # somebody else's folder, or removed since: the mapping holds
+    with suppress(OSError):  # another user's folder, or removed meanwhile: the mapping stays valid
         os.utime(folder)
     return arrays
 
 
-def _kept(folder: Path) -> list[Path]:
-    """Finished sets, the least recently used first."""
-    used = []
+def _cached_sets(folder: Path) -> list[tuple[Path, int]]:
+    """Finished sets and their bytes, the least recently used first. Other processes may remove sets meanwhile."""
+    found = []
     for path in folder.iterdir():
         if path.is_dir() and not path.name.startswith("."):
-            try:
-                used.append((path.stat().st_mtime_ns, path))
-            except FileNotFoundError:
-                continue
-    return [path for _, path in sorted(used)]
-
-
-def _size(folder: Path) -> int:
-    total = 0
-    for path in folder.glob("*.npy"):
-        try:
-            total += path.stat().st_size
-        except FileNotFoundError:
-            continue
-    return total
+            with suppress(FileNotFoundError):
+                size = sum(file.stat().st_size for file in path.glob("*.npy"))
+                found.append((path.stat().st_mtime_ns, path, size))
+    return [(path, size) for _, path, size in sorted(found)]
 
 
 def _make_room(folder: Path, size: int) -> None:
+    """Remove leftovers of killed processes, then the least recently used sets until `size` more bytes fit."""
     with FileLock(folder / ".room.lock"):
-        _sweep(folder)
-        kept = _kept(folder)
-        sizes = [_size(path) for path in kept]
-        excess = sum(sizes) + size - cache_limit()
-        for path, bytes_ in zip(kept, sizes, strict=True):
+        for left in folder.glob(".*.partial"):
+            with suppress(Timeout), FileLock(left.with_suffix(".lock"), timeout=0):  # held while a set is built
+                shutil.rmtree(left, ignore_errors=True)
+        for left in folder.glob(".*.removed-*"):
+            shutil.rmtree(left, ignore_errors=True)
+        found = _cached_sets(folder)
+        excess = sum(bytes_ for _, bytes_ in found) + size - cache_limit()
+        for path, bytes_ in found:
             if excess <= 0:
                 return
             doomed = path.with_name(f".{path.name}.removed-{os.getpid()}")
             try:
-                path.rename(doomed)  # at once, so that nobody opens half of it
+                path.rename(doomed)  # atomic, so that no process opens half of a set
             except FileNotFoundError:
                 continue
             shutil.rmtree(doomed, ignore_errors=True)
             excess -= bytes_
 
 
-def _sweep(folder: Path) -> None:
-    """Remove what killed processes left: sets half built, which nobody holds the lock of, and half removed."""
-    for left in folder.glob(".*.partial"):
-        with suppress(Timeout), FileLock(left.with_suffix(".lock"), timeout=0):
-            shutil.rmtree(left, ignore_errors=True)
-    for left in folder.glob(".*.removed-*"):
-        shutil.rmtree(left, ignore_errors=True)
-
-
 def content_hash(path: Path) -> str:
-    """A hash of a file's content (BLAKE2); that of a large file is remembered until the file changes."""
+    """A hash of a file's content (BLAKE2); for a large file it is stored in the cache until the file changes."""
     before = path.stat()
     if before.st_size < _SMALL:
         return _hash(path)
@@ -198,23 +182,19 @@ def content_hash(path: Path) -> str:
         before = path.stat()
         unsettled = _unsettled_ns(before)
     signature = [before.st_size, before.st_mtime_ns, before.st_ctime_ns, before.st_ino]
-    name = hash_text(str(path.resolve()))
+    name = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:32]
     note = cache_folder() / ".hashes" / f"{name}.json"
-    try:
+    with suppress(OSError, ValueError, KeyError, TypeError):
         known = json.loads(note.read_text(encoding="utf-8"))
         if known["signature"] == signature:
             return str(known["hash"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
     content = _hash(path)
     if unsettled <= 0:
-        try:
+        with suppress(OSError):  # without a cache folder the hash is computed again next time
             note.parent.mkdir(parents=True, exist_ok=True)
             partial = note.with_suffix(f".{os.getpid()}")
             partial.write_text(json.dumps({"signature": signature, "hash": content}), encoding="utf-8")
             partial.replace(note)
-        except OSError:  # not remembered, then
-            pass
     return content
 
 
@@ -228,8 +208,3 @@ def _unsettled_ns(status: os.stat_result) -> int:
 def _hash(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "blake2b").hexdigest()[:32]
-
-
-def hash_text(text: str) -> str:
-    """SHA-256 of a text, its first 32 hexadecimal digits."""
-    return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -1,6 +1,6 @@
-"""Text and JSON files: whatever is wrong with one becomes an error that names it; written whole or not at all.
+"""Reading and writing text and JSON files, with errors that name the file.
 
-What a file promises is bounded before it is read: it may be a pipe, which never ends, or have a hole of a terabyte.
+Sizes are checked before a file is read: it may be a pipe, which never ends, or a sparse file of a terabyte.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from typing import Any
 from icrl4aht_data.errors import IndexFormatError
 
 TEXT_BYTES = 64 * 2**20
-"""What is read whole: the largest, the provenance of ten thousand tasks, has a sixth of it."""
+"""Most bytes of a file that is read at once: six times the largest, the provenance of ten thousand tasks."""
 
 LINE_BYTES = 2**20
+"""Most bytes of a line."""
 
-_DEPTH = 64  # of JSON: beyond, what walks it would exceed Python's stack
+_DEPTH = 64  # nesting of JSON that is accepted, well below the depth of Python's stack
 
 
 def plain_size(path: Path, most: int) -> int:
-    """Bytes of a file that may be opened.
+    """Size in bytes of a regular file.
 
     Raises:
-        IndexFormatError: if it is missing, no plain file, or longer than `most`.
+        IndexFormatError: if it is missing, not a regular file, or larger than `most`.
     """
     with wrap_read_errors(path):
         status = path.stat()
@@ -43,7 +44,7 @@ def read_text(path: Path) -> str:
     """A text file's content.
 
     Raises:
-        IndexFormatError: if it is missing, unreadable, too long or not UTF-8.
+        IndexFormatError: if it is missing, unreadable, too large or not UTF-8.
     """
     plain_size(path, TEXT_BYTES)
     with wrap_read_errors(path):
@@ -51,10 +52,10 @@ def read_text(path: Path) -> str:
 
 
 def read_lines(path: Path) -> Iterator[str]:
-    """A text file's lines, of which there may be any number.
+    """The lines of a text file of any size, without their newlines.
 
     Raises:
-        IndexFormatError: the same.
+        IndexFormatError: if the file is missing, unreadable or not UTF-8, or a line is too long.
     """
     plain_size(path, 2**62)
     with wrap_read_errors(path), path.open("rb") as stream:
@@ -68,10 +69,10 @@ def read_lines(path: Path) -> Iterator[str]:
 
 @contextmanager
 def wrap_read_errors(path: Path) -> Iterator[None]:
-    """What reading a file raises becomes an error that names it.
+    """Turn errors of reading a file into ones that name it.
 
     Raises:
-        IndexFormatError: if it is missing, cannot be read, or is not UTF-8.
+        IndexFormatError: if the file is missing, cannot be read, or is not UTF-8.
     """
     try:
         yield
@@ -91,35 +92,35 @@ def parse_json(text: str) -> Any:
     """
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also too many digits, too deep
+    except (ValueError, RecursionError) as error:  # also for too many digits or levels
         raise IndexFormatError(f"not JSON: {error}") from error
     level = [value]
     for _ in range(_DEPTH):
         level = [part for part in level if isinstance(part, (dict, list))]
         if not level:
             return value
-        level = [part for whole in level for part in (whole.values() if isinstance(whole, dict) else whole)]
+        level = [inner for part in level for inner in (part.values() if isinstance(part, dict) else part)]
     raise IndexFormatError(f"not JSON as expected: more than {_DEPTH} levels deep")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Indented, for people."""
+    """Write indented JSON."""
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def json_hash(content: Any) -> str:
-    """Of settings: the first 16 hexadecimal digits of SHA-256 of their JSON."""
+    """A hash of settings: the first 16 hexadecimal digits of SHA-256 of their JSON, keys sorted."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def has_content(path: Path, content: bytes) -> bool:
-    """Whether a file has that content."""
+    """Whether a file exists with exactly this content."""
     return path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content
 
 
 @contextmanager
 def add_filename(path: Path) -> Iterator[None]:
-    """Errors of the disk name the file: those of writing to an open one do not."""
+    """Add the file's name to errors of the disk, which have none when they come from an open file."""
     try:
         yield
     except OSError as error:
@@ -130,10 +131,10 @@ def add_filename(path: Path) -> Iterator[None]:
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to. At the end the file, by then on the disk, takes its place at once; after an
-    error nothing changes."""
+    """A temporary path to write to. At the end the file is synced to disk and renamed to `path`; an error changes
+    nothing."""
     partial = path.with_name(f".{path.name}.partial")
-    partial.unlink(missing_ok=True)  # not to write through a link that somebody laid there
+    partial.unlink(missing_ok=True)  # writing would follow a link that somebody put there
     try:
         with add_filename(path):
             yield partial

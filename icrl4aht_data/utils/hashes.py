@@ -1,4 +1,4 @@
-"""TODO."""
+"""Hashes of files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ def file_hash(path: Path) -> str:
 
 
 def git_hash(content: bytes) -> str:
-    """Git's name for a file's content, hexadecimal: the Hub's for what it keeps in git itself."""
+    """Git's hash of a file's content, hexadecimal: the Hub identifies small files by it."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
 
 
 def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
-    """Whether every file (path in the folder -> SHA-256) is as it was.
+    """Whether every file (path in the folder -> SHA-256) still has its hash.
 
     Raises:
         OSError: if one cannot be read.

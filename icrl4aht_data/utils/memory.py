@@ -1,4 +1,4 @@
-"""TODO."""
+"""Free memory, and arrays that are allocated only if they fit into it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import OptionError
 
-_PLENTY = 2**29  # bytes that need no look at what is free
+_PLENTY = 2**29  # bytes; smaller arrays are allocated without a check
+_CGROUPS = (  # limit and use of a control group, versions 2 and 1
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
 
 
 def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray:
-    """np.empty, if the memory is there.
+    """An uninitialised array, if enough memory is free.
 
     Raises:
-        OptionError: says what is too large.
+        OptionError: if not; names what is too large.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size < _PLENTY or size <= free_memory():
@@ -29,25 +33,18 @@ def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray
 
 
 def free_memory() -> int:
-    """Bytes of memory that this process may still take: of the machine, and of its control group if that has less."""
+    """Bytes that this process may still allocate: the machine's, or its control group's if those are fewer."""
     free = []
-    try:
+    with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 free.append(int(line.split()[1]) * 1024)
-    except (OSError, ValueError):
-        pass
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ):
-        try:
+    for limit, used in _CGROUPS:
+        with suppress(OSError, ValueError):  # there is no such group, or its limit is "max"
             free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
-        except (OSError, ValueError):  # no such group, or "max"
-            continue
     if free:
         return max(0, min(free))
-    try:  # no Linux: half of the machine's memory
+    try:  # not Linux: half of the machine's memory
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     except (AttributeError, ValueError, OSError):
         return 4 * 2**30

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Paths that stay inside a release folder, on every system."""
 
 from __future__ import annotations
 
@@ -11,60 +11,49 @@ from pathlib import Path
 from icrl4aht_data.errors import UnsafePathError
 
 LARGEST = 4 * 2**30
-"""Bytes that a file of a release may have, if it is no shard."""
+"""Most bytes of a release's file that is not a shard."""
 
-
-_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # a name that Windows keeps for itself
-
-
+_WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _RESERVED = re.compile(r'[\\:*?"<>|]')
-
-
-_PART = 200  # bytes between two slashes: what is written beside a file has a longer name
+_PART_BYTES = 200  # between two slashes; leaves room for the longer names of temporary files
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """The names of all that is in a folder, at any depth, but for folders; links are not followed."""
+    """Names of everything in a folder, at any depth, except folders; symbolic links are not followed."""
     folders = [""]
     while folders:
-        at = folders.pop()
-        entries = _entries(folder / at)
-        if entries is None and at:
-            yield at
-        for name, is_folder in entries or ():
+        prefix = folders.pop()
+        try:
+            with os.scandir(folder / prefix) as found:
+                entries = [(prefix + entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
+        except OSError:
+            if prefix:  # a folder that cannot be listed is itself reported
+                yield prefix
+            continue
+        for name, is_folder in entries:
             if is_folder:
-                folders.append(f"{at}{name}/")
+                folders.append(f"{name}/")
             else:
-                yield at + name
-
-
-def _entries(folder: Path) -> list[tuple[str, bool]] | None:
-    """What is in a folder: names, and whether each is a folder; None if it cannot be read."""
-    try:
-        with os.scandir(folder) as found:
-            return [(entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
-    except OSError:
-        return None
+                yield name
 
 
 def is_inside(name: str) -> bool:
     """Whether a relative path names a file below its root on every system: no "..", drive, backslash, control code."""
     if len(name) >= 1024 or not name.isprintable() or _RESERVED.search(name):
         return False
-    return all(map(_is_part, name.split("/")))
-
-
-def _is_part(part: str) -> bool:
-    return 0 < len(part.encode()) <= _PART and part[-1] not in ". " and not _DEVICE.fullmatch(part)
+    return all(
+        0 < len(part.encode()) <= _PART_BYTES and part[-1] not in ". " and not _WINDOWS_DEVICE.fullmatch(part)
+        for part in name.split("/")
+    )
 
 
 def resolve_inside(folder: Path, name: str) -> Path:
-    """The path of a release's file, if it is in the release, symbolic links followed, and a file or a folder if it is.
+    """The path of a release's file, checked to stay in the release and to be a file or folder if it exists.
 
-    A folder of the Hub's cache holds links to the blobs beside its snapshots; these are followed as well.
+    A snapshot folder of the Hub's cache contains links to blobs outside of it; these are allowed.
 
     Raises:
-        UnsafePathError: names both.
+        UnsafePathError: names the folder and the file.
     """
     path = folder / name
     if not is_inside(name):
@@ -79,7 +68,7 @@ def resolve_inside(folder: Path, name: str) -> Path:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return path
-    except (OSError, RuntimeError) as error:  # links in a circle, names that this disk does not take
+    except (OSError, RuntimeError) as error:  # circular links, or names that this disk does not accept
         raise UnsafePathError(f"{path}: cannot be followed: {error}") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise UnsafePathError(f"{path}: neither a file nor a folder; do not use this release")

@@ -1,4 +1,4 @@
-"""The project's `cards` folder: where its files are, and how templates and tables are filled."""
+"""The project's `cards` folder: finding its files, filling templates, Markdown tables."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ _PACKAGE = Path(__file__).parent.parent
 
 
 def card_file(name: str, package: Path = _PACKAGE) -> Path:
-    """A template, table, licence or citation by its file name.
+    """Path of a template, table, licence or citation.
 
-    In an installed package all of them are in its folder `cards`; in a checkout in `cards` beside the package, but for
-    LICENSE and CITATION.cff, which are beside that.
+    An installed package contains the folder `cards`. In a checkout it is next to the package, and LICENSE and
+    CITATION.cff are in the checkout's root.
 
     Args:
+        name: file name.
         package: the folder of the package.
 
     Raises:
-        OptionError: if there is none.
+        OptionError: if there is no such file.
     """
     for folder in (package / "cards", package.parent / "cards", package.parent):
         if (folder / name).is_file():
@@ -30,7 +31,7 @@ def card_file(name: str, package: Path = _PACKAGE) -> Path:
 
 
 def fill(template: str, **values: str) -> str:
-    """The text of a template of the folder `cards`, every $name replaced.
+    """The text of a template in the folder `cards`, with every $name replaced.
 
     Raises:
         KeyError: if a value is missing.
@@ -41,8 +42,5 @@ def fill(template: str, **values: str) -> str:
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: int = 0) -> str:
     """A Markdown table; its last `right` columns are aligned to the right."""
     rule = "|" + "---|" * (len(header) - right) + "---:|" * right
-    return "\n".join([_row(header), rule, *map(_row, rows)])
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    lines = [f"| {' | '.join(cells)} |" for cells in (header, *rows)]
+    return "\n".join([lines[0], rule, *lines[1:]])

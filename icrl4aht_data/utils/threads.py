@@ -1,4 +1,4 @@
-"""One pool of threads for decoding and rendering, whose inner loops run without the interpreter's lock."""
+"""One pool of threads for decoding and rendering, whose inner loops release the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -10,17 +10,23 @@ _pool: ThreadPoolExecutor | None = None
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Number of cores that this process may run on."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every system
+    except AttributeError:  # the system has no affinities
         return os.cpu_count() or 1
 
 
 def in_slices(work: Callable[[int, int], None], n: int, threads: int, least: int = 1) -> None:
-    """Call `work(start, stop)` for slices that cover 0..n, on up to `threads` threads, none shorter than `least`.
+    """Call `work(start, stop)` for slices that cover 0..n, on up to `threads` threads.
 
-    The caller's thread does its share. An exception of any slice reaches the caller, after all have ended.
+    The caller's thread works too. If slices raise, one of the errors is raised here after all slices have ended.
+
+    Args:
+        work: handles the range from `start` to `stop`.
+        n: length of the complete range.
+        threads: at most this many slices.
+        least: shortest slice that is worth a thread.
     """
     parts = max(1, min(threads, n // max(least, 1)))
     edges = [n * part // parts for part in range(parts + 1)]
@@ -41,10 +47,10 @@ def _get_pool() -> ThreadPoolExecutor:
     return _pool
 
 
-def _forget() -> None:
+def _forget_pool() -> None:
     global _pool
     _pool = None
 
 
-if hasattr(os, "register_at_fork"):  # a child process has none of its parent's threads
-    os.register_at_fork(after_in_child=_forget)
+if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
+    os.register_at_fork(after_in_child=_forget_pool)

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Checks of option values."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from icrl4aht_data.errors import OptionError
 
 
 def check_int(name: str, value: Any, least: int) -> int:
-    """The value as an int, if it is one from `least` to 2**63.
+    """The value as an int, checked to be an integer from `least` to 2**63 - 1.
 
     Raises:
-        OptionError: otherwise.
+        OptionError: names the option.
     """
     try:
         number = operator.index(value)
     except TypeError as error:
-        raise OptionError(f"{name} = {value!r}: expected a whole number") from error
+        raise OptionError(f"{name} = {value!r}: expected an integer") from error
     if not least <= number < 2**63:
         raise OptionError(f"{name} = {number}: expected at least {least} and below 2**63")
     return number

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.chunks import BETWEEN, chunk_places, chunk_table_path
+from icrl4aht_data.format.chunks import BETWEEN, DEFLATE_LEVEL, chunk_locations, chunk_table_path, encode_chunk
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 _Arrays = Mapping[str, np.ndarray]
 
-_DEFLATE_LEVEL = 8
 _BLOCK = 2000  # steps: a chunk of scalars, two of records
 
 
@@ -53,7 +52,7 @@ def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], hi
     with h5py.File(path, "r") as file:
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = checksums
-        places = [place for entry in entries for place in chunk_places(file, kind, entry)]
+        places = [place for entry in entries for place in chunk_locations(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
     np.save(table_path, np.concatenate([table, _between(path, table)]), allow_pickle=False)
 
@@ -89,7 +88,7 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
             dtype=element,
             shuffle=element.itemsize > 1,
             compression="gzip",
-            compression_opts=_DEFLATE_LEVEL,
+            compression_opts=DEFLATE_LEVEL,
         )
 
 
@@ -139,14 +138,3 @@ def _as_stored(field: Field, element: np.dtype, array: np.ndarray, entry: Entry)
     if not np.array_equal(stored, array):
         raise OptionError(f"history {entry.history_id}: field {field.name} has values that {element.base} cannot hold")
     return stored
-
-
-def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
-    """What HDF5's shuffle and deflate filters make of a chunk of `length` rows, the missing ones zero."""
-    raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
-    if itemsize > 1:
-        raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
-    # Short matches among actions, which are drawn at random, cost more than they save.
-    strategy = zlib.Z_FILTERED if rows.ndim == 1 else zlib.Z_DEFAULT_STRATEGY
-    deflater = zlib.compressobj(_DEFLATE_LEVEL, strategy=strategy)
-    return deflater.compress(raw) + deflater.flush()

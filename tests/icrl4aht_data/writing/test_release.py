@@ -18,14 +18,13 @@ from hypothesis import strategies as st
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError, RootNotFoundError
-from icrl4aht_data.format.chunks import decode_chunk
+from icrl4aht_data.format.chunks import decode_chunk, encode_chunk
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, episode_returns
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.shard_writer import encode_chunk
 from tests.helpers.paths import ROOT
 from tests.helpers.random_play import make_tasks, play, random_release
 
