@@ -94,7 +94,7 @@ def test_closing_ends_the_thread(sampler):
     del abandoned
     gc.collect()
     deadline = time.monotonic() + 20
-    while workers() and time.monotonic() < deadline:  # what was ordered is still made
+    while workers() and time.monotonic() < deadline:  # submitted batches are still made
         time.sleep(0.01)
     assert workers() == 0
 
