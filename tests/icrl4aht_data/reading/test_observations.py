@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from generation.cli import cli as generation
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
@@ -98,8 +99,6 @@ class TestConversion:
             from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
 
     def test_generation_offers_the_other_kinds_only(self):
-        from generation.cli import cli as generation
-
         (kind,) = (p for p in generation.commands["generate"].params if p.name == "kind")
         assert tuple(kind.type.choices) == KINDS == ("full", "lite")  # type: ignore[attr-defined]
 
