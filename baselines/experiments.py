@@ -1,34 +1,33 @@
-"""The paper's experiments as commands: sweeps, ablations, held-out learned teammates (Sec. 5.3 and 5.4, App. F).
+"""The paper's experiments: sweeps, ablations, held-out learned teammates (Sec. 5.3 and 5.4, App. F).
 
-An experiment is a table of entries; each entry is trained on each layout and evaluated on that layout's tasks:
+An experiment is a list of entries; each entry is trained on each layout and evaluated on that layout's tasks:
 
-    OUT/<entry>/<layout>/run          what `train` makes
-    OUT/<entry>/<layout>/results      what `evaluate` makes
-    OUT/report/                       the report of them all, report.html among it
+    OUT/<method>-<entry>/<layout>/run          run folder, as of `train`
+    OUT/<method>-<entry>/<layout>/results      results, as of `evaluate`
+    OUT/report/                                report of all entries, with report.html
 
-Everything is resumable: what is finished is not done again, what was stopped goes on, and a folder of other settings is
-refused.
+Everything resumes: finished parts are kept, stopped ones continue, and folders of other settings are refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.agents.egos import Acting, find_agent
 from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import get_protocol
-from baselines.methods.method import SIZES, ModelOptions
+from baselines.evaluate.protocols import get_protocol, limit_tasks
+from baselines.methods.options import SIZES, ModelOptions
 from baselines.methods.registry import get_method
-from baselines.report.page import write_page_with_films
-from baselines.report.provenance import note_results
-from baselines.report.results import merge, read_run
-from baselines.report.write import write_report
-from baselines.training.histories import HistoryOptions, TrainingTask, prepare
-from baselines.training.trainer import TrainOptions, train
+from baselines.report.page import write_page_with_episodes
+from baselines.report.results import merge, note_results, read_run
+from baselines.report.summary import write_report
+from baselines.training.histories import TrainingTask, prepare
+from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
@@ -48,24 +47,40 @@ TESTED_ON = {layout: layout for layout in TRACKS["teammate"]["train"]} | dict(
 
 @dataclass(frozen=True)
 class ExperimentEntry:
-    """One model of an experiment: what differs from the defaults of `train`."""
+    """One model of an experiment: the differences from the default settings.
 
-    name: str  # of its folder, without the method
-    model: dict[str, Any] = field(default_factory=dict)  # of `ModelOptions`
-    train: dict[str, Any] = field(default_factory=dict)  # of `TrainOptions`
-    variant: dict[str, Any] | None = None  # of a sweep: what is varied and its value here
+    Attributes:
+        name: of its folder, without the method.
+        model: values of `ModelOptions`.
+        train: values of `TrainOptions`.
+        variant: of a sweep: the varied quantity and its value.
+    """
+
+    name: str
+    model: dict[str, Any] = field(default_factory=dict)
+    train: dict[str, Any] = field(default_factory=dict)
+    variant: dict[str, Any] | None = None
 
 
 class Experiment(NamedTuple):
-    """A table of entries, and where the paper runs them."""
+    """Entries of an experiment, and the layouts that the paper runs them on.
+
+    Attributes:
+        title: for the report.
+        entries: one per model.
+        layouts: to train on.
+        varies: options that distinguish the entries and can therefore not be set for all of them.
+        held_out: whether to evaluate with learned teammates held out of training, on the training layouts.
+    """
 
     title: str
     entries: tuple[ExperimentEntry, ...]
-    layouts: tuple[str, ...]  # training layouts
-    held_out: bool = False  # whether against learned teammates held out of training, on the training layouts
+    layouts: tuple[str, ...]
+    varies: tuple[str, ...] = ()
+    held_out: bool = False
 
 
-def _size(name: str) -> ExperimentEntry:
+def _size_entry(name: str) -> ExperimentEntry:
     layers, width, steps = SIZES[name]
     return ExperimentEntry(name, {"layers": layers, "width": width}, {"steps": steps}, {"size": name})
 
@@ -76,8 +91,14 @@ EXPERIMENTS = {
         "Context length",
         tuple(ExperimentEntry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
         ("test_wide", "demo_wide"),
+        varies=("context",),
     ),
-    "sweep size": Experiment("Model scale and training budget", tuple(map(_size, SIZES)), tuple(TESTED_ON)),
+    "sweep size": Experiment(
+        "Model scale and training budget",
+        tuple(map(_size_entry, SIZES)),
+        tuple(TESTED_ON),
+        varies=("layers", "width"),
+    ),
     "ablate ta": Experiment(
         "Teammate actions and auxiliary losses",
         (
@@ -87,6 +108,7 @@ EXPERIMENTS = {
             ExperimentEntry("ta-next_obs", {"teammate_actions": True, "next_obs": True}),
         ),
         ("test_wide", "demo_wide", "cramped_up"),
+        varies=("teammate_actions", "next_obs"),
     ),
     "heldout-rl": Experiment(
         "Held-out learned teammates", (ExperimentEntry("plain"),), tuple(TESTED_ON), held_out=True
@@ -97,141 +119,172 @@ EXPERIMENTS = {
 
 @dataclass(frozen=True)
 class ExperimentPlan:
-    """How an experiment is run; the defaults are the paper's."""
+    """Settings of an experiment's run; the defaults are the paper's.
+
+    Attributes:
+        methods: to train.
+        layouts: to train on; by default those of the experiment that the release has.
+        root: folder or address of a release; None for the bundled mini release.
+        suite: folder of learned teammates; required for "heldout-rl".
+        train: values of `TrainOptions` for all entries, such as steps.
+        model: values of `ModelOptions` for all entries.
+        values: names of the entries to run; all by default.
+        families: teammate families to evaluate with; all by default.
+        tasks: tasks of each teammate kind and layout, at most.
+        episodes: of a task; the protocol's by default.
+        seeds: number of times that every task is played.
+        protocol: name of the evaluation protocol.
+        acting: see `agents.egos.ACTING`.
+        gifs: whether the page shows an episode per family.
+        tensorboard: whether training also writes a log for TensorBoard.
+    """
 
     methods: tuple[str, ...] = ("ad", "dpt")
-    layouts: tuple[str, ...] = ()  # to train on; those of the experiment that the release has
-    root: str | None = None  # a release, its folder or address; the bundled mini release by default
-    suite: Path | None = None  # learned teammates; for "heldout-rl"
-    train: dict[str, Any] = field(default_factory=dict)  # of `TrainOptions` for all entries: steps, batch_size, ..
-    model: dict[str, Any] = field(default_factory=dict)  # of `ModelOptions` for all entries
-    values: tuple[str, ...] = ()  # only the entries of these names
-    families: tuple[str, ...] = ()  # only these teammate families
-    tasks: int | None = None  # at most so many of each kind of teammate and layout
-    episodes: int | None = None  # of a task, instead of 100
-    seeds: int = 1  # how often every task is played
+    layouts: tuple[str, ...] = ()
+    root: str | None = None
+    suite: Path | None = None
+    train: dict[str, Any] = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
+    values: tuple[str, ...] = ()
+    families: tuple[str, ...] = ()
+    tasks: int | None = None
+    episodes: int | None = None
+    seeds: int = 1
     protocol: str = "seeded"
     acting: Acting = "cached"
-    films: bool = True  # whether the page shows an episode per family
-    tensorboard: bool = False  # whether training is also logged for TensorBoard
+    gifs: bool = True
+    tensorboard: bool = False
 
 
-class Done(NamedTuple):
-    """What an experiment leaves."""
+class ExperimentOutcome(NamedTuple):
+    """Outcome of an experiment.
+
+    Attributes:
+        report: paths of the files written.
+        notes: facts for the reader, such as layouts that were left out.
+    """
 
     report: list[Path]
-    notes: list[str]  # what was left out
+    notes: list[str]
 
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is, and of how much."""
+ExperimentProgress = Callable[[str, int, int], None]
+"""Called with (description, units done, units)."""
 
 
 def run_experiment(
-    name: str, plan: ExperimentPlan, out: Path, progress: Progress = lambda what, done, of: None
-) -> Done:
-    """Train, evaluate and report all entries of an experiment, or go on with them.
+    name: str, plan: ExperimentPlan, out: Path, progress: ExperimentProgress = lambda what, done, total: None
+) -> ExperimentOutcome:
+    """Train, evaluate and report all entries of an experiment, or resume it.
 
     Args:
         name: one of `EXPERIMENTS`.
         plan: how.
-        out: the folder, see this module's docstring.
+        out: folder, see this module's docstring.
         progress: called now and then.
 
     Raises:
-        UnknownNameError: for an experiment, method, entry or layout that does not exist.
+        UnknownNameError: for an unknown experiment, method, entry or layout.
         EmptySelectionError: if the release has histories of none of the layouts, or no task is left.
         LabelsMissingError: for DPT on histories without expert actions.
-        OptionError: if a context is longer than a history, or a folder holds a run of other settings; for
-            "heldout-rl", if the suite has no held-out teammates, or one of them was trained with.
+        OptionError: if a context is longer than a history, the plan sets what the experiment varies, or a folder holds
+            a run of other settings; for "heldout-rl", if the suite has no held-out teammates, or one of them is in
+            training.
     """
     if name not in EXPERIMENTS:
         raise unknown("experiment", name, EXPERIMENTS)
     experiment = EXPERIMENTS[name]
-    for method in plan.methods:
-        get_method(method)
-    for value in plan.values:
-        if value not in {entry.name for entry in experiment.entries}:
-            raise unknown(f"setting of {name}", value, [entry.name for entry in experiment.entries])
-    entries = [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
-    layouts, notes = _layouts(experiment, plan)
-    tasks = {layout: _tasks(experiment, plan, layout) for layout in layouts}
+    entries = _chosen_entries(name, plan)
+    layouts, notes = _training_layouts(experiment, plan)
+    tasks = {layout: _test_tasks(experiment, plan, layout) for layout in layouts}
     models = list(product(plan.methods, entries, layouts))
     for model in models:
-        _prepared(*model, plan)  # what cannot be trained on fails before any work
+        _prepare_entry(*model, plan)  # impossible trainings fail before any work
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
-        _train(method, entry, layout, plan, folder / "run", progress)
-        _evaluate(entry, tasks[layout], plan, folder, progress, own_tasks=experiment.held_out)
+        _train_entry(method, entry, layout, plan, folder / "run", progress)
+        _evaluate_entry(entry, tasks[layout], plan, folder, progress, own_tasks=experiment.held_out)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"
-    report.append(write_page_with_films(runs, page, films=plan.films, notes=notes, suite=plan.suite))
-    return Done(report, notes)
+    report.append(write_page_with_episodes(runs, page, episodes=plan.gifs, notes=notes, suite=plan.suite))
+    return ExperimentOutcome(report, notes)
 
 
-def _layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
-    """The layouts to train on, and what to say of those left out."""
-    there = {layout.name for layout in load_icrl4aht(plan.root, split="train").layouts}
+def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
+    experiment = EXPERIMENTS[name]
+    for method in plan.methods:
+        get_method(method)
+    names = [entry.name for entry in experiment.entries]
+    for value in plan.values:
+        if value not in names:
+            raise unknown(f"setting of {name}", value, names)
+    for option, value in (plan.train | plan.model).items():
+        if option in experiment.varies:
+            raise OptionError(f"{option} = {value}: `{name}` varies it; choose by --only, such as {names[0]}")
+    return [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
+
+
+def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
+    """Returns the layouts to train on, and a note on those that were left out."""
+    available = {layout.name for layout in load_icrl4aht(plan.root, split="train").layouts}
+    release = plan.root or "the bundled mini release"
     if plan.layouts:
         names = [get_layout(name).name for name in plan.layouts]
         for name in names:
             if name not in TESTED_ON:
                 raise unknown("training layout", name, TESTED_ON)
-        missing = [name for name in names if name not in there]
+        missing = [name for name in names if name not in available]
         if missing:
             raise EmptySelectionError(
-                f"{plan.root or 'the bundled mini release'}: no training histories on {', '.join(missing)}; it has "
-                f"{', '.join(sorted(there))}: choose among them, or give a --root that has the others"
+                f"{release}: no training histories on {', '.join(missing)}; it has {', '.join(sorted(available))}: "
+                f"choose among them, or give a --root that has the others"
             )
         return names, []
-    names = [name for name in experiment.layouts if name in there]
+    names = [name for name in experiment.layouts if name in available]
     if not names:
         raise EmptySelectionError(
-            f"{plan.root or 'the bundled mini release'}: no training histories on {', '.join(experiment.layouts)}, "
-            f"where the paper runs this; it has {', '.join(sorted(there))}: give --layout, or another --root"
+            f"{release}: no training histories on {', '.join(experiment.layouts)}, where the paper runs this; it has "
+            f"{', '.join(sorted(available))}: give --layout, or another --root"
         )
-    left = [name for name in experiment.layouts if name not in there]
+    left = [name for name in experiment.layouts if name not in available]
     return names, [f"left out, the release has no training histories of them: {', '.join(left)}"] if left else []
 
 
-def _tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
-    """What a model trained on a layout is tested on."""
+def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
+    """Returns the tasks that a model trained on a layout is tested on."""
     if experiment.held_out:
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
-        on = TESTED_ON[layout]
-        tasks = [task for task in read_tasks(manifest_path(track_of(on), "test")) if task.layout.name == on]
-    there = dict.fromkeys(task.teammate_family for task in tasks)
+        tested_on = TESTED_ON[layout]
+        tasks = read_tasks(manifest_path(track_of(tested_on), "test"))
+        tasks = [task for task in tasks if task.layout.name == tested_on]
+    available = dict.fromkeys(task.teammate_family for task in tasks)
     for family in plan.families:
-        if family not in there:
-            raise unknown("teammate family of these tasks", family, there)
-    tasks = [task for task in tasks if not plan.families or task.teammate_family in plan.families]
-    if plan.tasks is None:
-        return tasks
-    if plan.tasks < 1:
-        raise OptionError(f"tasks = {plan.tasks}: expected at least 1 of each family and layout")
-    kinds = dict.fromkeys(task.teammate_kind for task in tasks)
-    return [task for kind in kinds for task in [t for t in tasks if t.teammate_kind == kind][: plan.tasks]]
+        if family not in available:
+            raise unknown("teammate family of these tasks", family, available)
+    return limit_tasks(
+        [task for task in tasks if not plan.families or task.teammate_family in plan.families], plan.tasks
+    )
 
 
 def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> list[Task]:
-    """The tasks of a suite's held-out manifest on a training layout (paper, App. F, "Held-Out RL Teammates").
+    """Returns the tasks of a suite's held-out manifest on a training layout (paper, App. F, "Held-Out RL Teammates").
 
     Args:
-        suite: a folder that `python -m generation teammates` has made.
+        suite: folder that `python -m generation teammates` made.
         layout: short name.
-        root: the release that models are trained on, whose teammates these must not be.
+        root: the release that models are trained on, which must not have these teammates.
 
     Raises:
         OptionError: if the suite has no held-out teammates there, or one of them is in the release.
     """
     if suite is None:
         raise OptionError("held-out teammates: expected a suite, found none; give --suite, a folder that `python -m "
-                          "generation teammates` has made")  # fmt: skip
+                          "generation teammates` made")  # fmt: skip
     path = suite / "manifests" / f"{track_of(layout)}_heldout.jsonl"
     if not path.is_file():
         raise OptionError(
@@ -245,70 +298,74 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
             f"teammates --suite {suite} --layout {layout}`, or choose another --layout"
         )
     release = load_icrl4aht(root, layout=layout).root
-    met = {
+    trained_with = {
         task.teammate["theta"]["sha256"]: task.task_id
         for task in read_tasks(release / TASKS)
         if task.teammate["kind"] == "rl" and task.split == "train"
     }
     for task in tasks:
         digest = task.teammate["theta"]["sha256"]
-        if digest in met:
+        if digest in trained_with:
             raise OptionError(
-                f"{path}: {task.task_id} has the teammate of {met[digest]} in {release}, which models are trained on; "
-                f"expected teammates that are not in training: give the suite that the release was made of"
+                f"{path}: {task.task_id} has the teammate of {trained_with[digest]} in {release}, which models are "
+                f"trained on; expected teammates that are not in training: give the suite that the release was made "
+                f"from"
             )
     return tasks
 
 
-def _prepared(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
+def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
     options = TrainOptions(**{**entry.train, **plan.train})
     model = ModelOptions(**{**entry.model, **plan.model})
     try:
         return prepare(method, model, options, HistoryOptions((layout,), plan.root))
     except (LabelsMissingError, OptionError) as error:
-        told = f"{method} {entry.name} on {layout}: {error}; or leave it out, by --method, --only and --layout"
-        raise type(error)(told) from error
+        hint = "or leave it out, by --method, --only and --layout"
+        error.args = (f"{method} {entry.name} on {layout}: {error}; {hint}",)
+        raise
 
 
-def _train(
-    method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan, folder: Path, progress: Progress
+def _train_entry(
+    method: str,
+    entry: ExperimentEntry,
+    layout: str,
+    plan: ExperimentPlan,
+    folder: Path,
+    progress: ExperimentProgress,
 ) -> None:
-    job = _prepared(method, entry, layout, plan)
-    options = job.options
+    job = _prepare_entry(method, entry, layout, plan)
+    steps = job.options.steps
     what = f"{job.method.label} {entry.name} on {layout}: training"
-    progress(what, 0, options.steps)
+    progress(what, 0, steps)
     train(
         job.method,
         job.data,
-        options,
+        job.options,
         folder,
         job.about,
         tensorboard=plan.tensorboard,
-        done=lambda step, loss: progress(what, step, options.steps),
+        done=lambda step, loss: progress(what, step, steps),
     )
-    progress(what, options.steps, options.steps)
+    progress(what, steps, steps)
 
 
-def _evaluate(
+def _evaluate_entry(
     entry: ExperimentEntry,
     tasks: Sequence[Task],
     plan: ExperimentPlan,
     folder: Path,
-    progress: Progress,
+    progress: ExperimentProgress,
     *,
     own_tasks: bool,
 ) -> None:
     agent = find_agent(str(folder / "run"), plan.acting)
-    protocol = get_protocol(plan.protocol)
-    if plan.episodes is not None:
-        protocol = replace(protocol, episodes=plan.episodes)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
     what = f"{agent.name} {entry.name} on {tasks[0].layout.name}: evaluation"
     evaluate(
         agent.name,
         agent.make,
         tasks,
-        protocol,
+        get_protocol(plan.protocol, plan.episodes),
         seeds=range(plan.seeds),
         suite=plan.suite,
         out=folder / "results",

@@ -1,21 +1,21 @@
 """Collection: speed, memory and size on disk: `make bench-collect`.
 
-One JSON line each for
-  speed   recorded transitions/s of the whole path (PPO, recording, writing), and the share of the time that recording
-          and writing take
-  memory  the highest resident memory of a collection with the paper's 1024 environments beside that of its learner
-          alone, each in a process of its own
-  bytes   per transition of the bundled histories, everything included: `lite` and `full` releases beside the paper's
-          format (App. D.1: float32 observations, gzip-6, one group per history) of the same histories
+One JSON line for each part:
+
+    speed   recorded transitions/s of the complete path (PPO, recording, writing), and the share of the time that
+            recording and writing take
+    memory  highest resident memory of a collection with the paper's 1024 environments and of its learner alone, each
+            in its own process
+    bytes   bytes per transition of the bundled histories, everything included: `lite` and `full` releases compared
+            with the paper's format (App. D.1: float32 observations, gzip-6, one group per history)
 """
 
 from __future__ import annotations
 
 import json
 import multiprocessing
-import resource
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -26,7 +26,7 @@ import click
 import h5py
 import jax
 
-from benchmarks.histories import folder_size
+from benchmarks.common import COUNT, folder_size, peak_memory, print_line
 from generation.collection.task import make_learner, run_task
 from generation.collection.task_folder import last_timing
 from generation.learners.network import Widths
@@ -37,7 +37,6 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
-from icrl4aht_data.reading.history import History
 from icrl4aht_data.writing.published import PUBLISHED_CHUNK
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
@@ -49,15 +48,14 @@ _PAPER_DTYPES = {
     "teammate_actions": "int32",
     "expert_actions": "int32",
 }
-_PARTS = ("speed", "memory", "bytes")
 
 
 class _EnoughError(Exception):
-    """Stops a collection that only had to be measured."""
+    """Stops a collection after the updates to measure."""
 
 
 def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
-    """The timing of a collection of the profile's last task after so many updates."""
+    """Timing of a collection of the profile's last heuristic task after a number of updates."""
     task = _task(profile)
 
     def report(update: int, metrics: dict[str, float]) -> None:
@@ -71,8 +69,8 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
         return last_timing(artefact) or {}
 
 
-def speed(profile_name: str, updates: int) -> dict[str, Any]:
-    """The learner's state is saved every two seconds here, fifteen times as often as when collecting."""
+def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
+    """Speed of a collection that saves the learner's state every two seconds, 15 times as often as usual."""
     profile = load_profile(profile_name)
     timing = collect_some(profile, updates, save_seconds=2)
     return {
@@ -84,7 +82,8 @@ def speed(profile_name: str, updates: int) -> dict[str, Any]:
     }
 
 
-def memory(updates: int) -> dict[str, Any]:
+def collection_memory(updates: int) -> dict[str, Any]:
+    """Peak memory of a collection and of its learner alone, in MiB."""
     peaks = {}
     for part in (learn_only, learn_and_record):
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
@@ -106,92 +105,80 @@ def learn_only(updates: int) -> float:
     state, update = jax.jit(learner.init)(jax.random.key(0)), jax.jit(learner.update, donate_argnums=0)
     for _ in range(updates):
         state, *_ = jax.block_until_ready(update(state))
-    return _peak()
+    return peak_memory()
 
 
 def learn_and_record(updates: int) -> float:
-    """Peak MiB of a process that collects; the histories are synced and the state saved at every update."""
+    """Peak MiB of a process that collects, and writes histories and the learner's state at every update."""
     collect_some(_wide(), updates, save_seconds=0)
-    return _peak()
+    return peak_memory()
 
 
 def _task(profile: Profile) -> Task:
-    """A task beside a teammate that needs no training."""
+    """A task with a teammate that needs no training."""
     return replace(profile, presets=("default",)).heuristic_tasks()[-1]
 
 
 def _wide() -> Profile:
-    """The paper's streams and roll-outs, with a network that does not make this long."""
+    """The paper's number of streams and rollout length, with a network that is small enough to be fast."""
     profile = load_profile("paper")
     return replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
 
 
-def _peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def sizes(streams: int) -> dict[str, Any]:
+def stored_bytes(streams: int) -> dict[str, Any]:
     """Bytes per transition of the first streams of every task of the bundled release, in all formats."""
     dataset = load_icrl4aht(obs="uint8")
-    tasks = read_tasks(dataset.root / TASKS)
-    chosen = {task.task_id: dataset.filter(task_id=task.task_id)[:streams] for task in tasks}
+    chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
     new = [
-        NewTask(
-            task,
-            Provenance(),
-            len(chosen[task.task_id]),
-            lambda part=chosen[task.task_id]: map(NewHistory.copied, part),
-        )
-        for task in tasks
+        NewTask(task, Provenance(), len(part), lambda part=part: map(NewHistory.copied, part)) for task, part in chosen
     ]
-    transitions = sum(history.entry.T for part in chosen.values() for history in part)
+    transitions = sum(history.entry.T for _, part in chosen for history in part)
     with tempfile.TemporaryDirectory() as folder:
-        found = {"paper": folder_size(_paper_format(Path(folder) / "paper", chosen)) / transitions}
+        write_paper_format(Path(folder) / "paper", [part for _, part in chosen])
+        found = {"paper": folder_size(Path(folder) / "paper") / transitions}
         for kind in KINDS:
             root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
             found[kind] = folder_size(root) / transitions
     return {
-        "histories": sum(map(len, chosen.values())),
+        "histories": sum(len(part) for _, part in chosen),
         "transitions": transitions,
         **{f"{name}_bytes_per_transition": round(size, 3) for name, size in found.items()},
         **{f"{kind}_smaller_by": round(found["paper"] / found[kind], 2) for kind in KINDS},
     }
 
 
-def _paper_format(root: Path, chosen: dict[str, Dataset]) -> Path:
-    """One HDF5 file a layout, and the index."""
+def write_paper_format(root: Path, parts: list[Dataset]) -> None:
+    """Write one HDF5 file per layout, and the index."""
     (root / "meta").mkdir(parents=True)
-    for part in chosen.values():
+    for part in parts:
         with h5py.File(root / f"{part[0].entry.layout}.h5", "a") as file, (root / HISTORIES).open("a") as index:
-            for history, (name, array) in _paper_fields(part):
+            for history in part:
                 group = file.require_group(str(history.entry.history_id))
-                chunk = (min(PUBLISHED_CHUNK, len(array)), *array.shape[1:])
-                group.create_dataset(name, data=array, chunks=chunk, compression="gzip", compression_opts=6)
-            index.writelines(json.dumps(entry.to_json()) + "\n" for entry in part.entries)
-    return root
+                for name, dtype in _PAPER_DTYPES.items():
+                    array = history.read(name).astype(dtype)
+                    chunk = (min(PUBLISHED_CHUNK, len(array)), *array.shape[1:])
+                    group.create_dataset(name, data=array, chunks=chunk, compression="gzip", compression_opts=6)
+                index.write(json.dumps(history.entry.to_json()) + "\n")
 
 
-def _paper_fields(part: Dataset) -> Iterator[tuple[History, tuple[str, Any]]]:
-    for history in part:
-        for name, dtype in _PAPER_DTYPES.items():
-            yield history, (name, history.read(name).astype(dtype))
+PARTS_OF_COLLECTION = ("speed", "memory", "bytes")
 
 
 @click.command()
-@click.argument("parts", nargs=-1, type=click.Choice(_PARTS))
-@click.option("--profile", "profile_name", default="smoke", show_default=True, help="Of the speed.")
-@click.option("--updates", default=30, show_default=True, help="Of the speed.")
-@click.option("--wide-updates", default=4, show_default=True, help="Of the memory, 262,144 steps each.")
-@click.option("--streams", default=8, show_default=True, help="Of each task, for the bytes.")
+@click.argument("parts", nargs=-1, type=click.Choice(PARTS_OF_COLLECTION))
+@click.option("--profile", "profile_name", default="smoke", show_default=True, help="Profile of the speed part.")
+@click.option("--updates", type=COUNT, default=30, show_default=True, help="Updates of the speed part.")
+@click.option("--wide-updates", type=COUNT, default=4, show_default=True, help="Updates of the memory part.")
+@click.option("--streams", type=COUNT, default=8, show_default=True, help="Histories of each task in the bytes part.")
 def main(parts: tuple[str, ...], profile_name: str, updates: int, wide_updates: int, streams: int) -> None:
-    """Speed, memory and bytes of a collection, one JSON line each."""
-    measures = {
-        "speed": lambda: speed(profile_name, updates),
-        "memory": lambda: memory(wide_updates),
-        "bytes": lambda: sizes(streams),
+    """Measure speed, memory and bytes of a collection; one JSON line each. An update of memory has 262,144 steps."""
+    measures: dict[str, Callable[[], dict[str, Any]]] = {
+        "speed": lambda: collection_speed(profile_name, updates),
+        "memory": lambda: collection_memory(wide_updates),
+        "bytes": lambda: stored_bytes(streams),
     }
-    for part in parts or _PARTS:
-        click.echo(json.dumps({"benchmark": "collect", "part": part, **measures[part]()}))
+    for part in parts or PARTS_OF_COLLECTION:
+        print_line("collect", part=part, **measures[part]())
 
 
 if __name__ == "__main__":

@@ -1,19 +1,17 @@
-"""Environment steps/s beside JaxMARL's OvercookedV2: `make bench-env`.
+"""Environment steps/s compared with JaxMARL's OvercookedV2: `make bench-env`.
 
 Both run the same jitted loop: random actions, auto-reset, both agents' 5 x 5 observations of every step written into a
 donated buffer. The peer and ours take turns, round by round; a ratio is the median over rounds of the ratio within a
-round. One JSON line per layout, number of environments and what is written:
+round. One JSON line per layout, number of environments, and content of the buffer:
 
-    uint8    observations as uint8, by both (the peer's int32 ones are cast as they are written)
-    float32  the same as float32
-    state    ours the state record, from which observations are rendered where used; the peer's observations as uint8
+    uint8    observations as uint8 (the peer's int32 ones are cast as they are written)
+    float32  observations as float32
+    state    state records of ours, from which observations are rendered where used; the peer's observations as uint8
 """
 
 from __future__ import annotations
 
-import json
-import statistics
-import time
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -22,6 +20,7 @@ import click
 import jax
 import jax.numpy as jnp
 
+from benchmarks.common import COUNT, print_line, rates_in_turn, ratio_facts
 from benchmarks.peers import jaxmarl_environment
 from generation.env import Environment
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -29,13 +28,14 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")
 ENVIRONMENTS = (64, 1024)
 WRITTEN = ("uint8", "state", "float32")
-STEPS = 51_200  # of all environments together, in one call
+STEPS = 51_200  # in one call, of all environments together
 
-Step = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
-"""(key, state, actions (N, 2)) -> state, what to write (N, ...), reward (N,)"""
+StepEnvironments = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
+"""(key, state, actions int32 (N, 2)) -> state, array to write (N, ...), reward float32 (N,)."""
 
 
-def our_game(layout: Layout, n: int, written: str) -> tuple[Any, Step]:
+def our_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironments]:
+    """Initial state and step function of n environments of ours."""
     env = Environment(layout)
 
     def step(key, state, actions):
@@ -48,7 +48,8 @@ def our_game(layout: Layout, n: int, written: str) -> tuple[Any, Step]:
     return env.init(jax.random.split(jax.random.key(0), n)), step
 
 
-def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, Step]:
+def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironments]:
+    """Initial state and step function of n environments of JaxMARL's."""
     env = jaxmarl_environment(layout)
     dtype = jnp.float32 if written == "float32" else jnp.uint8
 
@@ -61,69 +62,47 @@ def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, Step]:
     return jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), n))[1], step
 
 
-class Loop:
-    """A compiled rollout of one game, callable round by round."""
+def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
+    """A compiled call that plays `STEPS` steps with random actions and waits for them; each goes on from the last."""
+    state, step = game
+    steps = STEPS // n
 
-    def __init__(self, game: tuple[Any, Step], n: int) -> None:
-        self.state, step = game
-        self.steps = STEPS // n
-        self.n = n
+    @partial(jax.jit, donate_argnums=2)
+    def run(key, state, buffer):
+        def one_step(t, carry):
+            state, buffer, total = carry
+            action_key, step_key = jax.random.split(jax.random.fold_in(key, t))
+            actions = jax.random.randint(action_key, (n, 2), 0, 6)
+            state, written, reward = step(step_key, state, actions)
+            return state, jax.lax.dynamic_update_index_in_dim(buffer, written, t, 0), total + reward
 
-        @partial(jax.jit, donate_argnums=2)
-        def run(key, state, buffer):
-            def one(t, carry):
-                state, buffer, total = carry
-                acting, playing = jax.random.split(jax.random.fold_in(key, t))
-                actions = jax.random.randint(acting, (n, 2), 0, 6)
-                state, seen, reward = step(playing, state, actions)
-                return state, jax.lax.dynamic_update_index_in_dim(buffer, seen, t, 0), total + reward
+        return jax.lax.fori_loop(0, steps, one_step, (state, buffer, jnp.zeros(n)))
 
-            return jax.lax.fori_loop(0, self.steps, one, (state, buffer, jnp.zeros(n)))
+    written = jax.eval_shape(step, jax.random.PRNGKey(0), state, jnp.zeros((n, 2), jnp.int32))[1]
+    carry, number = (state, jnp.zeros((steps, *written.shape), written.dtype)), 0
 
-        self._run = run
-        actions = jnp.zeros((n, 2), jnp.int32)
-        seen = jax.eval_shape(step, jax.random.PRNGKey(0), self.state, actions)[1]
-        self.buffer = jnp.zeros((self.steps, *seen.shape), seen.dtype)
-
-    def steps_per_second(self, number: int) -> float:
-        started = time.perf_counter()
-        key = jax.random.PRNGKey(number)
-        self.state, self.buffer, total = self._run(key, self.state, self.buffer)
+    def play() -> None:
+        nonlocal carry, number
+        state, buffer, total = run(jax.random.PRNGKey(number), *carry)
+        carry, number = (state, buffer), number + 1
         jax.block_until_ready(total)
-        return self.steps * self.n / (time.perf_counter() - started)
 
-
-def compare(layout: Layout, n: int, written: str, rounds: int) -> dict[str, Any]:
-    """One JSON line."""
-    ours, peer = Loop(our_game(layout, n, written), n), Loop(peer_game(layout, n, written), n)
-    for loop in (ours, peer):
-        loop.steps_per_second(0)  # compiles
-    pairs = [(ours.steps_per_second(r), peer.steps_per_second(r)) for r in range(1, rounds + 1)]
-    ratios = [a / b for a, b in pairs]
-    return {
-        "benchmark": "env",
-        "layout": layout.name,
-        "environments": n,
-        "written": written,
-        "steps_per_second": round(statistics.median(a for a, _ in pairs)),
-        "jaxmarl_steps_per_second": round(statistics.median(b for _, b in pairs)),
-        "ratio": round(statistics.median(ratios), 1),
-        "ratio_min": round(min(ratios), 1),
-        "ratio_max": round(max(ratios), 1),
-    }
+    play()  # compiles
+    return play
 
 
 @click.command()
 @click.option("--layout", "layouts", multiple=True, default=LAYOUTS, show_default=True)
-@click.option("--environments", multiple=True, type=int, default=ENVIRONMENTS, show_default=True)
+@click.option("--environments", multiple=True, type=COUNT, default=ENVIRONMENTS, show_default=True)
 @click.option("--written", multiple=True, type=click.Choice(WRITTEN), default=WRITTEN, show_default=True)
-@click.option("--rounds", default=7, show_default=True)
+@click.option("--rounds", type=COUNT, default=7, show_default=True)
 def main(layouts: tuple[str, ...], environments: tuple[int, ...], written: tuple[str, ...], rounds: int) -> None:
-    """Environment steps/s beside JaxMARL's, one JSON line per setting."""
-    for name in layouts:
-        for n in environments:
-            for what in written:
-                click.echo(json.dumps(compare(get_layout(name), n, what, rounds)))
+    """Compare environment steps/s with JaxMARL's; one JSON line per setting."""
+    for name, n, what in itertools.product(layouts, environments, written):
+        layout = get_layout(name)
+        ours, peer = (rollout(game(layout, n, what), n) for game in (our_game, peer_game))
+        facts = ratio_facts(rates_in_turn(ours, peer, STEPS // n * n, rounds), "jaxmarl")
+        print_line("env", layout=layout.name, environments=n, written=what, **facts)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""Evaluation speed per teammate family beside the environment alone: `make bench-eval`.
+"""Evaluation speed per teammate family compared with the environment alone: `make bench-eval`.
 
 One JSON line per family: episode-steps/s of the evaluator with the random ego on the family's tasks of one layout, and
-of the bare environment (random actions, no teammate, nothing observed) with as many tables, taken in turn. A last line
-says what all 160 tasks take.
+of as many bare environments (random actions, no teammate, no observations), measured in turn. The last line has the
+seconds of all 160 tasks.
 """
 
 from __future__ import annotations
 
-import json
 import statistics
-import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +20,7 @@ from baselines.agents.egos import random
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.rollout import EvaluationRollout, task_key
+from benchmarks.common import COUNT, elapsed, print_line, rates_in_turn
 from generation.env import Environment
 from generation.teammates.instances import published_tasks
 from generation.teammates.registry import build
@@ -31,7 +31,7 @@ _EPISODES = 20
 
 
 def evaluator(layout: Layout, family: str) -> tuple[Any, int]:
-    """A function that plays one episode of the family's tasks, and the number of tasks."""
+    """A function that plays one episode of every task of a family, and the number of tasks."""
     tasks = [t for t in published_tasks(track_of(layout.name)) if (t.layout, t.teammate_kind) == (layout, family)]
     mates = [build(layout, task.teammate, noise="seeded") for task in tasks]
     rollout = EvaluationRollout(layout, random(layout), mates, replace(PROTOCOLS["seeded"], episodes=_EPISODES))
@@ -41,7 +41,7 @@ def evaluator(layout: Layout, family: str) -> tuple[Any, int]:
 
 
 def bare_environment(layout: Layout, n: int) -> Any:
-    """A function that plays one episode of n tables with random actions."""
+    """A function that plays one episode of n environments with random actions."""
     env = Environment(layout, PROTOCOLS["seeded"].steps)
 
     @jax.jit
@@ -56,44 +56,39 @@ def bare_environment(layout: Layout, n: int) -> Any:
     return lambda: play(state, jax.random.key(1))
 
 
-def steps_per_second(play: Any, n: int) -> float:
-    started = time.perf_counter()
-    for _ in range(_EPISODES):
-        jax.block_until_ready(play())
-    return _EPISODES * n * PROTOCOLS["seeded"].steps / (time.perf_counter() - started)
+def play_episodes_of(play: Callable[[], Any]) -> Callable[[], None]:
+    """A function that plays `_EPISODES` episodes one after the other; compiled."""
+    jax.block_until_ready(play())
 
+    def play_all() -> None:
+        for _ in range(_EPISODES):
+            jax.block_until_ready(play())
 
-def whole_benchmark() -> dict[str, Any]:
-    """The 160 test tasks of both tracks, 100 episodes each, with the random ego, compiling included."""
-    tasks = [task for track in TRACKS for task in published_tasks(track)]
-    started = time.perf_counter()
-    evaluate("random", random, tasks, PROTOCOLS["seeded"])
-    return {"benchmark": "eval-all", "tasks": len(tasks), "seconds": round(time.perf_counter() - started, 1)}
+    return play_all
 
 
 @click.command()
 @click.option("--layout", "layout_name", default="demo_wide", show_default=True)
-@click.option("--rounds", default=5, show_default=True)
+@click.option("--rounds", type=COUNT, default=5, show_default=True)
 def main(layout_name: str, rounds: int) -> None:
-    """Episode-steps/s per teammate family beside the environment alone, one JSON line each, then all 160 tasks."""
-    layout = get_layout(layout_name)
+    """Print episode-steps/s per teammate family and of the environment alone, then the seconds of all 160 tasks."""
+    layout, protocol = get_layout(layout_name), PROTOCOLS["seeded"]
     for family, short in HEURISTIC_KINDS.items():
-        ours, n = evaluator(layout, family)
-        bare = bare_environment(layout, n)
-        for warm in (ours, bare):
-            jax.block_until_ready(warm())
-        pairs = [(steps_per_second(ours, n), steps_per_second(bare, n)) for _ in range(rounds)]
-        line = {
-            "benchmark": "eval",
-            "layout": layout.name,
-            "family": short,
-            "tasks": n,
-            "steps_per_second": round(statistics.median(a for a, _ in pairs)),
-            "environment_steps_per_second": round(statistics.median(b for _, b in pairs)),
-            "share_of_environment_speed": round(statistics.median(a / b for a, b in pairs), 3),
-        }
-        click.echo(json.dumps(line))
-    click.echo(json.dumps(whole_benchmark()))
+        play, n = evaluator(layout, family)
+        ours, bare = play_episodes_of(play), play_episodes_of(bare_environment(layout, n))
+        pairs = rates_in_turn(ours, bare, _EPISODES * n * protocol.steps, rounds)
+        print_line(
+            "eval",
+            layout=layout.name,
+            family=short,
+            tasks=n,
+            steps_per_second=round(statistics.median(a for a, _ in pairs)),
+            environment_steps_per_second=round(statistics.median(b for _, b in pairs)),
+            share_of_environment_speed=round(statistics.median(a / b for a, b in pairs), 3),
+        )
+    tasks = [task for track in TRACKS for task in published_tasks(track)]
+    seconds = elapsed(lambda: evaluate("random", random, tasks, protocol))  # compiling included
+    print_line("eval-all", tasks=len(tasks), seconds=round(seconds, 1))
 
 
 if __name__ == "__main__":

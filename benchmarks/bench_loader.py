@@ -1,13 +1,13 @@
-"""Batches/s of every way of holding data beside two readers of the published format: `make bench-loader`.
+"""Batches/s with every cache compared with two readers of the published format: `make bench-loader`.
 
-All read the same histories (made from the bundled ones, each shifted by whole episodes) and make the same windows:
+All read the same histories (bundled ones, rotated by complete episodes) and make the same windows:
 
     published   h5py, float32 gzip-6, chunks of 4096, slices merged per history, 512 MB chunk cache, one thread
     fair        the same data in chunks of 500, read_direct into a preallocated batch
     ours        ram, mmap, stream (with and without decoded chunks kept); states, uint8, float32; batch buffers reused
 
-Readers take turns, round by round; a ratio is the median over rounds of the ratio within a round. Targets are printed
-beside what was measured. One JSON line each.
+Readers take turns, round by round; a ratio is the median over rounds of the ratio within a round. One JSON line each,
+with the targets.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,14 @@ import click
 import h5py
 import numpy as np
 
-from benchmarks.histories import folder_size, write_many
+from benchmarks.common import COUNT, elapsed, folder_size, print_line
+from benchmarks.histories import write_many
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.sampling.ad import ADSampler
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
 
-TARGETS = {  # (how held, observations) -> least ratio to the published and to the fair reader
+_LEAST_RATIOS = {  # (cache, observations) -> targets: ratio to the published and to the fair reader
     ("ram", "state"): (1000, 200),
     ("ram", "uint8"): (200, 40),
     ("ram", "float32"): (100, 20),
@@ -45,17 +46,16 @@ TARGETS = {  # (how held, observations) -> least ratio to the published and to t
 _READ = ("obs", "actions", "rewards", "dones")
 
 
-def say(**facts: Any) -> None:
-    click.echo(json.dumps({"benchmark": "loader", **facts}))
+_print = partial(print_line, "loader")
 
 
-def resident() -> int:
-    """Bytes of memory that this process has now."""
+def resident_memory() -> int:
+    """Resident memory of this process now, in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def make_data(folder: Path, layout: str, histories: int) -> None:
-    """lite, full, published and fair: the same histories, made once."""
+    """Write the same histories as lite, full, published and fair, unless they exist."""
     if (folder / "done").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
@@ -69,7 +69,7 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
 
 
 def published_reader(path: Path, length: int) -> Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]]:
-    """Reads as the published code reads: per history one slice for windows that overlap, cut and stacked."""
+    """A reader like the published code: one slice per history for windows that overlap, cut and stacked."""
     file = h5py.File(path / "histories.h5", "r", rdcc_nbytes=512 * 2**20)
 
     def read(ids: np.ndarray, starts: np.ndarray) -> dict[str, np.ndarray]:
@@ -95,7 +95,7 @@ def published_reader(path: Path, length: int) -> Callable[[np.ndarray, np.ndarra
 
 
 def fair_reader(path: Path, length: int, batch: int) -> Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]]:
-    """Chunks that fit the windows, straight into one batch buffer."""
+    """A reader of chunks that fit the windows, directly into one batch buffer."""
     file = h5py.File(path / "histories.h5", "r")
     first: Any = {name: file[f"/0/{name}"] for name in _READ}
     out = {name: np.ones((batch, length, *data.shape[1:]), data.dtype) for name, data in first.items()}
@@ -110,14 +110,8 @@ def fair_reader(path: Path, length: int, batch: int) -> Callable[[np.ndarray, np
     return read
 
 
-def seconds(work: Callable[[], Any]) -> float:
-    started = time.perf_counter()
-    work()
-    return time.perf_counter() - started
-
-
 def memcpy_rate(size: int, threads: int) -> float:
-    """Bytes/s of copying a buffer of that size onto another that is in use."""
+    """Bytes/s of copying a buffer of that size onto another one that has been written before."""
     from icrl4aht_data.utils.threads import in_slices
 
     size = min(size, 2**29)
@@ -126,33 +120,39 @@ def memcpy_rate(size: int, threads: int) -> float:
     def part(start: int, stop: int) -> None:
         target[start:stop] = source[start:stop]
 
-    return size / min(seconds(lambda: in_slices(part, size, threads)) for _ in range(5))
+    return size / min(elapsed(lambda: in_slices(part, size, threads)) for _ in range(5))
 
 
-def compare(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
-    """Every way of holding and of showing beside both peers."""
-    lite = load_icrl4aht(folder / "lite", threads=threads)
-    draw = lite.ad(batch_size=batch, length=length, seed=1)
-    published, fair = published_reader(folder / "published", length), fair_reader(folder / "fair", length, peer_windows)
-    readers = Ours(folder, batch, length, threads)
-    peers: dict[str, list[float]] = {"published": [], "fair": []}
+def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
+    """Measure our samplers with every cache and observation, and both peers."""
+    windows_of = load_icrl4aht(folder / "lite", threads=threads).ad(batch_size=batch, length=length, seed=1).windows
+    peers = {
+        "published": published_reader(folder / "published", length),
+        "fair": fair_reader(folder / "fair", length, peer_windows),
+    }
+    readers = LoaderTimes(folder, batch, length, threads)
+    seconds_per_window: dict[str, list[float]] = {"published": [], "fair": []}
     for i in range(rounds):
-        ids, starts = (drawn[:peer_windows] for drawn in draw.windows(i))
-        for name, read in (("published", published), ("fair", fair)):
-            peers[name].append(seconds(lambda read=read, ids=ids, starts=starts: read(ids, starts)) / peer_windows)
+        ids, starts = (drawn[:peer_windows] for drawn in windows_of(i))
+        for name, read in peers.items():
+            taken = elapsed(lambda read=read, ids=ids, starts=starts: read(ids, starts))
+            seconds_per_window[name].append(taken / peer_windows)
         for obs in ("state", "uint8", "float32"):
             for cache in ("ram", "mmap", "stream", "stream, nothing kept"):
                 if obs == "state" or cache != "stream, nothing kept":
                     readers.measure(cache, obs, i)
-    for name, times in peers.items():
-        per_window = statistics.median(times)
-        say(reader=name, windows_per_second=round(1 / per_window, 1), seconds_per_batch=round(per_window * batch, 2))
+    for name, times in seconds_per_window.items():
+        taken = statistics.median(times)
+        _print(reader=name, windows_per_second=round(1 / taken, 1), seconds_per_batch=round(taken * batch, 2))
     for (cache, obs), times in readers.times.items():
-        report(cache, obs, times, peers, batch)
+        print_reader(cache, obs, times, seconds_per_window, batch)
 
 
-class Ours:
-    """Our samplers, opened once, and the buffer that they write into: one at a time, since a float32 batch is large."""
+class LoaderTimes:
+    """Times of our samplers by cache and observation, each opened once.
+
+    They share one batch buffer at a time, since a float32 batch is large.
+    """
 
     def __init__(self, folder: Path, batch: int, length: int, threads: int) -> None:
         self._dataset, self._threads = load_icrl4aht(folder / "lite", threads=threads), threads
@@ -162,6 +162,7 @@ class Ours:
         self.times: dict[tuple[str, str], list[dict[str, float]]] = {}
 
     def measure(self, cache: str, obs: Any, number: int) -> None:
+        """Add the median time of a few batches, and the copying rate and memory at that time."""
         sampler = self._samplers.get((cache, obs))
         if sampler is None:
             held: Any = cache.split(",")[0]
@@ -170,28 +171,31 @@ class Ours:
         if obs != self._obs:
             self._buffer = None
             self._obs, self._buffer = obs, sampler.empty()
-        sampler.batch(10**6, self._buffer)  # decodes, and touches the buffer's pages
+        sampler.batch(10**6, self._buffer)  # decodes chunks, and maps the buffer's pages
 
-        def one(i: int) -> float:
+        def seconds_of(i: int) -> float:
             if cache == "stream, nothing kept":
                 sampler.dataset.forget_chunks()
-            return seconds(lambda: sampler.batch(i, self._buffer))
+            return elapsed(lambda: sampler.batch(i, self._buffer))
 
         repeats = {"state": 10, "uint8": 3, "float32": 3}[obs]
-        taken = statistics.median(one(1000 * number + k) for k in range(1, repeats + 1))
+        taken = statistics.median(seconds_of(1000 * number + k) for k in range(1, repeats + 1))
         size = sum(array.nbytes for array in self._buffer or () if array is not None)
-        facts = {"seconds": taken, "bytes": size, "memcpy": memcpy_rate(size, self._threads), "resident": resident()}
+        facts = {"seconds": taken, "bytes": size, "memcpy": memcpy_rate(size, self._threads)}
+        facts["resident"] = resident_memory()
         self.times.setdefault((cache, obs), []).append(facts)
 
 
-def report(cache: str, obs: str, times: list[dict[str, float]], peers: dict[str, list[float]], batch: int) -> None:
+def print_reader(
+    cache: str, obs: str, times: list[dict[str, float]], peers: dict[str, list[float]], batch: int
+) -> None:
+    """Print the line of one of our caches; `peers` has seconds per window by round."""
     own = statistics.median(row["seconds"] for row in times)
     ratios = {
         name: round(statistics.median(p * batch / row["seconds"] for p, row in zip(peer, times, strict=True)), 1)
         for name, peer in peers.items()
     }
-    least = TARGETS.get((cache, obs), (None, None))
-    say(
+    _print(
         reader="ours",
         cache=cache,
         obs=obs,
@@ -204,19 +208,20 @@ def report(cache: str, obs: str, times: list[dict[str, float]], peers: dict[str,
         resident_gigabytes=round(times[-1]["resident"] / 1e9, 2),
         times_published=ratios["published"],
         times_fair=ratios["fair"],
-        targets=least,
+        targets=_LEAST_RATIOS.get((cache, obs), (None, None)),
     )
 
 
-def sizes(folder: Path, dataset: Dataset) -> None:
-    transitions = int(dataset.column("T").sum())
+def print_sizes(folder: Path) -> None:
+    """Print the size of every format."""
+    transitions = int(load_icrl4aht(folder / "lite").column("T").sum())
     for name in ("lite", "full", "published", "fair"):
         size = folder_size(folder / name)
-        say(format=name, megabytes=round(size / 1e6, 1), bytes_per_transition=round(size / transitions, 2))
+        _print(format=name, megabytes=round(size / 1e6, 1), bytes_per_transition=round(size / transitions, 2))
 
 
 def train_step_waits(folder: Path, batch: int, length: int, steps: int) -> None:
-    """A jitted step that renders its states, with prefetch: the share of its time that it waits for data."""
+    """Share of a training step that waits for data; the step is jitted and renders states, batches are prefetched."""
     import jax
     import jax.numpy as jnp
 
@@ -249,7 +254,7 @@ def train_step_waits(folder: Path, batch: int, length: int, steps: int) -> None:
             weights = jax.block_until_ready(train(weights, next(batches)))
         total = time.perf_counter() - started
         share = (batches.waited - waited) / total
-    say(
+    _print(
         step="renders inside jit",
         device=jax.devices()[0].device_kind,
         batch=batch,
@@ -261,16 +266,17 @@ def train_step_waits(folder: Path, batch: int, length: int, steps: int) -> None:
 
 
 def flat_memory(folder: Path, batches: int) -> None:
-    """Resident memory after a tenth of many batches and after all."""
+    """Print resident memory after a tenth of many batches and after all of them."""
     for cache in ("ram", "mmap", "stream"):
         sampler = load_icrl4aht(folder / "lite", cache=cache, obs="uint8").ad(batch_size=16, length=100)
         with sampler.batches(stop=batches) as made:
             for _ in range(batches // 10):
                 next(made)
-            early = resident()
+            early = resident_memory()
             for _ in made:
                 pass
-        say(memory=cache, batches=batches, early_megabytes=round(early / 1e6), late_megabytes=round(resident() / 1e6))
+        late = resident_memory()
+        _print(memory=cache, batches=batches, early_megabytes=round(early / 1e6), late_megabytes=round(late / 1e6))
 
 
 _OPEN_INDEX = """
@@ -294,7 +300,7 @@ print(json.dumps(facts | {"peak_megabytes": resource.getrusage(resource.RUSAGE_S
 
 
 def index_times(folder: Path, lines: int) -> None:
-    """First and later opening of a long index, each in a process of its own with an empty cache folder at first."""
+    """Print the times of opening a long index, each in its own process, the first with an empty cache folder."""
     root = folder / f"index-{lines}"
     if not (root / "meta" / "info.json").exists():
         write_long_index(root, lines)
@@ -304,10 +310,11 @@ def index_times(folder: Path, lines: int) -> None:
         run = subprocess.run(
             [sys.executable, "-c", _OPEN_INDEX, str(root)], env=with_cache, capture_output=True, text=True, check=True
         )
-        say(index=opening, lines=lines, target_open_seconds=most, **json.loads(run.stdout))
+        _print(index=opening, lines=lines, target_open_seconds=most, **json.loads(run.stdout))
 
 
 def write_long_index(root: Path, lines: int) -> None:
+    """Write an index of many tasks of 128 histories, with entries of the bundled release."""
     source = load_icrl4aht()
     rng = np.random.default_rng(0)
     (root / "meta").mkdir(parents=True, exist_ok=True)
@@ -331,44 +338,35 @@ def write_long_index(root: Path, lines: int) -> None:
     (root / "meta" / "info.json").write_text(json.dumps(info))
 
 
-PARTS = ("index", "size", "read", "step", "memory")
+PARTS_OF_LOADER = ("index", "size", "read", "step", "memory")
 
 
 @click.command()
 @click.option("--folder", type=click.Path(path_type=Path), default=Path("build/bench-loader"), show_default=True)
-@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS), default=PARTS, show_default=True)
+@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS_OF_LOADER), default=PARTS_OF_LOADER)
 @click.option("--layout", default="coord_simple", show_default=True)
-@click.option("--histories", default=128, show_default=True)
-@click.option("--batch", default=1024, show_default=True)
-@click.option("--length", default=500, show_default=True)
-@click.option("--rounds", default=3, show_default=True)
-@click.option("--threads", default=2, show_default=True)
-@click.option("--peer-windows", type=int, help="Windows that the peers read a round; by default a whole batch.")
-@click.option("--lines", default=1_000_000, show_default=True, help="Of the long index.")
+@click.option("--histories", type=COUNT, default=128, show_default=True)
+@click.option("--batch", type=COUNT, default=1024, show_default=True)
+@click.option("--length", type=COUNT, default=500, show_default=True)
+@click.option("--rounds", type=COUNT, default=3, show_default=True)
+@click.option("--threads", type=COUNT, default=2, show_default=True)
+@click.option("--peer-windows", type=COUNT, help="Windows that the peers read in a round.", show_default="a batch")
+@click.option("--lines", type=COUNT, default=1_000_000, show_default=True, help="Lines of the long index.")
 def main(
-    folder: Path,
-    parts: tuple[str, ...],
-    layout: str,
-    histories: int,
-    batch: int,
-    length: int,
-    rounds: int,
-    threads: int,
-    peer_windows: int | None,
-    lines: int,
+    folder: Path, parts: tuple[str, ...], layout: str, histories: int, lines: int, peer_windows: int | None, **read: int
 ) -> None:
-    """Loader figures beside two readers of the published format, one JSON line each."""
+    """Measure the loader and two readers of the published format; one JSON line each."""
     if set(parts) - {"index"}:
         make_data(folder, layout, histories)
     os.environ.setdefault("ICRL4AHT_CACHE_DIR", str(folder.resolve() / "cache"))
     if "index" in parts:
         index_times(folder, lines)
     if "size" in parts:
-        sizes(folder, load_icrl4aht(folder / "lite"))
+        print_sizes(folder)
     if "read" in parts:
-        compare(folder, batch, length, rounds, threads, peer_windows or batch)
+        compare_readers(folder, **read, peer_windows=peer_windows or read["batch"])
     if "step" in parts:
-        train_step_waits(folder, batch=256, length=length, steps=10)
+        train_step_waits(folder, batch=256, length=read["length"], steps=10)
     if "memory" in parts:
         flat_memory(folder, 2000)
 

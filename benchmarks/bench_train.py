@@ -1,9 +1,9 @@
 """Training and acting speed of AD: `make bench-train`.
 
-    train     steps/s and transitions/s on state records rendered in the step, beside the same model and trainer fed
-              float32 observations that a reader of the published format makes; in turn, the ratio within each round
-    act       the evaluator's steps/s with `cached` beside `exact` acting, in turn
-    all       what all 160 test tasks take with `cached`, compiling included
+    train     steps/s and transitions/s on state records rendered in the step, compared with the same model and trainer
+              on float32 observations that a reader of the published format makes; in turn, ratios within each round
+    act       the evaluator's steps/s with `cached` compared with `exact` acting, in turn
+    all       minutes of all 160 test tasks with `cached` acting, compiling included
 
 One JSON line each. Models are untrained: speed does not depend on what they know.
 """
@@ -11,10 +11,10 @@ One JSON line each. Models are untrained: speed does not depend on what they kno
 from __future__ import annotations
 
 import dataclasses
-import json
 import statistics
 import time
 from collections.abc import Generator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,12 +25,15 @@ import jax
 import numpy as np
 
 from baselines.agents.egos import Acting, learned
-from baselines.evaluate.evaluator import Game, evaluate, play, prepare_rollout
+from baselines.evaluate.evaluator import PreparedRollout, evaluate, play_episodes, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
-from baselines.methods.method import Method, ModelOptions
+from baselines.methods.method import Method
+from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
-from baselines.training.trainer import Trainer, TrainOptions
+from baselines.training.options import TrainOptions
+from baselines.training.trainer import Trainer
+from benchmarks.common import COUNT, elapsed, print_line
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
@@ -43,12 +46,11 @@ from icrl4aht_data.writing.published import FROM_PUBLISHED, HISTORIES_H5, to_pub
 _TARGET_RATIO, _TARGET_MINUTES = 20, 30
 
 
-def say(**facts: Any) -> None:
-    click.echo(json.dumps({"benchmark": "train", **facts}))
+_print = partial(print_line, "train")
 
 
 def published_batches(folder: Path, draw: ADSampler) -> Generator[ADBatch]:
-    """The windows that `draw` draws, read as the published code reads: float32 observations, gzip chunks of 4096."""
+    """Batches of the windows that `draw` draws, read like the published code: float32, gzip chunks of 4096 steps."""
     number = {int(history): k for k, history in enumerate(draw.dataset.ids)}
     length, i = draw.length, 0
     with h5py.File(folder / HISTORIES_H5, "r", rdcc_nbytes=512 * 2**20) as file:
@@ -79,7 +81,7 @@ def _window(group: Any, start: int, length: int) -> dict[str, np.ndarray]:
 
 
 def compare_training(dataset: Dataset, model: ModelOptions, options: TrainOptions, steps: int, rounds: int) -> None:
-    """Both ways in turn: some steps of each in every round."""
+    """Train both ways in turn, some steps of each in every round, and print their speeds."""
     trainers = [
         Trainer(get_method("ad")(model, overcooked_world(dataset.layouts, view)), options)
         for view in (None, plain_view)
@@ -103,7 +105,7 @@ def compare_training(dataset: Dataset, model: ModelOptions, options: TrainOption
         theirs.close()
     median = [statistics.median(rate) for rate in rates]
     per_step = options.batch_size * options.context
-    say(
+    _print(
         part="train",
         batch=options.batch_size,
         length=options.context,
@@ -118,37 +120,35 @@ def compare_training(dataset: Dataset, model: ModelOptions, options: TrainOption
 
 
 def untrained(layout: Layout, model: ModelOptions) -> tuple[Method, Any]:
-    """AD for a layout's observations, and its parameters."""
+    """AD for a layout's observations, and its initial parameters."""
     method = get_method("ad")(model, overcooked_world([layout]))
     return method, method.init(jax.random.key(0))
 
 
 def compare_acting(layout: Layout, model: ModelOptions, context: int, steps: int, rounds: int, most: int) -> None:
-    """Tasks of a layout's first family, some steps of each way in every round. Both ways compute over all K places,
-    however many of them are filled."""
+    """Play some tasks of a layout in both ways in turn, some steps of each in every round, and print their speeds.
+
+    Both compute over all K positions of the context, however many of them are filled.
+    """
     method, params = untrained(layout, model)
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
-    ways: dict[Acting, int] = {"cached": 10 * steps, "exact": steps}  # an episode's own cost must not weigh
-    games = [
-        prepare_rollout(
-            _ego(method, params, context, acting), tasks, dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=n)
-        )
-        for acting, n in ways.items()
-    ]
-    seconds: list[list[float]] = [[], []]
-    for number in range(rounds + 1):
-        for way, (game, n) in enumerate(zip(games, ways.values(), strict=True)):
-            taken = _seconds_per_episode(game, 1) / n
-            if number:
-                seconds[way].append(taken)
-    rates = [len(tasks) / statistics.median(taken) for taken in seconds]
-    say(
+    ways: dict[Acting, int] = {"cached": 10 * steps, "exact": steps}  # so that the start of an episode weighs little
+    seconds: dict[Acting, list[float]] = {"cached": [], "exact": []}
+    prepared = {}
+    for acting, n in ways.items():
+        protocol = dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=n)
+        prepared[acting] = prepare_rollout(_ego(method, params, context, acting), tasks, protocol)
+        elapsed(lambda acting=acting: _play_episode(prepared[acting]))  # compiles
+    for acting, n in list(ways.items()) * rounds:
+        seconds[acting].append(elapsed(lambda acting=acting: _play_episode(prepared[acting])) / n)
+    cached, exact = (len(tasks) / statistics.median(taken) for taken in seconds.values())
+    _print(
         part="act",
         context=context,
         tasks=len(tasks),
-        cached_steps_per_second=round(rates[0], 1),
-        exact_steps_per_second=round(rates[1], 2),
-        ratio=round(statistics.median(e / c for c, e in zip(*seconds, strict=True)), 1),
+        cached_steps_per_second=round(cached, 1),
+        exact_steps_per_second=round(exact, 2),
+        ratio=round(statistics.median(e / c for c, e in zip(*seconds.values(), strict=True)), 1),
         target=_TARGET_RATIO,
     )
 
@@ -158,72 +158,56 @@ def _ego(method: Method, params: Any, context: int, acting: Acting) -> Any:
     return lambda layout: policy
 
 
-def _seconds_per_episode(game: Game, episodes: int) -> float:
-    started = time.perf_counter()
-    for played in play(game, episodes):
+def _play_episode(prepared: PreparedRollout) -> None:
+    for played in play_episodes(prepared, 1):
         jax.block_until_ready(played)
-    return (time.perf_counter() - started) / episodes
 
 
-def whole_benchmark(model: ModelOptions, context: int, protocol: Protocol) -> None:
-    """All 160 tasks, an untrained AD for each layout, as the evaluator plays them, compiling included."""
+def evaluate_all_tasks(model: ModelOptions, context: int, protocol: Protocol) -> None:
+    """Print the minutes of all 160 tasks with an untrained AD for each layout, compiling included."""
     tasks = [task for track in TRACKS for task in published_tasks(track)]
 
     def make(layout: Layout) -> Policy:
         return _ego(*untrained(layout, model), context, "cached")(layout)
 
-    started = time.perf_counter()
-    evaluate("AD", make, tasks, protocol)
-    say(
+    seconds = elapsed(lambda: evaluate("AD", make, tasks, protocol))
+    _print(
         part="all",
         context=context,
         tasks=len(tasks),
         episodes=protocol.episodes,
-        minutes=round((time.perf_counter() - started) / 60, 2),
+        minutes=round(seconds / 60, 2),
         target_minutes=_TARGET_MINUTES,
     )
 
 
-PARTS = ("train", "act", "all")
+PARTS_OF_TRAINING = ("train", "act", "all")
 
 
 @click.command()
-@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS), default=PARTS, show_default=True)
+@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS_OF_TRAINING), default=PARTS_OF_TRAINING)
 @click.option("--layout", "layout_name", default="demo_wide", show_default=True)
-@click.option("--histories", default=8, show_default=True, help="Of the bundled release, to train on.")
-@click.option("--batch", default=32, show_default=True)
-@click.option("--length", default=500, show_default=True, help="L, and the K of acting.")
-@click.option("--steps", default=2, show_default=True, help="Training steps of each way in a round.")
-@click.option("--acting-steps", default=10, show_default=True, help="Exact steps in a round; ten times as many cached.")
-@click.option("--episodes", default=100, show_default=True, help="Of each of the 160 tasks.")
-@click.option("--tasks", default=5, show_default=True, help="Of a family, to compare acting on.")
-@click.option("--rounds", default=3, show_default=True)
-@click.option("--layers", default=4, show_default=True)
-@click.option("--width", default=256, show_default=True)
-def main(
-    parts: tuple[str, ...],
-    layout_name: str,
-    histories: int,
-    batch: int,
-    length: int,
-    steps: int,
-    acting_steps: int,
-    episodes: int,
-    tasks: int,
-    rounds: int,
-    layers: int,
-    width: int,
-) -> None:
-    """Training beside a reader of the published format, cached beside exact acting, all 160 tasks; JSON lines."""
-    layout, model = get_layout(layout_name), ModelOptions(layers, width)
+@click.option("--histories", type=COUNT, default=8, show_default=True, help="Bundled histories to train on.")
+@click.option("--batch", type=COUNT, default=32, show_default=True)
+@click.option("--length", type=COUNT, default=500, show_default=True, help="L in training, K in acting.")
+@click.option("--steps", type=COUNT, default=2, show_default=True, help="Training steps of each way in a round.")
+@click.option("--acting-steps", type=COUNT, default=10, show_default=True, help="Exact steps in a round, 10x cached.")
+@click.option("--episodes", type=COUNT, default=100, show_default=True, help="Episodes of each of the 160 tasks.")
+@click.option("--tasks", type=COUNT, default=5, show_default=True, help="Tasks to compare acting on.")
+@click.option("--rounds", type=COUNT, default=3, show_default=True)
+@click.option("--layers", type=COUNT, default=4, show_default=True)
+@click.option("--width", type=COUNT, default=256, show_default=True)
+def main(parts: tuple[str, ...], layout_name: str, length: int, rounds: int, **sizes: int) -> None:
+    """Compare training with a reader of the published format, cached with exact acting, and time all 160 tasks."""
+    layout, model = get_layout(layout_name), ModelOptions(sizes["layers"], sizes["width"])
     if "train" in parts:
         dataset = load_icrl4aht(layout=layout.name, obs="state")
-        options = TrainOptions(batch_size=batch, context=length)
-        compare_training(dataset.select(dataset.ids[:histories]), model, options, steps, rounds)
+        options = TrainOptions(batch_size=sizes["batch"], context=length)
+        compare_training(dataset.select(dataset.ids[: sizes["histories"]]), model, options, sizes["steps"], rounds)
     if "act" in parts:
-        compare_acting(layout, model, length, acting_steps, rounds, tasks)
+        compare_acting(layout, model, length, sizes["acting_steps"], rounds, sizes["tasks"])
     if "all" in parts:
-        whole_benchmark(model, length, dataclasses.replace(PROTOCOLS["seeded"], episodes=episodes))
+        evaluate_all_tasks(model, length, dataclasses.replace(PROTOCOLS["seeded"], episodes=sizes["episodes"]))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""As many histories as a benchmark wants, made from the bundled ones."""
+"""Releases of any number of histories, made from the bundled ones."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 
 def write_many(folder: Path, layouts: Sequence[str], histories: int) -> Path:
-    """A lite release with that many histories of each layout; of the bundled ones, each shifted by whole episodes."""
+    """Write a lite release with a number of histories of each layout: bundled ones, rotated by complete episodes."""
     source = load_icrl4aht()
     first = {task.layout.name: task for task in reversed(read_tasks(source.root / TASKS))}
     tasks = [
-        NewTask(first[name], Provenance(), histories, partial(_shifted, source.filter(layout=name), histories))
+        NewTask(first[name], Provenance(), histories, partial(_rotated, source.filter(layout=name), histories))
         for name in layouts
     ]
     return write_release(folder, "lite", tasks, data_version="0.0.0", card="# benchmark\n")
 
 
-def _shifted(source: Dataset, histories: int) -> Iterator[NewHistory]:
+def _rotated(source: Dataset, histories: int) -> Iterator[NewHistory]:
     kept = source.info.environment.kept_steps
     for number in range(histories):
         history, episodes = source[number % len(source)], number // len(source)
@@ -36,8 +36,3 @@ def _shifted(source: Dataset, histories: int) -> Iterator[NewHistory]:
             for field in held_fields("lite")
         }
         yield NewHistory(number, arrays)
-
-
-def folder_size(folder: Path) -> int:
-    """Bytes of all its files."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

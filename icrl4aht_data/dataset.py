@@ -14,7 +14,7 @@ from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Obs
-from icrl4aht_data.reading.selection import Names, ReadOptions, Selection
+from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
@@ -30,12 +30,12 @@ MINI = Path(__file__).parent / "mini"
 def load_icrl4aht(
     root: str | Path | None = None,
     *,
-    split: Names = None,
-    layout: Names = None,
-    track: Names = None,
-    teammate_family: Names = None,
-    teammate_kind: Names = None,
-    task_id: Names = None,
+    split: FilterValues = None,
+    layout: FilterValues = None,
+    track: FilterValues = None,
+    teammate_family: FilterValues = None,
+    teammate_kind: FilterValues = None,
+    task_id: FilterValues = None,
     obs: Obs = "float32",
     cache: CacheMode = "auto",
     threads: int | None = None,

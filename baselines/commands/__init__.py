@@ -1,1 +1,1 @@
-"""The command line of `python -m baselines`."""
+"""Command line of `python -m baselines`."""

@@ -1,4 +1,4 @@
-"""What the commands of `python -m baselines` take in common: types of their arguments, and options."""
+"""Argument types and options that several commands of `python -m baselines` share."""
 
 from __future__ import annotations
 
@@ -9,37 +9,44 @@ from typing import Any
 
 import click
 
+from baselines.methods.options import ModelOptions
+from baselines.training.options import TrainOptions
+from icrl4aht_data.commands.dataclass_options import dataclass_options
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
 
 
-def found_in(module: str, name: str) -> Callable[[], Any]:
-    """What a module holds, imported when it is asked for: JAX takes its time."""
+def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
+    """Returns a function that imports a module and returns one of its attributes, since importing JAX takes seconds."""
     return lambda: getattr(import_module(module), name)
 
 
-class Agent(Names):
-    """An ego's name, or the folder of a run."""
+class EgoName(Names):
+    """Name of a reference ego, or folder of a run; checked by `find_ego`."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         return value
 
 
-def agent_of(option: str, value: str, acting: Any = "cached") -> Any:
-    """The ego that an option names."""
+def find_ego(option: str, value: str, acting: Any = "cached") -> Any:
+    """Returns the ego that an option names, a `baselines.agents.egos.NamedEgo`.
+
+    Raises:
+        click.UsageError: if the value is neither a reference ego nor a run folder.
+    """
     from baselines.agents.egos import AGENTS, find_agent
     from baselines.training.run_folder import CONFIG
 
     if value not in AGENTS and not Path(value).is_dir():
-        folder = "A trained model is named by its folder, which `python -m baselines train` makes."
-        raise click.UsageError(f"{option}: {unknown('agent', value, AGENTS)} {folder}")
+        hint = "A trained model is named by its folder, which `python -m baselines train` makes."
+        raise click.UsageError(f"{option}: {unknown('agent', value, AGENTS)} {hint}")
     if value not in AGENTS and not (Path(value) / CONFIG).is_file():
         raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `python -m baselines train` makes one")
     return find_agent(value, acting)
 
 
 class HostPort(click.ParamType):
-    """Where a process listens."""
+    """Address that a process listens on."""
 
     name = "host:port"
 
@@ -50,65 +57,74 @@ class HostPort(click.ParamType):
         return value
 
 
-AGENT = Agent("agent", found_in("baselines.agents.egos", "AGENTS"))
-METHOD = Names("method", found_in("baselines.methods.registry", "METHODS"))
-PROTOCOL = Names("protocol", found_in("baselines.evaluate.evaluator", "PROTOCOLS"))
+EGO_NAME = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
+METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
+PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
 protocol_option = click.option(
     "--protocol",
-    type=PROTOCOL,
+    type=PROTOCOL_NAME,
     default="seeded",
-    help="Teammates' noise: seeded, drawn anew in every episode, or published, as for the paper's numbers.",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
 )
 acting_option = click.option(
     "--acting",
-    type=Names("acting", found_in("baselines.agents.egos", "ACTING")),
+    type=Names("acting", lazy_attribute("baselines.agents.egos", "ACTING")),
     default="cached",
-    help="How a trained model remembers: cached, or exact and slower.",
+    help="Memory of a trained model: cached, or exact and slower.",
 )
-seeds_option = click.option("--seeds", type=COUNT, default=1, help="How often every task is played.")
+tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
+episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
+seeds_option = click.option("--seeds", type=COUNT, default=1, help="Times that every task is played.")
 suite_option = click.option(
-    "--suite", type=Folder("`python -m generation teammates`"), metavar="FOLDER", help="Where learned teammates are."
+    "--suite", type=Folder("`python -m generation teammates`"), metavar="FOLDER", help="Folder of learned teammates."
 )
 tensorboard_option = click.option(
     "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
 )
-films_option = click.option("--films/--no-films", default=True, help="A GIF per teammate family on the page.")
+gifs_option = click.option("--films/--no-films", "gifs", default=True, help="A GIF per teammate family on the page.")
 root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
 )
-STEPS: dict[str, Any] = {"type": COUNT, "help": "Training steps."}
-CONTEXT: dict[str, Any] = {"type": COUNT, "help": "K: steps of a window, or transitions of a context."}
 
-batch_size_option = click.option(
-    "--batch-size", type=COUNT, help="Windows, or contexts.", show_default="1024 as in the paper, or 8 on a CPU"
+_PAPER_OR_CPU = "1024 as in the paper, or 8 on a CPU"
+training_options = dataclass_options(
+    TrainOptions, "train", default_text={"steps": "the size's", "batch_size": _PAPER_OR_CPU}
 )
+model_options = dataclass_options(ModelOptions, "model", default_text={"layers": "the size's", "width": "the size's"})
 
 
-def variants(of: str) -> Names:
-    """What an experiment's name goes on with."""
-    every = found_in("baselines.experiments", "EXPERIMENTS")
-    return Names(of, lambda: [name.removeprefix(f"{of} ") for name in every() if name.startswith(f"{of} ")])
+def default_batch_size() -> int:
+    """Returns the paper's batch size, or on a CPU one that makes a step take seconds."""
+    import jax
+
+    return 8 if jax.default_backend() == "cpu" else TrainOptions.batch_size
 
 
-def experiment_options(command: Any) -> Any:
-    """What all experiments take."""
-    out = f"runs/{command.__name__.replace('_', '-')}" + ("-WHAT" if command.__name__ in ("sweep", "ablate") else "")
+def variant_names(command: str) -> Names:
+    """Returns the type of an experiment's second word, such as `size` in `sweep size`."""
+    experiments = lazy_attribute("baselines.experiments", "EXPERIMENTS")
+    prefix = f"{command} "
+    return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
+
+
+def experiment_options(out: str) -> Callable[[Any], Any]:
+    """Returns a decorator with the options of all experiments; `out` is shown as the default folder."""
     options = [
         click.option(
             "--method",
             "methods",
-            type=METHOD,
+            type=METHOD_NAME,
             multiple=True,
             default=("ad", "dpt"),
-            help="ad, dpt, hybrid_ad or amago_offline; again for more.",
+            help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",
         ),
         click.option(
             "--layout",
             "layouts",
             type=LAYOUT,
             multiple=True,
-            help="To train on; again for more.",
+            help="Training layout; repeat for several.",
             show_default="the paper's that the release has",
         ),
         root_option,
@@ -117,27 +133,42 @@ def experiment_options(command: Any) -> Any:
             "values",
             metavar="SETTING",
             multiple=True,
-            help="Only this setting, such as K250, medium or ta; again for more.",
+            help="Only this setting, such as K250, medium or ta; repeat for several.",
         ),
-        click.option("--steps", **STEPS, show_default="the paper's"),
-        click.option("--context", **CONTEXT, show_default="500; varied by `sweep context`"),
-        batch_size_option,
         click.option(
             "--family",
             "families",
             type=FAMILY,
             multiple=True,
-            help="Only teammates of this family, such as H4; again for more.",
+            help="Only teammates of this family, such as H4; repeat for several.",
         ),
-        click.option("--tasks", type=COUNT, help="At most so many teammates of each family and layout."),
-        click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100"),
+        tasks_option,
+        episodes_option,
         seeds_option,
         protocol_option,
         acting_option,
-        films_option,
+        gifs_option,
         tensorboard_option,
-        click.option("--out", type=Folder(), metavar="FOLDER", help="Write all of it here.", show_default=out),
+        click.option("--out", type=Folder(), metavar="FOLDER", help="Write runs and report here.", show_default=out),
+        dataclass_options(
+            TrainOptions,
+            "train",
+            default_text={
+                "steps": "the paper's",
+                "batch_size": _PAPER_OR_CPU,
+                "context": "500; varied by `sweep context`",
+            },
+        ),
+        dataclass_options(
+            ModelOptions,
+            "model",
+            default_text={"layers": "4; varied by `sweep size`", "width": "256; varied by `sweep size`"},
+        ),
     ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+
+    def decorate(command: Any) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate

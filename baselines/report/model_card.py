@@ -1,4 +1,4 @@
-"""The card of a trained model, `cards/baseline.md` filled with its settings and results."""
+"""Cards of trained models: `cards/baseline.md` filled with settings and results."""
 
 from __future__ import annotations
 
@@ -7,43 +7,46 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from baselines.report.markdown import tables
-from baselines.report.results import Run
+from baselines.report.results import EvaluationRun
+from baselines.report.summary import track_tables
 from icrl4aht_data.utils.templates import fill
 
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
 
-def model_card(run: Run, trained: Mapping[str, Any]) -> str:
-    """README.md of a model, for who publishes its run folder.
+def model_card(run: EvaluationRun, trained: Mapping[str, Any]) -> str:
+    """Returns README.md of a model, to publish with its run folder.
 
     Args:
         run: its results.
-        trained: what was trained, see `report.Source`.
+        trained: settings of its training, see `ResultSource.trained`.
     """
     config, histories = trained["config"], trained["config"]["histories"]
-    at_hub = _HUB.match(histories["root"])
+    on_hub = _HUB.match(histories["root"])
     limits = [
-        f"It is one run, of seed {config['train']['seed']}: how far another would differ is not known.",
-        "What it is given at each step must be what the evaluator gives, see `docs/protocol.md` in the repository.",
+        f"It is one run, of seed {config['train']['seed']}: the variation between seeds is not known.",
+        "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
     ]
     return fill(
         "baseline.md",
         method=run.agent,
-        dataset=at_hub[1] if at_hub else "icrl4aht",
+        dataset=on_hub[1] if on_hub else "icrl4aht",
         data_version=histories["data_version"],
         selection=f"{histories['sizes']['train']} of {', '.join(histories['layouts'])}; the release's manifest has "
         f"SHA-256 `{trained['manifest_sha256']}`",
         code_version=config["package_version"],
         settings=_bullets({**config["model"], **config["train"]}),
         protocol=run.protocol,
-        results="\n\n".join(table for _, table in tables(run)),
+        results="\n\n".join(table for _, table in track_tables(run)),
         limits="\n".join(f"* {limit}" for limit in limits),
     )
 
 
-def write_model_cards(runs: Iterable[Run], folder: Path) -> list[Path]:
-    """The cards of those that were trained, by their names, into a folder; of several sources the first's settings."""
+def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:
+    """Write the card of every trained model into a folder; a merged run has the settings of its first source.
+
+    Returns their paths, NAME.md by the run's name.
+    """
     paths = []
     for run in runs:
         trained = next((source.trained for source in run.sources if source.trained), None)

@@ -1,25 +1,36 @@
-"""The report as one self-contained HTML page: inline CSS, pictures as data URIs, no script, nothing fetched."""
+"""The report as one self-contained HTML page: inline CSS, pictures as data URIs, no script, no external files."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from baselines.report.episode_gifs import EpisodeGif, film_families
-from baselines.report.figures import plot_gain, plot_sweep
-from baselines.report.results import TEST_LAYOUTS, Run, plot_curves, read_published
-from baselines.report.tables import AVERAGE, PAPER_TABLES, PaperTable, Point, Row, Score, fill, score, sweep
+from baselines.plotting import SweepPoint, plot_adaptation_gain, plot_return_curves, plot_sweep
+from baselines.report.episode_gifs import EpisodeGif, family_gifs
+from baselines.report.results import TEST_LAYOUTS, EvaluationRun, read_published
+from baselines.report.tables import (
+    AVERAGE,
+    PAPER_TABLES,
+    PaperTable,
+    TableRow,
+    TableScore,
+    fill_table,
+    score_cells,
+    sweep_points,
+)
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash
 
-_FILMED = 3  # runs; a GIF takes up to 110 kB of the page
-_BEHIND = {"oracle": 1, "random": 2, "stay": 3}
+_RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
+_REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
+_SHOWN_TRAINING = ("steps", "batch_size", "context", "learning_rate", "seed")
+_SHOWN_MODEL = ("layers", "width", "positions")
 _SWEEPS = {"K": "Context length", "size": "Model scale and training budget"}
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1d2129; max-width: 1250px; margin: 2em auto; padding: 0 1.2em }
@@ -29,20 +40,22 @@ th, td { border: 1px solid #d5d8dd; padding: .25em .55em; text-align: left; vert
 th { background: #f1f3f6 } td.flat { background: #e8e8e8 } td.none { color: #999 }
 tr.first td, tr.first th { border-top: 2px solid #8a9099 }
 small { color: #5a6472; display: block } .norm { color: #1f5fa8 }
-figure { display: inline-block; margin: .5em 1em .5em 0; vertical-align: top } figure.film { width: 22em }
+figure { display: inline-block; margin: .5em 1em .5em 0; vertical-align: top } figure.episode { width: 22em }
 td.long { min-width: 11em; max-width: 22em } td.long, figcaption { overflow-wrap: anywhere }
 img { max-width: 100%; height: auto } figcaption { font-size: 13px; color: #444 } code { font-size: 12px }
 """
 
 
-def write_page(runs: Sequence[Run], path: Path, films: Sequence[EpisodeGif] = (), notes: Sequence[str] = ()) -> Path:
-    """Write the page.
+def write_page(
+    runs: Sequence[EvaluationRun], path: Path, gifs: Sequence[EpisodeGif] = (), notes: Sequence[str] = ()
+) -> Path:
+    """Write the page. Returns its path.
 
     Args:
-        runs: merged, see `report.merge`; of any protocols, sweeps among them.
-        path: ends in .html; replaced at once.
-        films: by family; see `watching.film_families`.
-        notes: what a reader must know of these runs, such as what was left out.
+        runs: merged, see `results.merge`; of any protocols, sweeps among them.
+        path: ends in .html; replaced atomically.
+        gifs: episodes, see `episode_gifs.family_gifs`.
+        notes: facts about these runs for the reader, such as layouts that were left out.
 
     Raises:
         OptionError: if the path does not end in .html, or there is no run.
@@ -51,102 +64,106 @@ def write_page(runs: Sequence[Run], path: Path, films: Sequence[EpisodeGif] = ()
         raise OptionError(f"{path}: expected a name that ends in .html")
     if not runs:
         raise OptionError("no run to report; give at least one folder of results")
-    protocols = dict.fromkeys(run.protocol for run in runs)
     parts = [_introduction(runs, notes)]
     with TemporaryDirectory() as folder:
-        for protocol in protocols:
-            own = [run for run in runs if run.protocol == protocol]
-            parts += _protocol(protocol, own, Path(folder))
-    if films:
-        parts += _films(films)
-    parts += [_settings(runs), _sources()]
+        for protocol in dict.fromkeys(run.protocol for run in runs):
+            parts += _protocol_section(protocol, [run for run in runs if run.protocol == protocol], Path(folder))
+    if gifs:
+        parts += _episode_section(gifs)
+    parts += [_settings_section(runs), _sources_section()]
     head = f'<meta charset="utf-8"><title>ICRL4AHT report</title><style>{_STYLE}</style>'
+    body = "\n".join(parts)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as partial:
-        text = (
-            f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n' + "\n".join(parts) + "\n</body></html>\n"
-        )
+        text = f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
         partial.write_text(text, encoding="utf-8")
     return path
 
 
-def write_page_with_films(
-    runs: Sequence[Run], path: Path, *, films: bool = True, notes: Sequence[str] = (), suite: Path | None = None
+def write_page_with_episodes(
+    runs: Sequence[EvaluationRun],
+    path: Path,
+    *,
+    episodes: bool = True,
+    notes: Sequence[str] = (),
+    suite: Path | None = None,
 ) -> Path:
-    """The same, with an episode beside every family played for it, of at most three runs.
+    """Write the page with an episode per family of teammates, of at most three runs. Returns its path.
 
-    `suite` is the folder that learned teammates' checkpoints are in.
+    Args:
+        runs, path, notes: see `write_page`.
+        episodes: False for a page without episodes.
+        suite: folder of learned teammates' checkpoints.
     """
-    shown = _worth_seeing(runs)[:_FILMED] if films else []
+    shown = _most_informative(runs)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
-        notes = [*notes, f"episodes are of {_FILMED} runs at most; there is none of: {', '.join(left)}"]
+        notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
     with TemporaryDirectory() as folder:
-        return write_page(runs, path, film_families(shown, Path(folder), suite), notes)
+        return write_page(runs, path, family_gifs(shown, Path(folder), suite), notes)
 
 
-def _worth_seeing(runs: Sequence[Run]) -> list[Run]:
-    """Trained agents first, each once before any twice; reference egos last, `stay` behind them all."""
-    before = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
-    ranked = [
-        (_BEHIND.get(run.agent, 0), nth, number) for number, (run, nth) in enumerate(zip(runs, before, strict=True))
-    ]
-    return [runs[number] for _, _, number in sorted(ranked)]
+def _most_informative(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
+    """Returns the runs sorted: trained agents first, each agent once before any twice; reference egos last."""
+    repeats = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
+    order = sorted(range(len(runs)), key=lambda k: (_REFERENCE_RANK.get(runs[k].agent, 0), repeats[k], k))
+    return [runs[number] for number in order]
 
 
-def _introduction(runs: Sequence[Run], notes: Sequence[str]) -> str:
+def _introduction(runs: Sequence[EvaluationRun], notes: Sequence[str]) -> str:
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return f"""<h1>ICRL4AHT report</h1>
 <p>{len(runs)} runs, package version {escape(version("icrl4aht-data"))}. Large: ours, mean ± std over the teammate
-instances of a cell; over the cells' means where several are averaged. Small: the paper's number, and the
-headroom-normalised score, (return − stay) / (oracle − stay), where the cell has headroom. <b>Grey</b>:
-no reference ego gets more there than one that only stays; such a cell says nothing about adaptation. A
+instances of a cell; over the cells' means if several are averaged. Small: the paper's number, and the
+headroom-normalised score, (return − stay) / (oracle − stay), if the cell has headroom. <b>Grey</b>:
+no reference ego earns more in this cell than one that only stays, so it says nothing about adaptation. A
 dash: not run.</p>
 <ul>{items}</ul>"""
 
 
-def _protocol(protocol: str, runs: list[Run], folder: Path) -> list[str]:
+def _protocol_section(protocol: str, runs: list[EvaluationRun], folder: Path) -> list[str]:
     plain = [run for run in runs if run.variant is None]
     parts = [f"<h2>Protocol <code>{escape(protocol)}</code></h2>"]
     if plain:
         for number, table in enumerate(PAPER_TABLES, start=1):
             parts.append(f"<h3>Table {number}. {table.title}</h3>")
-            parts.append(_paper_table(table, fill(table, plain, protocol)))
+            parts.append(_paper_table(table, fill_table(table, plain, protocol)))
         parts += _other_cells(plain, protocol)
-    for what, title in _SWEEPS.items():
-        panels = sweep(runs, what)
+    for quantity, title in _SWEEPS.items():
+        panels = sweep_points(runs, quantity)
         if panels:
-            path = folder / f"{protocol}-{what}.png"
-            plot_sweep(panels, what, path)
-            parts += [f"<h3>{title}</h3>", _figure(path, "Bars: std over families' means."), _sweep_table(panels, what)]
+            path = folder / f"{protocol}-{quantity}.png"
+            plot_sweep(panels, quantity, path)
+            figure = _figure(path, "Bars: std over families' means.")
+            parts += [f"<h3>{title}</h3>", figure, _sweep_table(panels, quantity)]
     for name, some in (("of the agents", plain), ("of the sweeps", [run for run in runs if run.variant])):
         if some:
             path = folder / f"{protocol}-curves.png"
-            plot_curves(some, path)
-            told = "Return per episode, running mean over 10; mean and range over instances."
-            parts += [f"<h3>Adaptation curves {name}</h3>", _figure(path, told)]
+            plot_return_curves([(run.name, run.cells) for run in some], path)
+            caption = "Return per episode, running mean over 10; mean and range over instances."
+            parts += [f"<h3>Adaptation curves {name}</h3>", _figure(path, caption)]
     path = folder / f"{protocol}-gain.png"
-    plot_gain(runs, path)
-    told = (
-        "Mean over a track's cells, a dot per cell; of the halves, where there are fewer than 40 episodes. The paper "
+    plot_adaptation_gain([(run.name, {cell: run.gain(cell) for cell in run.cells}) for run in runs], path)
+    caption = (
+        "Mean over a track's cells, a dot per cell; of the halves, if there are fewer than 40 episodes. The paper "
         "states no numbers: “small on average” (App. F)."
     )
-    parts += ["<h3>Adaptation gain</h3>", _figure(path, told), _gain_table(runs)]
+    parts += ["<h3>Adaptation gain</h3>", _figure(path, caption), _gain_table(runs)]
     return [*parts, "<h3>Headroom</h3>", _headroom_table(protocol)]
 
 
-def _paper_table(table: PaperTable, rows: list[Row]) -> str:
+def _paper_table(table: PaperTable, rows: list[TableRow]) -> str:
     body, before = [], None
     for row in rows:
-        cells = [_th(row.label), _th(row.agent), *map(_score, row.scores)]
-        body.append((row.label != before, cells[0 if table.rows == "cell" else 1 :]))
+        cells = [_th(row.label), _th(row.agent), *map(_score_cell, row.scores)]
+        body.append((row.label != before, cells[0 if table.group == "cell" else 1 :]))
         before = row.label
-    return _table([*(["family"] if table.rows == "cell" else []), "agent", *table.columns], body)
+    return _html_table([*(["family"] if table.group == "cell" else []), "agent", *table.columns], body)
 
 
-def _score(score: Score) -> str:
+def _score_cell(score: TableScore) -> str:
     lines = []
-    useful, measured = score.headroom
+    with_headroom, measured = score.headroom
     if score.mean is not None and score.std is not None:
         lines.append(f"{score.mean:z.1f} ± {score.std:.1f}")
         if score.played[0] < score.played[1]:
@@ -158,56 +175,50 @@ def _score(score: Score) -> str:
         lines.append(f"<small>paper {mean:z.1f}{'' if std is None else f' ± {std:.1f}'}</small>")
     if score.normalised is not None:
         lines.append(f'<small class="norm">normalised {score.normalised:z.2f}</small>')
-    if measured and not useful and score.mean is not None:
+    if measured and not with_headroom and score.mean is not None:
         lines.append("<small>no headroom</small>")
-    kind = "flat" if measured and not useful else "none" if score.mean is None else ""
+    kind = "flat" if measured and not with_headroom else "none" if score.mean is None else ""
     return f'<td class="{kind}">{"".join(lines)}</td>'
 
 
-def _other_cells(runs: list[Run], protocol: str) -> list[str]:
-    """Cells of no paper table: learned teammates, training layouts."""
+def _other_cells(runs: list[EvaluationRun], protocol: str) -> list[str]:
+    """Returns the table of cells that no paper table has: learned teammates, training layouts."""
     usual = {(layout, family) for layout in TEST_LAYOUTS for family in HEURISTICS}
     cells = list(dict.fromkeys(cell for run in runs for cell in run.cells if cell not in usual))
     if not cells:
         return []
     headroom = read_headroom(protocol)
     shown = [run for run in runs if any(cell in run.cells for cell in cells)]
-    body = [(False, [_th(run.label), *(_score(score([cell], run, headroom)) for cell in cells)]) for run in shown]
+    body = [
+        (False, [_th(run.label), *(_score_cell(score_cells([cell], run, headroom)) for cell in cells)]) for run in shown
+    ]
     columns = ["agent", *(f"{layout}, {'learned' if family == 'rl' else family}" for layout, family in cells)]
-    told = (
+    note = (
         "<p>Learned teammates are held out of training. The paper gives this as a figure without numbers (App. F).</p>"
     )
-    return ["<h3>Other teammates</h3>", told, _table(columns, body)]
+    return ["<h3>Other teammates</h3>", note, _html_table(columns, body)]
 
 
-def _sweep_table(panels: dict[str, dict[str, list[Point]]], what: str) -> str:
-    body = [
-        (False, [_th(layout), _th(agent), f"<td>{escape(str(point.value))}</td>", _score(_of_point(point))])
-        for layout, lines in panels.items()
-        for agent, points in lines.items()
-        for point in points
-    ]
-    return _table(["layout", "agent", what, AVERAGE], body)
+def _sweep_table(panels: Mapping[str, Mapping[str, Sequence[SweepPoint]]], quantity: str) -> str:
+    body = []
+    for layout, lines in panels.items():
+        for agent, points in lines.items():
+            for point in points:
+                published = None if point.published is None else (point.published, None)
+                score = TableScore(point.mean, point.std, published, None, (0, 0), (1, 1))
+                body.append(
+                    (False, [_th(layout), _th(agent), f"<td>{escape(str(point.value))}</td>", _score_cell(score)])
+                )
+    return _html_table(["layout", "agent", quantity, AVERAGE], body)
 
 
-def _of_point(point: Point) -> Score:
-    published = None if point.published is None else (point.published, None)
-    return Score(point.mean, point.std, published, None, (0, 0), (1, 1))
-
-
-def _gain_table(runs: list[Run]) -> str:
+def _gain_table(runs: list[EvaluationRun]) -> str:
     cells = list(dict.fromkeys(cell for run in runs for cell in run.cells))
-    body = [
-        (
-            False,
-            [
-                _th(run.label),
-                *(f"<td>{run.gain(cell):+z.1f}</td>" if cell in run.cells else "<td></td>" for cell in cells),
-            ],
-        )
-        for run in runs
-    ]
-    return _table(["agent", *(f"{layout} {family}" for layout, family in cells)], body)
+    body = []
+    for run in runs:
+        gains = [f"<td>{run.gain(cell):+z.1f}</td>" if cell in run.cells else "<td></td>" for cell in cells]
+        body.append((False, [_th(run.label), *gains]))
+    return _html_table(["agent", *(f"{layout} {family}" for layout, family in cells)], body)
 
 
 def _headroom_table(protocol: str) -> str:
@@ -216,32 +227,30 @@ def _headroom_table(protocol: str) -> str:
     for family in HEURISTICS:
         row = [_th(family)]
         for layout in TEST_LAYOUTS:
-            told = measured.get((layout, family))
-            if told is None:
+            references = measured.get((layout, family))
+            if references is None:
                 row.append('<td class="none">not measured</td>')
             else:
-                kind = "" if has_headroom(told) else "flat"
-                row.append(f'<td class="{kind}">{" / ".join(f"{told[a]:z.1f}" for a in REFERENCES)}</td>')
+                kind = "" if has_headroom(references) else "flat"
+                row.append(f'<td class="{kind}">{" / ".join(f"{references[a]:z.1f}" for a in REFERENCES)}</td>')
         body.append((False, row))
-    told = "<p>Mean return of the reference egos stay / random / oracle (scripted, full information).</p>"
-    return told + _table(["family", *TEST_LAYOUTS], body)
+    note = "<p>Mean return of the reference egos stay / random / oracle (scripted, full information).</p>"
+    return note + _html_table(["family", *TEST_LAYOUTS], body)
 
 
-def _films(films: Sequence[EpisodeGif]) -> list[str]:
-    told = (
+def _episode_section(gifs: Sequence[EpisodeGif]) -> list[str]:
+    note = (
         "<p>The first episode of an evaluated task, when the ego remembers nothing yet. Ego blue, teammate red; the "
-        "frame is what the ego sees.</p>"
+        "frame is the ego's view.</p>"
     )
-    parts = ["<h2>An episode per family</h2>", told]
-    for family in dict.fromkeys(film.family for film in films):
+    parts = ["<h2>An episode per family</h2>", note]
+    for family in dict.fromkeys(gif.family for gif in gifs):
         parts.append(f"<h3>{'Learned teammates' if family == 'rl' else family}</h3>")
-        for film in films:
-            if film.family == family:
-                parts.append(_figure(film.path, film.told, " class=film"))
+        parts += [_figure(gif.path, gif.caption, " class=episode") for gif in gifs if gif.family == family]
     return parts
 
 
-def _settings(runs: Sequence[Run]) -> str:
+def _settings_section(runs: Sequence[EvaluationRun]) -> str:
     columns = [
         "agent", "layouts", "protocol", "episodes x steps", "seeds", "settings hash", "version", "trained on",
         "training", "run hash", "data manifest (SHA-256)", "results",
@@ -252,38 +261,37 @@ def _settings(runs: Sequence[Run]) -> str:
             settings, trained = source.settings, source.trained or {}
             config = trained.get("config", {})
             histories, train = config.get("histories", {}), config.get("train", {})
-            plan = settings["protocol"]
-            how = {
-                name: train.get(name) for name in ("steps", "batch_size", "context", "learning_rate", "seed") if train
-            } | {name: config["model"][name] for name in ("layers", "width", "positions") if "model" in config}
+            protocol, model = settings["protocol"], config.get("model", {})
+            training = {name: train[name] for name in _SHOWN_TRAINING if name in train}
+            training |= {name: model[name] for name in _SHOWN_MODEL if name in model}
             values = [
                 run.label,
                 ", ".join(source.layouts),
-                plan["name"],
-                f"{plan['episodes']} x {plan['steps']}",
+                protocol["name"],
+                f"{protocol['episodes']} x {protocol['steps']}",
                 ", ".join(map(str, settings["seeds"])),
                 json_hash(settings),
                 settings["code_version"],
                 f"{', '.join(histories['layouts'])}; data {histories['data_version']}" if histories else "",
-                ", ".join(f"{name} {value}" for name, value in how.items()),
+                ", ".join(f"{name} {value}" for name, value in training.items()),
                 trained.get("run_hash", ""),
                 trained.get("manifest_sha256") or "",
                 source.folder,
             ]
             body.append((False, [_code(value) for value in values]))
-    return "<h2>Settings and hashes</h2>" + _table(columns, body)
+    return "<h2>Settings and hashes</h2>" + _html_table(columns, body)
 
 
 def _code(text: str) -> str:
     return f"<td{' class=long' if len(text) > 30 else ''}><code>{escape(text)}</code></td>"
 
 
-def _sources() -> str:
+def _sources_section() -> str:
     published = read_published()
-    told = [published["source"], *(published[part]["source"] for part in ("tracks", "contexts", "auxiliary"))]
+    texts = [published["source"], *(published[part]["source"] for part in ("tracks", "contexts", "auxiliary"))]
     extra = json.dumps(published["auxiliary"]["methods"])
     items = "".join(
-        f"<li>{escape(text)}</li>" for text in [*told, f"auxiliary losses: {extra}", published["not_stated"]]
+        f"<li>{escape(text)}</li>" for text in [*texts, f"auxiliary losses: {extra}", published["not_stated"]]
     )
     return f"<h2>The paper's numbers</h2><ul>{items}</ul>"
 
@@ -292,15 +300,15 @@ def _th(text: str) -> str:
     return f"<th>{escape(text)}</th>"
 
 
-def _table(columns: Iterable[str], body: Iterable[tuple[bool, Sequence[str]]]) -> str:
+def _html_table(columns: Iterable[str], body: Iterable[tuple[bool, Sequence[str]]]) -> str:
     head = "".join(map(_th, columns))
     rows = "".join(f"<tr{' class=first' if first else ''}>{''.join(cells)}</tr>" for first, cells in body)
     return f'<div class="wide"><table><tr>{head}</tr>{rows}</table></div>'
 
 
-def _figure(path: Path | None, caption: str, look: str = "") -> str:
+def _figure(path: Path | None, caption: str, attributes: str = "") -> str:
     image = ""
     if path is not None:
         content = base64.b64encode(path.read_bytes()).decode()
         image = f'<img alt="{escape(caption)}" src="data:image/{path.suffix.removeprefix(".")};base64,{content}">'
-    return f"<figure{look}>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+    return f"<figure{attributes}>{image}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -1,4 +1,4 @@
-"""A run's log for TensorBoard, by tensorboardX (extra `tensorboard`)."""
+"""A run's log for TensorBoard, written by tensorboardX (extra `tensorboard`)."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ from typing import Any
 
 from icrl4aht_data.errors import OptionError
 
-_SECONDS = 10  # between writes, so that one can look on
+_FLUSH_SECONDS = 10
 
 
-class Events:
-    """Event files with the numbers of metrics.jsonl, in a folder for each part: a chart shows the parts together.
+class TensorBoardLog:
+    """Event files with the numbers of metrics.jsonl, one folder per part, so that a chart shows the parts together.
 
-    They are made anew from the log whenever a run goes on, so they hold what the log holds, and no step twice.
+    They are rewritten from the log whenever a run resumes, so they hold the log's lines, and no step twice.
 
     Args:
-        folder: what it holds is replaced.
+        folder: its content is replaced.
         metrics: the log so far.
+
+    Raises:
+        OptionError: if tensorboardX is not installed.
     """
 
     def __init__(self, folder: Path, metrics: Path) -> None:
+        check_installed()
         self._folder = folder
         self._writers: dict[str, Any] = {}
         shutil.rmtree(folder, ignore_errors=True)
@@ -32,30 +36,27 @@ class Events:
 
     def add(self, lines: Iterable[dict[str, Any]]) -> None:
         """Write lines of the log."""
-        for line in lines:
-            writer = self._writer(line["part"])
-            for name, value in line.items():
-                if name not in ("step", "part"):
-                    writer.add_scalar(name, value, line["step"])
-
-    def _writer(self, part: str) -> Any:
         from tensorboardX import SummaryWriter
 
-        if part not in self._writers:
-            self._writers[part] = SummaryWriter(str(self._folder / part), flush_secs=_SECONDS)
-        return self._writers[part]
+        for line in lines:
+            part = line["part"]
+            if part not in self._writers:
+                self._writers[part] = SummaryWriter(str(self._folder / part), flush_secs=_FLUSH_SECONDS)
+            for name, value in line.items():
+                if name not in ("step", "part"):
+                    self._writers[part].add_scalar(name, value, line["step"])
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write everything to the disk."""
         for writer in self._writers.values():
             writer.close()
 
 
 def check_installed() -> None:
-    """Whether there is tensorboardX.
+    """Check that tensorboardX is installed.
 
     Raises:
-        OptionError: if not.
+        OptionError: if it is not.
     """
     try:
         import tensorboardX  # noqa: F401

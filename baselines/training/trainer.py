@@ -1,14 +1,15 @@
-"""The one trainer (paper, App. E.4): any method on any batches; exact resume, accumulation, data-parallel.
+"""The trainer (paper, App. E.4): any method on any batches; exact resume, accumulation, data parallelism.
 
-Step i is a function of the state before it and of batch i, which is a function of (seed, i): a run that was killed goes
-on from its last checkpoint to the same parameters and the same log as one that was not.
+Step i is a function of the state before it and of batch i, which is a function of (seed, i). So a run that was killed
+resumes from its last checkpoint to the same parameters and the same log as an uninterrupted one.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,92 +21,65 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from baselines.methods.method import Method
-from baselines.training.plots import plot_run
-from baselines.training.run_folder import (
-    CURVES,
-    METRICS,
-    TENSORBOARD,
-    TIMING,
-    Checkpoints,
-    append,
-    forget_after,
-    open_run,
-    versions,
-)
-from baselines.training.tensorboard import Events, check_installed
+from baselines.plotting import plot_training_log
+from baselines.training.options import TrainOptions
+from baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
+from baselines.training.tensorboard import TensorBoardLog, check_installed
+from generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.sampling.batches import Batches
 
-PARTS = "data"
+BATCH_AXIS = "data"
 """The mesh's one axis: rows of a batch."""
 
 
-@dataclass(frozen=True)
-class TrainOptions:
-    """How a model is trained; the defaults are the paper's (App. E.5)."""
+class TrainingData(NamedTuple):
+    """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
-    steps: int = 20_000
-    batch_size: int = 1024  # over all devices and processes
-    context: int = 500  # steps of a window, or transitions of a context
-    learning_rate: float = 1e-3
-    warmup: float = 0.05  # share of the steps
-    weight_decay: float = 0.0
-    clip: float = 1.0  # of the gradient's global norm
-    accumulate: int = 1  # parts that a batch is computed in, one after the other
-    seed: int = 0
-    log_every: int = 50
-    validate_every: int = 1000
-    validation_batches: int = 2
-    save_every: int = 1000
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "context", "accumulate", "log_every", "validate_every", "save_every"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: expected at least 1")
-        for name in ("learning_rate", "clip"):
-            if getattr(self, name) <= 0:
-                raise OptionError(f"{name} = {getattr(self, name)}: expected a positive number")
-        if not 0 <= self.warmup <= 1:
-            raise OptionError(f"warmup = {self.warmup}: expected a share of the steps, 0 to 1")
-        if self.weight_decay < 0 or self.validation_batches < 0:
-            raise OptionError("weight_decay and validation_batches: expected 0 or more")
-
-    @property
-    def schedule(self) -> optax.Schedule:
-        """The learning rate: linear warm-up, then cosine to 0 (paper, App. E.4)."""
-        warmup = round(self.warmup * self.steps)
-        return optax.warmup_cosine_decay_schedule(0.0, self.learning_rate, warmup, max(self.steps, warmup + 1))
-
-    @property
-    def optimizer(self) -> optax.GradientTransformation:
-        """AdamW on clipped gradients."""
-        adam = optax.adamw(self.schedule, weight_decay=self.weight_decay)
-        return optax.chain(optax.clip_by_global_norm(self.clip), adam)
-
-
-class Data(NamedTuple):
-    """Samplers: sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`."""
+    Attributes:
+        train: sampler of the batches to train on.
+        validation: name of a held-out part -> its sampler.
+    """
 
     train: Any
     validation: Mapping[str, Any]
 
 
-class State(NamedTuple):
-    """What a checkpoint holds."""
+class TrainState(NamedTuple):
+    """Content of a checkpoint.
+
+    Attributes:
+        params: pytree of float32 arrays.
+        slow: copy of the parameters that follows them slowly, or None.
+        optimizer: state of the optimizer.
+        step: int32 (), steps so far.
+    """
 
     params: Any
-    slow: Any  # a slowly following copy of the parameters, or None
+    slow: Any
     optimizer: optax.OptState
     step: Int[Array, ""]
 
 
+def learning_rate_schedule(options: TrainOptions) -> optax.Schedule:
+    """Returns the learning rate per step: linear warm-up, then cosine to 0 (paper, App. E.4)."""
+    warmup = round(options.warmup * options.steps)
+    return optax.warmup_cosine_decay_schedule(0.0, options.learning_rate, warmup, max(options.steps, warmup + 1))
+
+
+def make_optimizer(options: TrainOptions) -> optax.GradientTransformation:
+    """Returns AdamW on gradients clipped by global norm."""
+    adam = optax.adamw(learning_rate_schedule(options), weight_decay=options.weight_decay)
+    return optax.chain(optax.clip_by_global_norm(options.clip), adam)
+
+
 class Trainer:
-    """A method's training step and validation, compiled for the devices there are.
+    """A method's training step and validation, compiled for some devices.
 
     Args:
         method: what to train.
         options: how.
-        devices: all, over all processes, by default.
+        devices: all devices of all processes by default.
 
     Raises:
         OptionError: if a batch cannot be divided among devices and parts.
@@ -119,75 +93,93 @@ class Trainer:
                 f"batch_size = {options.batch_size}: expected a multiple of {share}, {len(devices)} devices x "
                 f"{options.accumulate} parts"
             )
-        self.method, self.options = method, options
-        mesh = Mesh(np.asarray(devices), (PARTS,))
+        self.method, self.options, self._optimizer = method, options, make_optimizer(options)
+        self._learning_rate = learning_rate_schedule(options)
+        mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
         self.rows, self._parts, self.everywhere = (
-            NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((PARTS,), (None, PARTS), ())
+            NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((BATCH_AXIS,), (None, BATCH_AXIS), ())
         )
         same = self.everywhere
         self.step = jax.jit(self._step, in_shardings=(same, self.rows), out_shardings=same, donate_argnums=0)
         self.validate = jax.jit(self._validate, in_shardings=(same, self.rows), out_shardings=same)
 
-    def init(self) -> State:
-        """The state before the first step."""
-        return jax.jit(self.fresh, out_shardings=self.everywhere)()
+    def init(self) -> TrainState:
+        """Returns the state before the first step, on the trainer's devices."""
+        return jax.jit(self._initial_state, out_shardings=self.everywhere)()
 
-    def fresh(self) -> State:
-        """The same, wherever it is computed."""
+    def state_like(self) -> Any:
+        """Returns shapes, dtypes and shardings of the state, to restore a checkpoint by."""
+        shapes = jax.eval_shape(self._initial_state)
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self.everywhere), shapes)
+
+    def _initial_state(self) -> TrainState:
         params = self.method.init(jax.random.key(self.options.seed))
         slow = jax.tree.map(jnp.copy, params) if self.method.slow else None
-        return State(params, slow, self.options.optimizer.init(params), jnp.int32(0))
+        return TrainState(params, slow, self._optimizer.init(params), jnp.int32(0))
 
-    def _step(self, state: State, batch: Any) -> tuple[State, dict[str, Array]]:
-        """One update; what to log."""
-        options = self.options
-        key = jax.random.fold_in(jax.random.key(options.seed + 1), state.step)
-        gradient_of = jax.value_and_grad(self.method.loss, has_aux=True)
-
-        def part(number: Array, rows: Any) -> tuple[Any, dict[str, Array]]:
-            (_, log), gradient = gradient_of(state.params, state.slow, rows, jax.random.fold_in(key, number))
-            return gradient, log
-
-        if options.accumulate == 1:
-            gradient, log = part(jnp.int32(0), batch)
-        else:
-            parts = jax.tree.map(self._in_parts, batch)
-            first = jax.tree.map(lambda leaf: leaf[0], parts)
-            zero = jax.tree.map(
-                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(part, jnp.int32(0), first)
-            )
-
-            def add(total: Any, numbered: Any) -> tuple[Any, None]:
-                return jax.tree.map(jnp.add, total, part(*numbered)), None
-
-            total, _ = jax.lax.scan(add, zero, (jnp.arange(options.accumulate), parts))
-            gradient, log = jax.tree.map(lambda leaf: leaf / options.accumulate, total)
-        change, optimizer = options.optimizer.update(gradient, state.optimizer, state.params)
+    def _step(self, state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Array]]:
+        """Returns the state after one update, and the numbers to log."""
+        key = jax.random.fold_in(jax.random.key(self.options.seed + 1), state.step)
+        gradient, log = self._gradient(state, batch, key)
+        change, optimizer = self._optimizer.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, change)
         slow = state.slow
         if self.method.slow:
             slow = optax.incremental_update(params, slow, self.method.slow)
-        rate = jnp.asarray(options.schedule(state.step))
+        rate = jnp.asarray(self._learning_rate(state.step))
         norm = jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(gradient)))
         log |= {"gradient_norm": norm, "learning_rate": rate}
-        return State(params, slow, optimizer, state.step + 1), log
+        return TrainState(params, slow, optimizer, state.step + 1), log
 
-    def _in_parts(self, rows: Array) -> Array:
-        """(B, ..) -> (accumulate, B / accumulate, ..): every part has rows of every device."""
+    def _gradient(self, state: TrainState, batch: Any, key: Array) -> tuple[Any, dict[str, Array]]:
+        """Returns gradient and log of a batch: the mean of its parts, which are computed one after the other."""
+        parts = self.options.accumulate
+        gradient_of = jax.value_and_grad(self.method.loss, has_aux=True)
+
+        def part_gradient(number: Array, rows: Any) -> tuple[Any, dict[str, Array]]:
+            (_, log), gradient = gradient_of(state.params, state.slow, rows, jax.random.fold_in(key, number))
+            return gradient, log
+
+        if parts == 1:
+            return part_gradient(jnp.int32(0), batch)
+        split = jax.tree.map(self._split_rows, batch)
+        first = jax.tree.map(lambda leaf: leaf[0], split)
+        shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+        def add(total: Any, numbered: Any) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, total, part_gradient(*numbered)), None
+
+        total, _ = jax.lax.scan(add, zero, (jnp.arange(parts), split))
+        return jax.tree.map(lambda leaf: leaf / parts, total)
+
+    def _split_rows(self, rows: Array) -> Array:
+        """Reshapes (B, ..) to (accumulate, B / accumulate, ..), so that every part has rows on every device."""
         parts = rows.reshape(-1, self.options.accumulate, *rows.shape[1:]).swapaxes(0, 1)
         return jax.lax.with_sharding_constraint(parts, self._parts)
 
-    def _validate(self, state: State, batch: Any) -> dict[str, Array]:
+    def _validate(self, state: TrainState, batch: Any) -> dict[str, Array]:
         return self.method.loss(state.params, state.slow, batch, None)[1]
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 2) -> Batches:
-        """Batches on the devices, the next one's transfer running beside a step."""
+        """Returns batches on the devices; the next one is transferred during a step."""
         return Batches(sampler, start, stop, prefetch=prefetch, device=self.rows)
+
+    def validation_lines(self, state: TrainState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
+        """Returns log lines with the mean of every logged number over the first batches of each held-out part."""
+        lines = []
+        for name, sampler in samplers.items():
+            with self.batches(sampler, 0, self.options.validation_batches, prefetch=0) as batches:
+                logs = [_as_floats(self.validate(state, batch)) for batch in batches]
+            if logs:
+                means = {key: float(np.mean([log[key] for log in logs])) for key in logs[0]}
+                lines.append({"step": step, "part": name, **means})
+        return lines
 
 
 def train(
     method: Method,
-    data: Data,
+    data: TrainingData,
     options: TrainOptions,
     folder: Path,
     about: Mapping[str, Any],
@@ -195,99 +187,71 @@ def train(
     devices: Any = None,
     tensorboard: bool = False,
     done: Callable[[int, float], None] = lambda step, loss: None,
-) -> State:
-    """Train, or go on with what is in the folder; to its end.
+) -> TrainState:
+    """Train to the end, from the start or from the last checkpoint in the folder.
 
     Args:
         method: what to train.
         data: batches of `options.batch_size` rows.
         options: how.
-        folder: config.json, metrics.jsonl (a function of the settings), timing.jsonl, curves.png, checkpoints/.
-        about: the rest of config.json: what the run is of.
+        folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, curves.png and
+            checkpoints/.
+        about: further settings for config.json, such as the model's and the data's.
         devices: all by default.
-        tensorboard: also write the log for TensorBoard, into tensorboard/.
+        tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
         done: called with a step and its loss whenever they are logged.
 
     Returns:
         The state after the last step.
 
     Raises:
-        OptionError: if the folder holds a run of other settings, or tensorboardX is not installed.
+        OptionError: if the folder holds a run of other settings, or tensorboardX is required and not installed.
+        BusyError: if another process trains in the folder.
     """
     if tensorboard:
         check_installed()
     trainer = Trainer(method, options, devices)
-    config = {**versions(), "method": method.name, **about, "train": asdict(options)}
-    checkpoints, events = Checkpoints(folder), None
-    try:
-        there = open_run(folder, config) and checkpoints.latest is not None
-        state = _restored(checkpoints, trainer) if there else trainer.init()
-        first, writes = int(state.step), jax.process_index() == 0
+    config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
+    with ExitStack() as stack:
+        writes = jax.process_index() == 0
         if writes:
-            for name in (METRICS, TIMING):
-                forget_after(folder / name, first)
-            events = Events(folder / TENSORBOARD, folder / METRICS) if tensorboard else None
-        clock = _Clock(first)
-        with trainer.batches(data.train, first, options.steps) as batches:
-            for number, batch in enumerate(batches, start=first + 1):
-                state, log = trainer.step(state, batch)
-                last = number == options.steps
-                lines = []
-                if number % options.log_every == 0 or last:
-                    lines.append({"step": number, "part": "train", **_numbers(log)})
-                    done(number, lines[0]["loss"])
-                if number % options.validate_every == 0 or last:
-                    lines += _validation(trainer, state, data.validation, number)
-                if writes and lines:
-                    append(folder / METRICS, lines)
-                    append(folder / TIMING, [clock.line(number, batches.waited)])
-                if events and lines:
-                    events.add(lines)
-                if number % options.save_every == 0 or last:
-                    checkpoints.save(number, *_parts_of(state))
-    finally:
-        checkpoints.close()
+            stack.enter_context(run_lock(folder))
+        open_run(folder, config)
+        checkpoints = Checkpoints(folder / CHECKPOINTS, config)
+        state = trainer.init() if checkpoints.latest is None else checkpoints.load(trainer.state_like())[0]
+        first = int(state.step)
+        log = stack.enter_context(RunLog(folder, lambda line: line["step"] <= first))
+        events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
         if events:
-            events.close()
-    if writes:
-        plot_run(folder / METRICS, folder / CURVES, method.name)
+            stack.callback(events.close)
+        batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
+        clock, save = _StepClock(first), SaveInterval(options.steps, updates=options.save_every)
+        for step, batch in enumerate(batches, start=first + 1):
+            state, numbers = trainer.step(state, batch)
+            last, lines = step == options.steps, []
+            if step % options.log_every == 0 or last:
+                lines.append({"step": step, "part": "train", **_as_floats(numbers)})
+                done(step, lines[0]["loss"])
+            if step % options.validate_every == 0 or last:
+                lines += trainer.validation_lines(state, data.validation, step)
+            if lines:
+                log.write(*lines, timing=clock.line(step, batches.waited))
+                if events:
+                    events.add(lines)
+            if save.due(step):
+                log.sync()
+                checkpoints.save(state, step)
+        if writes:
+            plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
     return state
 
 
-def _parts_of(state: State) -> tuple[Any, Any]:
-    """What acting needs, and what only training does."""
-    rest = {"optimizer": state.optimizer, "step": state.step}
-    return state.params, rest if state.slow is None else rest | {"slow": state.slow}
-
-
-def _restored(checkpoints: Checkpoints, trainer: Trainer) -> State:
-    def like(leaf: Any) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=trainer.everywhere)
-
-    fresh = jax.tree.map(like, jax.eval_shape(trainer.fresh))
-    found = checkpoints.restore(*_parts_of(fresh))
-    return State(found.params, found.rest.get("slow"), found.rest["optimizer"], found.rest["step"])
-
-
-def _validation(trainer: Trainer, state: State, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-    """The mean of every logged number over the first batches of each held-out part."""
-    lines = []
-    for name, sampler in samplers.items():
-        with trainer.batches(sampler, 0, trainer.options.validation_batches, prefetch=0) as batches:
-            logs = [_numbers(trainer.validate(state, batch)) for batch in batches]
-        if logs:
-            lines.append(
-                {"step": step, "part": name} | {key: float(np.mean([log[key] for log in logs])) for key in logs[0]}
-            )
-    return lines
-
-
-def _numbers(log: dict[str, Array]) -> dict[str, float]:
+def _as_floats(log: dict[str, Array]) -> dict[str, float]:
     return {name: float(value) for name, value in jax.device_get(log).items()}
 
 
-class _Clock:
-    """Steps per second since it was last asked."""
+class _StepClock:
+    """Steps per second, and the share of time spent waiting for batches, since the last line."""
 
     def __init__(self, step: int) -> None:
         self._step, self._time, self._waited = step, time.perf_counter(), 0.0
@@ -298,7 +262,7 @@ class _Clock:
         line = {
             "step": step,
             "steps_per_second": round((step - self._step) / seconds, 4),
-            "loader_wait": round((waited - self._waited) / seconds, 4),  # share of the time
+            "loader_wait": round((waited - self._waited) / seconds, 4),
         }
         self._step, self._time, self._waited = step, now, waited
         return line

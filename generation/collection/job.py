@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from generation.collection.task import Report, TaskBusyError, run_task
+from generation.collection.task import Report, run_task
+from generation.learners.resume import BusyError
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError
@@ -42,6 +43,6 @@ class Job:
     def __call__(self, task: Task, report: Report = lambda update, metrics: None) -> Literal["done", "busy"]:
         try:
             run_task(task, self.profile, self.folder(task), report, suite=self.suite, wait=self.wait)
-        except TaskBusyError:
+        except BusyError:
             return "busy"
         return "done"

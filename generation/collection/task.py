@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from filelock import FileLock, Timeout
 
 from generation.collection.task_folder import (
     LEARNER,
     Writer,
     finish,
     is_finished,
-    lock_file,
     partial_folder,
     publish,
     resumable_settings,
@@ -28,12 +26,11 @@ from generation.collection.task_folder import (
 from generation.env import Environment
 from generation.learners.checkpoint import write_policy
 from generation.learners.ego import Learner, compiled_update
-from generation.learners.state_file import load_state, read_card, save_state
+from generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock
 from generation.policy import Noise
 from generation.profiles import Profile
 from generation.teammates.registry import build
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import TEAMMATE
 
 TEAMMATE_NOISE: Noise = "seeded"
@@ -44,10 +41,6 @@ SAVE_SECONDS = 30.0
 
 Report = Callable[[int, dict[str, float]], None]
 """Called after each update with its number and metrics."""
-
-
-class TaskBusyError(OptionError):
-    """Another process is at this task."""
 
 
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
@@ -77,19 +70,13 @@ def run_task(
         Whether there was anything to do; False if the artefact was finished before.
 
     Raises:
-        TaskBusyError: if another process is at this task.
+        BusyError: if another process is at this task.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(lock_file(folder), timeout=-1 if wait else 0):
-            if is_finished(folder, task, profile):
-                return False
-            _run(task, profile, folder, report, suite, save_seconds)
-            return True
-    except Timeout as error:
-        raise TaskBusyError(
-            f"{folder}: another process is collecting this task; wait for it, or give another --out"
-        ) from error
+    with run_lock(folder, wait=wait):
+        if is_finished(folder, task, profile):
+            return False
+        _run(task, profile, folder, report, suite, save_seconds)
+        return True
 
 
 def _run(task: Task, profile: Profile, folder: Path, report: Report, suite: Path | None, save_seconds: float) -> None:
@@ -103,12 +90,12 @@ def _run(task: Task, profile: Profile, folder: Path, report: Report, suite: Path
 def _learn(
     task: Task, profile: Profile, partial: Path, report: Report, suite: Path | None, save_seconds: float
 ) -> None:
-    learner, card = make_learner(task, profile, suite), resumable_settings(task, profile)
-    state, first = _state(learner, task, partial, card)
+    learner, saved = make_learner(task, profile, suite), StateFile(partial / LEARNER, resumable_settings(task, profile))
+    state, first = _state(learner, task, saved)
     update = compiled_update(learner)
     writer = Writer(partial, task, profile.ego, first)
     waiting: Any = None  # the last roll-out is written while the next one runs
-    saved = time.monotonic()
+    interval = SaveInterval(profile.ego.updates, seconds=save_seconds)
 
     def write(number: int, rollout: Any, metrics: Any) -> None:
         report(number, writer.write(number, rollout, metrics))
@@ -119,26 +106,28 @@ def _learn(
             if waiting is not None:
                 write(*waiting)
             waiting = number, rollout, metrics
-            if number + 1 == profile.ego.updates or time.monotonic() - saved >= save_seconds:
+            if interval.due(number + 1):
                 write(*waiting)
                 waiting = None
                 writer.sync()
                 began = time.perf_counter()
-                save_state(partial / LEARNER, state, card | {"updates": str(number + 1)})
+                saved.save(state, number + 1)
                 writer.count(time.perf_counter() - began)
-                saved = time.monotonic()
     finally:
         writer.close()
     steps = profile.ego.updates * profile.ego.steps_per_update
     write_policy(partial, learner.network, state.params, {"task_id": task.task_id, "steps": steps})
 
 
-def _state(learner: Learner, task: Task, partial: Path, card: dict[str, str]) -> tuple[Any, int]:
+def _state(learner: Learner, task: Task, saved: StateFile) -> tuple[Any, int]:
     """The learner's state and the number of updates it has had: as saved under the same settings, or new."""
     init, key = jax.jit(learner.init), jax.random.key(task.seed)
-    saved = read_card(partial / LEARNER)
-    if saved is not None and card | {"updates": saved.get("updates")} == saved:
-        return load_state(partial / LEARNER, jax.eval_shape(init, key)), int(saved["updates"])
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    try:
+        updates = saved.progress
+    except OtherSettingsError:  # nothing is published under these: start again
+        updates = None
+    if updates is not None:
+        return saved.load(jax.eval_shape(init, key)), updates
+    shutil.rmtree(saved.path.parent, ignore_errors=True)
+    saved.path.parent.mkdir(parents=True)
     return init(key), 0

@@ -26,14 +26,14 @@ import numpy as np
 
 from generation.collection import record
 from generation.learners.ppo import PPOConfig
-from generation.learners.state_file import keep_lines
+from generation.learners.resume import METRICS, TIMING, RunLog, software_versions
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
-METADATA, METRICS, TIMING, LEARNER = "metadata.json", "metrics.jsonl", "timing.jsonl", "learner.safetensors"
+METADATA, LEARNER = "metadata.json", "learner.safetensors"
 FILTER_CURVES = "filter.png"
 
 _HASHED = {f"{name}.npy" for name in record.Histories._fields} | {METRICS, "policy.safetensors", "policy.json"}
@@ -44,20 +44,14 @@ def partial_folder(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.partial")
 
 
-def lock_file(folder: Path) -> Path:
-    """The lock of a task."""
-    return folder.with_name(f".{folder.name}.lock")
-
-
 def settings(task: Task, profile: Profile) -> dict[str, Any]:
     """What an artefact is made of: a change of any of it makes the artefact anew."""
     return {"task": asdict(task), "ego_hash": profile.ego_hash, "code_version": version("icrl4aht-data")}
 
 
-def resumable_settings(task: Task, profile: Profile) -> dict[str, str]:
+def resumable_settings(task: Task, profile: Profile) -> dict[str, Any]:
     """What must be the same for a resumed task to give the same bits as an uninterrupted one."""
-    software = {"jax": jax.__version__, "platform": jax.default_backend()}
-    return {name: json.dumps(value) for name, value in (settings(task, profile) | software).items()}
+    return settings(task, profile) | software_versions()
 
 
 def is_finished(folder: Path, task: Task, profile: Profile) -> bool:
@@ -109,9 +103,7 @@ class Writer:
         if not first:
             for name, (shape, dtype) in record.shapes(task.layout, config).items():
                 np.lib.format.open_memmap(self._array(name), "w+", dtype, shape)
-        keep_lines(partial / METRICS, first)
-        self._metrics = (partial / METRICS).open("a", encoding="utf-8")
-        self._timing = (partial / TIMING).open("a", encoding="utf-8")
+        self._log = RunLog(partial, keep=lambda line: line["update"] < first)
         self._histories = self._mapped()
 
     def _array(self, name: str) -> Path:
@@ -132,7 +124,6 @@ class Writer:
         began = time.perf_counter()
         record.keep(self._histories, number, rollout)
         line = {"update": number, "step": (number + 1) * self._config.steps_per_update} | _metrics(metrics)
-        self._metrics.write(json.dumps(line) + "\n")
         now = time.perf_counter()
         self._busy += now - began
         seconds = now - self._started
@@ -140,8 +131,7 @@ class Writer:
         if number == self._first:  # the time until here was spent on compiling
             self._started, self._busy = now, 0.0
         timing = {"steps_per_second": round(speed, 1), "seconds": round(seconds, 3), "recording": round(self._busy, 3)}
-        self._timing.write(json.dumps({"update": number} | timing) + "\n")
-        self._timing.flush()
+        self._log.write(line, timing={"update": number} | timing)
         return line | timing
 
     def sync(self) -> None:
@@ -150,8 +140,7 @@ class Writer:
         for array in self._histories:
             array.flush()  # type: ignore[attr-defined]
         self._histories = self._mapped()
-        self._metrics.flush()
-        os.fsync(self._metrics.fileno())
+        self._log.sync()
         self._busy += time.perf_counter() - began
 
     def count(self, seconds: float) -> None:
@@ -159,8 +148,7 @@ class Writer:
         self._busy += seconds
 
     def close(self) -> None:
-        self._metrics.close()
-        self._timing.close()
+        self._log.close()
         del self._histories
 
 

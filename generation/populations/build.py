@@ -10,11 +10,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from generation.learners.resume import BusyError
 from generation.populations.cross_play import EPISODES
 from generation.populations.diversity import actions_on_common_states, between_families, hamming
 from generation.populations.figures import plot_matrix
 from generation.populations.select import Selection, layout_number, select, write_manifests
-from generation.populations.train import PopulationBusyError, Run, checkpoints, is_trained, play_matrix, train
+from generation.populations.train import Run, checkpoints, is_trained, play_matrix, train
 from generation.profiles import Profile
 from generation.progress import progress
 from generation.teammates import learned
@@ -106,7 +107,7 @@ def _train(run: Run, folder: Path, wait: bool, console: Console) -> bool:
             if not train(run, folder, report, wait=wait):
                 console.print(f"{label}: finished before")
                 return True
-        except PopulationBusyError:
+        except BusyError:
             console.print(f"{label}: another process is training it")
             return False
     console.print(

@@ -22,9 +22,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from filelock import FileLock, Timeout
 
-from generation.collection.task_folder import TIMING
 from generation.env import Environment
 from generation.learners.checkpoint import CARD, WEIGHTS, load_card, load_policy, save_policy
 from generation.learners.population.brdiv import BRDiv
@@ -33,7 +31,15 @@ from generation.learners.population.fcp import FCP
 from generation.learners.population.lbrdiv import LBRDiv
 from generation.learners.population.population import Population, PopulationState
 from generation.learners.ppo import PPOConfig
-from generation.learners.state_file import keep_lines, load_state, read_card, save_state
+from generation.learners.resume import (
+    METRICS,
+    RunLog,
+    SaveInterval,
+    StateFile,
+    differing_settings,
+    run_lock,
+    software_versions,
+)
 from generation.policy import stacked
 from generation.populations import cross_play
 from generation.populations.figures import plot_training
@@ -48,7 +54,7 @@ CHECKPOINTS = 5
 
 _SELECTIONS = 10  # how often in a member's training CoMeDi looks anew for the member it resembles most
 _SAVE_SECONDS = 60.0
-_POPULATION, _METRICS, _RESUME = "population.json", "metrics.jsonl", "resume.safetensors"
+_POPULATION, _RESUME = "population.json", "resume.safetensors"
 
 Report = Callable[[int, int, dict[str, float]], None]
 """Called after each update with its number, the number of all updates, and the metrics."""
@@ -135,10 +141,6 @@ def is_finished(folder: Path, run: Run) -> bool:
         return False
 
 
-class PopulationBusyError(OptionError):
-    """Another process is training this population."""
-
-
 def train(
     run: Run, folder: Path, report: Report = lambda update, updates, metrics: None, *, wait: bool = False
 ) -> bool:
@@ -151,18 +153,15 @@ def train(
         Whether there was anything to do; False if the population was finished before.
 
     Raises:
-        PopulationBusyError: if another process trains into this folder.
+        BusyError: if another process trains into this folder.
         OptionError: if it holds a run of other settings.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=-1 if wait else 0):
-            if is_finished(folder, run):
-                return False
-            _Training(run, folder, report).run_on()
-            return True
-    except Timeout as error:
-        raise PopulationBusyError(f"{folder}: another process is training this population; wait for it") from error
+    with run_lock(folder, wait=wait):
+        folder.mkdir(exist_ok=True)
+        if is_finished(folder, run):
+            return False
+        _Training(run, folder, report).run_on()
+        return True
 
 
 class _Training:
@@ -170,52 +169,37 @@ class _Training:
 
     def __init__(self, run: Run, folder: Path, report: Report) -> None:
         self.run, self.folder, self.report = run, folder, report
+        self.saved = StateFile(folder / _RESUME, run.settings | software_versions())
 
     def run_on(self) -> None:
-        stage, state = self._resume()
-        while stage < len(self.run.stages):
-            self._train_stage(stage, state)
-            stage, state = stage + 1, None
-        self._finish()
-
-    def _resume(self) -> tuple[int, PopulationState | None]:
-        path = self.folder / _RESUME
         if (self.folder / _POPULATION).exists():
             raise OptionError(
                 f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
             )
-        notes = read_card(path)
-        if notes is None:
-            self._begin_anew()
+        done, state = self._resume()
+        interval = SaveInterval(self.run.updates, seconds=_SAVE_SECONDS)
+        updates = self.run.config.updates
+        with RunLog(self.folder, lambda line: line["stage"] * updates + line["update"] < done) as log:
+            for stage in range(max(0, done - 1) // updates, len(self.run.stages)):
+                self._train_stage(stage, state, log, interval)
+                state = None
+        self._finish()
+
+    def _resume(self) -> tuple[int, PopulationState | None]:
+        """Number of updates done over all stages, and the state after them."""
+        done = self.saved.progress
+        if done is None:  # remove the checkpoints of a run that was killed before its first save
+            for folder in (*self.folder.glob("m[0-9]*"), self.folder / "responses"):
+                shutil.rmtree(folder, ignore_errors=True)
             return 0, None
-        if {name: notes.get(name) for name in self._notes(0)} != self._notes(int(notes["stage"])):
-            raise OptionError(
-                f"{self.folder}: holds an unfinished run of other settings, another JAX or another kind of device; "
-                f"remove it, or give another --suite"
-            )
-        stage = int(notes["stage"])
-        state = load_state(path, jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
-        keep_lines(self.folder / _METRICS, stage * self.run.config.updates + int(state.update))
-        return stage, state
-
-    def _begin_anew(self) -> None:
-        """Remove what a run left that was killed before its first save."""
-        for folder in (*self.folder.glob("m[0-9]*"), self.folder / "responses"):
-            shutil.rmtree(folder, ignore_errors=True)
-        for name in (_METRICS, TIMING):
-            (self.folder / name).unlink(missing_ok=True)
-
-    def _notes(self, stage: int) -> dict[str, str]:
-        """What must be the same for a run to go on to the same bits."""
-        software = {"jax": jax.__version__, "platform": jax.default_backend()}
-        return {"settings_hash": self.run.settings_hash, "stage": str(stage), **software}
+        stage = (done - 1) // self.run.config.updates
+        return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
 
     def _difference(self) -> str:
-        """In what a finished population is not this run's."""
+        """How a finished population differs from this run's."""
         try:
             found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
-            wanted = json.loads(json.dumps(self.run.settings))
-            other = {name: found.get(name) for name, value in wanted.items() if found.get(name) != value}
+            other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
         except (OSError, ValueError, KeyError, AttributeError):
             other = {}
         return f"of other settings: {other}" if other else "with changed files"
@@ -223,32 +207,27 @@ class _Training:
     def _key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
 
-    def _train_stage(self, stage: int, resumed: PopulationState | None) -> None:
+    def _train_stage(self, stage: int, resumed: PopulationState | None, log: RunLog, interval: SaveInterval) -> None:
         population, updates = self.run.stages[stage], self.run.config.updates
         state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
         update = jax.jit(population.update, donate_argnums=0)
         marks = {-(-updates * (c + 1) // CHECKPOINTS): c for c in range(CHECKPOINTS)}
         started, before = time.perf_counter(), int(state.update)
-        saved = started
-        metrics_file, timing_file = (self.folder / name for name in (_METRICS, TIMING))
-        with metrics_file.open("a", encoding="utf-8") as log, timing_file.open("a", encoding="utf-8") as clock:
-            for number in range(before, updates):
-                if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
-                    state = state._replace(params=self._meet_the_nearest(state.params, stage, number))
-                state, metrics = update(state)
-                seconds = time.perf_counter() - started
-                line = self._line(stage, number, metrics)
-                speed = {"steps_per_second": round((number + 1 - before) * population.steps_per_update / seconds, 1)}
-                log.write(json.dumps(line) + "\n")
-                clock.write(json.dumps({"stage": stage, "update": number} | speed) + "\n")
-                self.report(stage * updates + number + 1, self.run.updates, line | speed)
-                if number + 1 in marks:
-                    self._save_checkpoints(stage, marks[number + 1], number + 1, state.params)
-                if time.perf_counter() - saved > _SAVE_SECONDS:
-                    log.flush()
-                    clock.flush()
-                    save_state(self.folder / _RESUME, state, self._notes(stage))
-                    saved = time.perf_counter()
+        for number in range(before, updates):
+            if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
+                state = state._replace(params=self._meet_the_nearest(state.params, stage, number))
+            state, metrics = update(state)
+            seconds = time.perf_counter() - started
+            line = self._line(stage, number, metrics)
+            speed = {"steps_per_second": round((number + 1 - before) * population.steps_per_update / seconds, 1)}
+            log.write(line, timing={"stage": stage, "update": number} | speed)
+            done = stage * updates + number + 1
+            self.report(done, self.run.updates, line | speed)
+            if number + 1 in marks:
+                self._save_checkpoints(stage, marks[number + 1], number + 1, state.params)
+            if interval.due(done):
+                log.sync()
+                self.saved.save(state, done)
 
     def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
         values = {name: float(value) for name, value in metrics.items()}
@@ -307,7 +286,7 @@ class _Training:
 
     def _finish(self) -> None:
         plot_training(
-            self.folder / _METRICS, self.folder / "curves.png", f"{self.run.algorithm}, {self.run.layout.name}"
+            self.folder / METRICS, self.folder / "curves.png", f"{self.run.algorithm}, {self.run.layout.name}"
         )
         files = {
             str(path.relative_to(self.folder)): file_hash(path)

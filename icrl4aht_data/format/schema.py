@@ -52,7 +52,7 @@ CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("c
 (the last chunk is padded), and the checksum of the stored bytes. The bytes between the chunks follow in rows with
 `rows` = 0, so that the table covers every byte of a shard exactly once. Rows are ordered by history, then by `FIELDS`,
 then by chunk. In the file a history's chunks are ordered by time, so that a window of steps is one range of bytes, see
-`shard_writer.in_time`."""
+`shard_writer.file_order`."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 
-Names = str | Sequence[str] | None
+FilterValues = str | Sequence[str] | None
 """One value of an index field, several, or None for any."""
 
 
@@ -239,7 +239,7 @@ class Selection:
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 
-    def filter(self, **wanted: Names) -> Self:
+    def filter(self, **wanted: FilterValues) -> Self:
         """The histories of this selection whose index fields have one of the wanted values.
 
         Args:

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from baselines.demo import run_demo
 from baselines.evaluate.protocols import PROTOCOLS
-from baselines.methods.method import ModelOptions
-from baselines.training.trainer import TrainOptions
+from baselines.methods.options import ModelOptions
+from baselines.training.options import TrainOptions
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 

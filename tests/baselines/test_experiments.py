@@ -15,13 +15,22 @@ from click.testing import CliRunner
 from baselines import experiments
 from baselines.commands.cli import cli
 from baselines.evaluate.results import read_result
-from baselines.experiments import CONTEXTS, EXPERIMENTS, TESTED_ON, Done, ExperimentPlan, held_out_tasks, run_experiment
-from baselines.methods.method import ModelOptions
-from baselines.report.episode_gifs import film_families
+from baselines.experiments import (
+    CONTEXTS,
+    EXPERIMENTS,
+    TESTED_ON,
+    ExperimentOutcome,
+    ExperimentPlan,
+    held_out_tasks,
+    run_experiment,
+)
+from baselines.methods.options import ModelOptions
+from baselines.report.episode_gifs import family_gifs
 from baselines.report.results import TEST_LAYOUTS, read_run
-from baselines.training.run_folder import Checkpoints
+from baselines.training.run_folder import CHECKPOINTS
 from generation.learners.checkpoint import WEIGHTS, save_policy
 from generation.learners.network import ActorCritic, Widths
+from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -32,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 MODEL: dict[str, Any] = {"layers": 1, "width": 8, "heads": 2}
 TRAIN: dict[str, Any] = {"steps": 2, "batch_size": 2, "validation_batches": 1}
-SMALL = ExperimentPlan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, films=False)
+SMALL = ExperimentPlan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, gifs=False)
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +70,8 @@ def test_the_settings_are_the_papers():
 def killed(what: str):
     """A run that dies when this is done."""
 
-    def progress(task: str, done: int, of: int) -> None:
-        if what in task and done == of:
+    def progress(task: str, done: int, total: int) -> None:
+        if what in task and done == total:
             raise KeyboardInterrupt
 
     return progress
@@ -76,7 +85,7 @@ def swept(release, tmp_path_factory) -> tuple[Path, ExperimentPlan]:
     for what in ("K250 on demo_wide: training", "K250 on demo_wide: evaluation"):
         with pytest.raises(KeyboardInterrupt):
             run_experiment("sweep context", plan, out, killed(what))
-    assert Checkpoints(out / "ad-K250" / "demo_wide" / "run").latest == 2
+    assert Checkpoints(out / "ad-K250" / "demo_wide" / "run" / CHECKPOINTS).latest == 2
     done = run_experiment("sweep context", plan, out)
     assert done.notes[1] == "left out, the release has no training histories of them: test_wide"
     return out, plan
@@ -97,12 +106,12 @@ def test_what_is_finished_is_not_done_again(swept, monkeypatch):
     results = sorted(out.rglob("tasks/*.json"))
     before = [(path, path.stat().st_mtime_ns) for path in results]
     assert len(results) == 1
-    steps = []
-    monkeypatch.setattr(experiments, "write_page_with_films", lambda *a, **k: out)
-    run_experiment("sweep context", plan, out, lambda what, done, of: steps.append((what.split(": ")[1], done, of)))
+    steps: list[tuple[str, int, int]] = []
+    monkeypatch.setattr(experiments, "write_page_with_episodes", lambda *a, **k: out)
+    run_experiment("sweep context", plan, out, lambda what, *counts: steps.append((what.split(": ")[1], *counts)))
     assert [(path, path.stat().st_mtime_ns) for path in results] == before
     assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 0, 1), ("evaluation", 1, 1)]
-    with pytest.raises(OptionError, match=r"train\.seed: the run has 0, asked for 3"):
+    with pytest.raises(OptionError, match=r"train\.seed: the run has 0, expected 3"):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
 
 
@@ -116,7 +125,7 @@ def asked(release, tmp_path_factory) -> Path:
         methods=("dpt",),
         layouts=("demo_wide",),
         values=("ta-next_obs",),
-        films=True,
+        gifs=True,
         tensorboard=True,
     )
     run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), out)
@@ -136,21 +145,21 @@ def test_the_page_shows_the_reported_agent(asked, tmp_path):
     where = asked / "dpt-ta-next_obs" / "demo_wide"
     (result,) = (read_result(path) for path in where.rglob("tasks/*.json"))
     page = (asked / "report" / "report.html").read_text()
-    told = f"DPT+TA+next_obs beside H4/t0 on demo_wide: team return {result.returns[0][0]:g} in episode 1 of 2. "
+    told = f"DPT+TA+next_obs with H4/t0 on demo_wide: team return {result.returns[0][0]:g} in episode 1 of 2. "
     assert f"{told}Task {result.task_id}, protocol seeded, seed 0." in page
     assert page.count("data:image/gif") == 1
 
     other = shutil.copytree(where, tmp_path / "other")
     about = json.loads((other / "results" / "run.json").read_text())
-    for folder, why in ((tmp_path / "gone", "is gone"), (other / "run", "holds another model than these results")):
+    for folder, why in ((tmp_path / "gone", "is missing"), (other / "run", "holds another model than these results")):
         if folder.exists():
             config = json.loads((folder / "config.json").read_text())
             (folder / "config.json").write_text(json.dumps(config | {"package_version": "0.0.0"}))
         (other / "results" / "run.json").write_text(json.dumps(about | {"run": str(folder)}))
-        (film,) = film_families([read_run(other / "results")], tmp_path)
-        assert film.path is None
-        assert "on demo_wide: no picture, " in film.told
-        assert f"{folder} {why}" in film.told
+        (gif,) = family_gifs([read_run(other / "results")], tmp_path)
+        assert gif.path is None
+        assert "on demo_wide: no picture, " in gif.caption
+        assert f"{folder} {why}" in gif.caption
 
 
 def test_what_cannot_be_trained_on_fails_before_any_work(release, tmp_path):
@@ -168,7 +177,7 @@ def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
 
     def note(name, plan, out, progress):
         asked.append((name, plan, out))
-        return Done([tmp_path / "report.html"], ["left out: nothing"])
+        return ExperimentOutcome([tmp_path / "report.html"], ["left out: nothing"])
 
     monkeypatch.setattr(experiments, "run_experiment", note)
     small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-films"]
@@ -184,7 +193,7 @@ def test_commands_say_what_to_run(release, tmp_path, monkeypatch):
         "train": {"steps": 1, "batch_size": 2},
         "episodes": 3,
     }
-    rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "films": False, "root": str(release)}
+    rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "gifs": False, "root": str(release)}
     assert plan == ExperimentPlan(**options, **rest)
     assert CliRunner().invoke(cli, ["tracks", *small], catch_exceptions=False).exit_code == 0
     assert (asked[1][0], asked[1][2]) == ("tracks", Path("runs/tracks"))
@@ -218,7 +227,7 @@ def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path, mo
     assert "AD,seeded,cramped_up,rl,1,2," in (tmp_path / "report" / "report.csv").read_text()
     page = (tmp_path / "report" / "report.html").read_text()
     assert "cramped_up, learned" in page
-    assert "AD beside rl/t0 on cramped_up: team return" in page
+    assert "AD with rl/t0 on cramped_up: team return" in page
     assert "| rl |" in (tmp_path / "report" / "report.md").read_text()
     about = json.loads((tmp_path / "ad-plain" / "cramped_up" / "results" / "run.json").read_text())
     assert about["config"]["histories"]["layouts"] == ["cramped_up"]

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from baselines.methods.encoder import FlatEncoder
-from baselines.methods.method import Method, ModelOptions, World
+from baselines.methods.method import Method, World
+from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import plain_view
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch

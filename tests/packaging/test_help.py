@@ -1,4 +1,4 @@
-"""Help texts: short, complete, the same words in all three programs; examples that are understood; completion."""
+"""Help texts of the three programs: complete and consistent, with valid examples; completion in shells."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PROGRAMS = {
 
 
 def commands(program: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
-    """A command and those below it, by what is typed."""
+    """Yield a command and its subcommands, with the words that run each."""
     yield program, command
     if isinstance(command, click.Group):
         for name, below in command.commands.items():
@@ -49,26 +49,25 @@ def test_help(typed):
     assert "Usage" in help_of(command)
     assert command.help
     first = command.help.splitlines()[0]
-    assert first.endswith("."), "one sentence that says what it does"
+    assert first.endswith("."), "the first line is one sentence"
     if typed not in PROGRAMS:
-        assert command.get_short_help_str(62) == first, "a list of commands shows it in full"
+        assert command.get_short_help_str(62) == first, "a list of commands shows it completely"
     for option in command.params:
         if isinstance(option, click.Option):
-            assert option.help, f"{option.name} is not explained"
+            assert option.help, f"{option.name} has no help"
             assert option.help.endswith("."), f"{option.name}: a sentence"
 
 
 @pytest.mark.parametrize("typed", EVERY)
-def test_help_names_what_may_be_given(typed):
+def test_help_lists_the_valid_names(typed):
     for option in EVERY[typed].params:
         if isinstance(option, click.Option) and isinstance(option.type, Names) and option.type is not LAYOUT:
-            offered = list(option.type.valid())
-            told = (option.help or "") + help_of(EVERY[typed])
+            names, text = list(option.type.valid()), (option.help or "") + help_of(EVERY[typed])
             if "such as" not in (option.help or ""):
-                assert all(name in told for name in offered), f"{option.name}: {offered}"
+                assert all(name in text for name in names), f"{option.name}: {names}"
 
 
-def test_every_command_has_its_heading():
+def test_every_command_has_a_heading():
     for group in PROGRAMS.values():
         assert isinstance(group, Sections)
         listed = group.list_commands(click.Context(group))
@@ -85,15 +84,14 @@ def test_a_command_without_a_heading_comes_last():
     assert text.index("Look:") < text.index("show") < text.index("Others:") < text.index("other")
 
 
-def test_the_same_option_means_the_same():
-    """An option's name has one type."""
+def test_options_of_one_name_have_one_type():
     types: dict[str, set[str]] = {}
     for command in EVERY.values():
         for option in command.params:
             if isinstance(option, click.Option):
                 types.setdefault(option.opts[0], set()).add(option.type.name)
     mixed = {name for name, kinds in types.items() if len(kinds) > 1}
-    assert mixed == {"--out", "--tasks", "--to"}, "other things, which their commands explain"
+    assert mixed == {"--out", "--tasks", "--to"}, "their commands explain them"
 
 
 def examples() -> list[str]:
@@ -103,22 +101,22 @@ def examples() -> list[str]:
 
 
 @pytest.mark.parametrize("line", examples())
-def test_examples_are_understood(line):
+def test_examples_are_valid(line):
     program = next(name for name in PROGRAMS if line.startswith(name))
     understand(PROGRAMS[program], shlex.split(line)[len(program.split()) :])
 
 
 def completed(*words: str) -> list[str]:
-    """What completion in bash offers after these words, by the console script."""
+    """Return what the console script offers in bash after these words."""
     line = " ".join(("icrl4aht-data", *words))
-    asked = {"_ICRL4AHT_DATA_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(words))}
-    return [offer.partition(",")[2] for offer in script(asked).splitlines()]
+    request = {"_ICRL4AHT_DATA_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(words))}
+    return [offer.partition(",")[2] for offer in script(request).splitlines()]
 
 
 def script(environment: dict[str, str]) -> str:
     path = Path(sys.executable).with_name("icrl4aht-data")
-    of_here = {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([path], env=os.environ | of_here | environment, capture_output=True, text=True, check=True)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    done = subprocess.run([path], env=environment, capture_output=True, text=True, check=True)
     return done.stdout
 
 

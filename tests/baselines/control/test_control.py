@@ -13,7 +13,7 @@ from generation.policy import Policy
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
-TINY = control.Size(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
+TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 
 
 def fixed(action: int) -> Policy:
@@ -22,11 +22,11 @@ def fixed(action: int) -> Policy:
 
 def test_what_the_worlds_reward():
     means = jnp.array([[0.0, 1.0, 0, 0, 0], [1.0, 0.0, 0, 0, 0]])
-    actions, rewards = worlds.play(worlds.bandit(), fixed(1), means, 0, 6)
+    actions, rewards = worlds.play_world(worlds.bandit(), fixed(1), means, 0, 6)
     assert actions.tolist() == [[1] * 6] * 2
     assert rewards.tolist() == [[1] * 6, [0] * 6]
     above, corner = worlds.MIDDLE - worlds.SIDE, 0
-    _, rewards = worlds.play(worlds.dark_room(), fixed(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
+    _, rewards = worlds.play_world(worlds.dark_room(), fixed(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
     episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # it passes the goal and goes on to the wall
     assert rewards.tolist() == [episode * 2, [0] * 2 * worlds.ROOM_STEPS]
     assert worlds.best_return(np.array([above, corner])).tolist() == [10, 7]

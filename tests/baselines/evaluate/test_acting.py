@@ -13,14 +13,15 @@ from click.testing import CliRunner
 
 from baselines.agents.egos import find_agent
 from baselines.commands.cli import cli
-from baselines.evaluate.drift import measure
+from baselines.evaluate.drift import measure_drift
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
-from baselines.methods.method import SIZES, ModelOptions
+from baselines.methods.options import SIZES, ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
-from baselines.training.histories import HistoryOptions, prepare, read_trained
-from baselines.training.run_folder import Checkpoints, open_run, versions
-from baselines.training.trainer import TrainOptions
+from baselines.training.histories import prepare, read_trained
+from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.run_folder import CHECKPOINTS, format_versions, open_run
+from generation.learners.resume import Checkpoints
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.utils.hashes import file_hash
@@ -42,11 +43,9 @@ def runs(lite, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     for name in ("ad", "dpt"):
         job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
-        config = {**versions(), "method": name, **job.about, "train": dataclasses.asdict(OPTIONS)}
+        config = {**format_versions(), "method": name, **job.about, "train": dataclasses.asdict(OPTIONS)}
         open_run(folder / name, config)
-        checkpoints = Checkpoints(folder / name)
-        checkpoints.save(2, drawn(job.method), {"step": np.int32(2)})
-        checkpoints.close()
+        Checkpoints(folder / name / CHECKPOINTS).save({"params": drawn(job.method), "step": np.int32(2)}, 2)
     return folder
 
 
@@ -63,18 +62,18 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
 
 
 def test_drift_is_nothing_before_the_window_is_full_and_something_after(runs, monkeypatch):
-    """With one layer there is none at all: what is kept of a step was computed of that step alone."""
-    kitchen_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
-    params, found, protocol = drawn(kitchen_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
+    """With one layer there is no drift at all: a step's cache is computed from that step alone."""
+    two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
+    params, found, protocol = drawn(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
 
-    def two_layers(method, params_of_run, context, tasks, asked):
-        assert (context, len(tasks), asked.episodes) == (30, 5, 3)
-        found.extend(measure(kitchen_ad, params, context, WIDE[:1], protocol))
+    def on_two_layers(method, params_of_run, context, tasks, planned):
+        assert (context, len(tasks), planned.episodes) == (30, 5, 3)
+        found.extend(measure_drift(two_layer_ad, params, context, WIDE[:1], protocol))
         return found
 
-    monkeypatch.setattr("baselines.evaluate.drift.measure", two_layers)
+    monkeypatch.setattr("baselines.evaluate.drift.measure_drift", on_two_layers)
     result = CliRunner().invoke(cli, ["drift", str(runs / "ad")], catch_exceptions=False)
-    assert "AD+TA on demo_wide beside 5 teammates of H4, K = 30" in result.output
+    assert "AD+TA on demo_wide with 5 teammates of H4, K = 30" in result.output
     (episode,) = found
     assert f"{episode.distance.max():>10.6f}" in result.output
     assert episode.distance.shape == (1, 60)
@@ -87,8 +86,8 @@ class TestBadRuns:
         arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
         result = CliRunner().invoke(cli, arguments)
         assert isinstance(result.exception, OptionError)
-        told = "trained on demo_wide with observations (5, 5, 45); coord_simple has (5, 5, 40)"
-        assert told in str(result.exception)
+        message = "trained on demo_wide with observations (5, 5, 45); coord_simple has (5, 5, 40)"
+        assert message in str(result.exception)
 
     def test_folders_that_are_no_runs(self, runs, tmp_path):
         with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle"):
@@ -103,15 +102,15 @@ class TestBadRuns:
             (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
             return str(tmp_path / name)
 
-        with pytest.raises(OptionError, match=r"run_format 99, expected 1: written by version .*; use that version"):
+        with pytest.raises(OptionError, match=r"run_format 99, expected 2: written by version .*; use that version"):
             find_agent(copy("newer", run_format=99))
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
-        with pytest.raises(OptionError, match=r"parameters of another model: .* has shape"):
+        with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):
             find_agent(copy("wider", model=wide))
         with pytest.raises(OptionError, match="not of a run on learning histories: KeyError"):
             find_agent(copy("other", model={}, histories={}))
         shutil.rmtree(Path(copy("early")) / "checkpoints")
-        with pytest.raises(OptionError, match="no checkpoint yet; train on"):
+        with pytest.raises(OptionError, match="no checkpoint yet; continue the training"):
             find_agent(str(tmp_path / "early"))
 
 
@@ -124,14 +123,14 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
         arguments = ["train", "ad", "--layout", "demo_wide", "--root", server.url, "--out", str(tmp_path / "run")]
         result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
         assert result.exit_code == 0, result.output
-        assert "1 steps in" in result.output
+        assert "1 step in" in result.output
         again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
     assert config["histories"]["data_version"] == "0.0.1"
     assert config["histories"]["root"] == server.url
     assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")
-    assert "model.teammate_actions: the run has False, asked for True" in str(again.exception)
+    assert "model.teammate_actions: the run has False, expected True" in str(again.exception)
     wrong = CliRunner().invoke(cli, [*arguments, "--size", "smal"])
     assert wrong.exit_code == 2
     assert "unknown size 'smal'" in wrong.output

@@ -16,9 +16,9 @@ from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate, play_tasks
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from baselines.evaluate.results import read_result
-from baselines.report.headroom import write_cards
-from baselines.report.markdown import csv_text, interval, markdown
-from baselines.report.results import Run, as_run, normalised, read_run
+from baselines.report.headroom import write_headroom_cards
+from baselines.report.results import EvaluationRun, as_run, normalized_return, read_run
+from baselines.report.summary import bootstrap_interval, csv_text, markdown
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -208,9 +208,9 @@ def test_unknown_names():
 
 def test_bootstrap_interval_covers_the_mean():
     means = np.array([1.0, 2.0, 3.0, 4.0, 10.0])
-    low, high = interval(means, np.random.default_rng(0))
+    low, high = bootstrap_interval(means, np.random.default_rng(0))
     assert 1.0 <= low < 4.0 < high <= 10.0
-    assert interval(np.full(5, 7.0), np.random.default_rng(0)) == (7.0, 7.0)
+    assert bootstrap_interval(np.full(5, 7.0), np.random.default_rng(0)) == (7.0, 7.0)
 
 
 def test_report_shows_the_published_numbers_beside(together):
@@ -244,11 +244,11 @@ def test_commands(tmp_path):
 def test_headroom_cards_name_the_cells_that_leave_nothing_to_do(tmp_path):
     def run(agent, values):
         returns = {cell: np.full((5, 2), value) for cell, value in values.items()}
-        return Run(agent, "seeded", returns)
+        return EvaluationRun(agent, "seeded", returns)
 
     flat, open_ = ("coord_simple", "H4"), ("demo_wide", "H1")
     runs = [run("stay", {flat: 40.0, open_: 0.0}), run("random", {flat: 35.0, open_: 0.0})]
-    write_cards([*runs, run("oracle", {flat: 40.5, open_: 39.9})], tmp_path)
+    write_headroom_cards([*runs, run("oracle", {flat: 40.5, open_: 39.9})], tmp_path)
     content = json.loads((tmp_path / "headroom.json").read_text())
     assert content["seeded"]["demo_wide"]["H1"] == {"stay": 0.0, "random": 0.0, "oracle": 39.9}
     text = (tmp_path / "headroom.md").read_text()
@@ -258,9 +258,9 @@ def test_headroom_cards_name_the_cells_that_leave_nothing_to_do(tmp_path):
 
 def test_normalised_scores_stand_only_where_there_is_headroom():
     table = {"stay": 10.0, "random": 5.0, "oracle": 30.0}
-    assert normalised(20.0, table) == 0.5
-    assert normalised(10.0, {**table, "oracle": 10.5}) is None
-    assert normalised(10.0, None) is None
+    assert normalized_return(20.0, table) == 0.5
+    assert normalized_return(10.0, {**table, "oracle": 10.5}) is None
+    assert normalized_return(10.0, None) is None
 
 
 def test_headroom_cards_cover_every_cell():

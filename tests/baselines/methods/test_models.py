@@ -15,15 +15,16 @@ import pytest
 
 from baselines.agents.host import Percept
 from baselines.methods import attention
-from baselines.methods.method import Method, ModelOptions
+from baselines.methods.method import Method
+from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import (
     Transition,
+    batch_steps,
+    batch_transitions,
+    percept_step,
     plain_view,
     state_view,
-    step_of,
-    steps_of,
-    transitions_of,
     visible_slots,
 )
 from icrl4aht_data import get_layout, load_icrl4aht
@@ -94,7 +95,7 @@ KINDS = [("ad", "none"), ("ad", "rope"), ("hybrid_ad", "none"), ("amago_offline"
 @pytest.mark.parametrize(("name", "positions"), KINDS)
 def test_steps_see_all_that_was_and_nothing_to_come(name, positions):
     method, params = tiny(name, positions=positions)
-    steps = steps_of(ad_batch(rows=1), plain_view)
+    steps = batch_steps(ad_batch(rows=1), plain_view)
 
     def policy(obs, rewards):
         changed = steps._replace(obs=obs[None], prev_reward=rewards[None])
@@ -107,7 +108,7 @@ def test_steps_see_all_that_was_and_nothing_to_come(name, positions):
 @pytest.mark.parametrize("name", STEPS)
 def test_policies_depend_on_the_actions_before(name):
     method, params = tiny(name)
-    steps = steps_of(ad_batch(rows=1), plain_view)
+    steps = batch_steps(ad_batch(rows=1), plain_view)
 
     @jax.jit
     def policy(mine, theirs):
@@ -129,7 +130,7 @@ def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positi
 
     def answers(obs, rewards, query):
         changed = batch._replace(context_obs=obs[None], context_rewards=rewards[None], query_obs=query)
-        return run(method, params, *transitions_of(changed, plain_view)).logits[0]
+        return run(method, params, *batch_transitions(changed, plain_view)).logits[0]
 
     of_obs, of_rewards, of_query = reach(answers, batch.context_obs[0], batch.context_rewards[0], batch.query_obs)
     seen = np.tril(np.ones((7, 6), bool), k=-1)  # answer j has seen the first j transitions
@@ -164,7 +165,7 @@ def test_attention_is_that_of_the_mask(monkeypatch):
         return jax.nn.dot_product_attention(q, k, v, mask=jnp.asarray(query_mask(7))[None, None])
 
     def ours(q, k, v):
-        context = attention.causal(q[:, :7], k[:, :7], v[:, :7])
+        context = attention.causal_attention(q[:, :7], k[:, :7], v[:, :7])
         queries = attention.query_attention(q[:, 7:], k[:, 7:], v[:, 7:], k[:, :7], v[:, :7])
         return jnp.concatenate([context, queries], axis=1)
 
@@ -183,7 +184,7 @@ def test_padding_is_not_seen(monkeypatch):
     expected = jax.nn.dot_product_attention(q, k, v, is_causal=True, key_value_seq_lengths=lengths)
     for rows in (attention.ROWS, 5):
         monkeypatch.setattr(attention, "ROWS", rows)
-        found = jax.jit(lambda q, k, v: attention.causal(q, k, v, lengths))(q, k, v)
+        found = jax.jit(lambda q, k, v: attention.causal_attention(q, k, v, lengths))(q, k, v)
         np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-6)
 
 
@@ -272,7 +273,7 @@ def test_next_observations_are_of_the_same_episode():
     assert loss(last) == loss(last._replace(obs=after_the_end)) != loss(last._replace(obs=within))
 
 
-class TestKitchen:
+class TestOvercooked:
     """On real batches."""
 
     def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite):
@@ -325,7 +326,7 @@ def player(name: str, context: int, cached: bool, **changes: Any):
     @jax.jit
     def play(seen: Percept):
         def step(memory, percept):
-            logits, memory = method.act(params, step_of(percept), percept.prev_done, memory)
+            logits, memory = method.act(params, percept_step(percept), percept.prev_done, memory)
             return memory, logits
 
         return jax.lax.scan(step, method.start(context, cached), seen)[1]
@@ -345,7 +346,7 @@ def test_cached_equals_exact_while_the_window_is_not_full(name, positions):
 def test_acting_computes_what_training_computes(name):
     method, params = tiny(name)
     seen = percepts(9, episode=4)
-    steps = jax.tree.map(lambda x: x[None], step_of(seen))
+    steps = jax.tree.map(lambda x: x[None], percept_step(seen))
     policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
     whole = policy(steps)
     np.testing.assert_allclose(player(name, 12, False)(seen), whole, rtol=1e-4, atol=1e-5)
@@ -406,6 +407,6 @@ def test_amago_prefers_what_is_rewarded():
         return jax.lax.scan(step, (params, slow, state), jax.random.split(jax.random.key(3), 200))[0]
 
     params, slow, _ = train(params, optimizer.init(params))
-    steps = steps_of(batch(jax.random.key(9)), plain_view)
+    steps = batch_steps(batch(jax.random.key(9)), plain_view)
     policy = jax.nn.softmax(method.logits(run(method, params, steps).head))
     assert float(policy[..., 2].mean()) > 0.9

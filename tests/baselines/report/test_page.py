@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 
 from baselines.commands.cli import cli
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol
-from baselines.report import episode_gifs as watching
-from baselines.report.episode_gifs import EpisodeGif, ego_of
+from baselines.report import episode_gifs as gifs
+from baselines.report.episode_gifs import EpisodeGif, restore_ego
 from baselines.report.model_card import write_model_cards
-from baselines.report.page import write_page, write_page_with_films
-from baselines.report.results import TEST_LAYOUTS, Run, Source, merge, read_published
-from baselines.report.tables import AVERAGE, PAPER_TABLES, fill, score, sweep
+from baselines.report.page import write_page, write_page_with_episodes
+from baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultSource, merge, read_published
+from baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, score_cells, sweep_points
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
 from icrl4aht_data.benchmark.tasks import make_task, manifest_path, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -33,12 +33,12 @@ SETTINGS = {
 }
 
 
-def run(agent: str, layouts=("demo_wide",), value=10.0, variant=None, families=HEURISTICS) -> Run:
+def run(agent: str, layouts=("demo_wide",), value=10.0, variant=None, families=HEURISTICS) -> EvaluationRun:
     """Every instance earns `value`, and 2 more in the second half."""
     returns = value + np.repeat([[0.0, 2.0]], 20, axis=1) * np.ones((5, 1))
     cells = {(layout, family): returns for layout in layouts for family in families}
-    source = Source(f"runs/{agent}", tuple(layouts), SETTINGS, None)
-    return Run(agent, "seeded", cells, variant, sources=(source,))
+    source = ResultSource(f"runs/{agent}", tuple(layouts), SETTINGS, None)
+    return EvaluationRun(agent, "seeded", cells, variant, sources=(source,))
 
 
 class Outside(HTMLParser):
@@ -87,7 +87,7 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
         "Table 5. Offline Meta-RL Comparison",
         "left out: &lt;nothing&gt;",
         "H1 &amp; an ego",
-        "<h3>Learned teammates</h3>\n<figure class=film><figcaption>no picture: &lt;its run&gt; is gone",
+        "<h3>Learned teammates</h3>\n<figure class=episode><figcaption>no picture: &lt;its run&gt; is gone",
         "paper 12.5 ± 11.3",
     ):
         assert told in text
@@ -103,7 +103,7 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
 
 def test_tables_hold_ours_beside_the_papers():
     runs = [run("AD", TEST_LAYOUTS), run("oracle", ("demo_wide",), 50.0)]
-    one, two, three, four, five = (fill(table, runs, "seeded") for table in PAPER_TABLES)
+    one, two, three, four, five = (fill_table(table, runs, "seeded") for table in PAPER_TABLES)
     assert [row.agent for row in one[:4]] == ["AD", "DPT", "random", "oracle"]
     assert [row.agent for row in two[:4]] == ["AD", "DPT", "random", "AD"], "oracle did not play there"
     place = PAPER_TABLES[0].columns.index("demo_wide")
@@ -125,7 +125,7 @@ def test_tables_hold_ours_beside_the_papers():
 
 
 def test_a_part_of_a_place_is_said_to_be_one():
-    partial = score([("demo_wide", family) for family in HEURISTICS], run("AD", families=("H1", "H2")), {})
+    partial = score_cells([("demo_wide", family) for family in HEURISTICS], run("AD", families=("H1", "H2")), {})
     assert partial.played == (2, 4)
     assert (partial.mean, partial.normalised) == (11.0, None)
 
@@ -155,12 +155,12 @@ def test_legends_fit_their_figures(labels):
 
 def test_sweeps_have_the_papers_points_where_it_states_them():
     runs = [run("AD", ("test_wide",), variant=("K", k)) for k in (250, 500, 1000)]
-    assert [(p.value, p.mean, p.published) for p in sweep(runs, "K")["test_wide"]["AD"]] == [
+    assert [(p.value, p.mean, p.published) for p in sweep_points(runs, "K")["test_wide"]["AD"]] == [
         (250, 11.0, None),
         (500, 11.0, -7.9),
         (1000, 11.0, -7.6),
     ]
-    assert sweep(runs, "size") == {}
+    assert sweep_points(runs, "size") == {}
 
 
 def test_the_papers_averages_are_those_of_its_cells():
@@ -201,12 +201,12 @@ def test_trained_models_have_cards(tmp_path):
 def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
     """Where the family leaves headroom; every agent before any twice, reference egos last."""
     (tmp_path / "a.gif").write_bytes(GIF)
-    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) + 1)
-    monkeypatch.setattr(watching, "ego_of", lambda source: source)
+    monkeypatch.setattr(gifs, "episode_gif", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
     tasks = read_tasks(manifest_path("teammate", "test"))
     played = {(task.layout.name, task.teammate_family): task for task in tasks}
 
-    def with_tasks(agent: str, **options) -> Run:
+    def with_tasks(agent: str, **options) -> EvaluationRun:
         found = run(agent, ("coord_simple", "demo_wide"), families=("H1", "H4"), **options)
         settings = SETTINGS | {"protocol": dataclasses.asdict(PROTOCOLS["seeded"])}
         own = {cell: played[cell] for cell in found.cells}
@@ -214,21 +214,23 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
 
     runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
     runs.insert(3, with_tasks("AD", variant=("K", 250)))
-    text = write_page_with_films(runs, tmp_path / "report.html").read_text()
-    found = re.findall(r"<figcaption>([^<]+? beside \S+ on \S+): team return 7 ", text)
+    text = write_page_with_episodes(runs, tmp_path / "report.html").read_text()
+    found = re.findall(r"<figcaption>([^<]+? with \S+ on \S+): team return 7 ", text)
     assert found == [
-        f"{agent} beside {mate} on demo_wide" for mate in ("H1/t4", "H4/t4") for agent in ("AD", "DPT", "AD, K = 250")
+        f"{agent} with {mate} on demo_wide" for mate in ("H1/t4", "H4/t4") for agent in ("AD", "DPT", "AD, K = 250")
     ]
     assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
-    assert "An episode per family" not in write_page_with_films(runs, tmp_path / "r.html", films=False).read_text()
+    assert (
+        "An episode per family" not in write_page_with_episodes(runs, tmp_path / "r.html", episodes=False).read_text()
+    )
 
 
 def test_egos_that_cannot_be_made_again_say_why(tmp_path):
-    source = Source("runs/AD", ("demo_wide",), SETTINGS | {"details": {"step": 3}}, None)
+    source = ResultSource("runs/AD", ("demo_wide",), SETTINGS | {"details": {"step": 3}}, None)
     with pytest.raises(OptionError, match="AD is neither a reference ego nor of a run folder"):
-        ego_of(source)
-    with pytest.raises(OptionError, match=r"its run folder .*/gone is gone"):
-        ego_of(source._replace(trained={"run": str(tmp_path / "gone")}))
+        restore_ego(source)
+    with pytest.raises(OptionError, match=r"its run folder .*/gone is missing"):
+        restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 
 def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
@@ -237,14 +239,14 @@ def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 2, 5))
     played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
     assert CliRunner().invoke(cli, played, catch_exceptions=False).exit_code == 0
-    monkeypatch.setattr(watching, "film", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    monkeypatch.setattr(gifs, "episode_gif", lambda path, *a, **k: path.write_bytes(GIF) + 1)
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "report.html").read_text()
     assert Outside(text).images.count("data:image/gif") == 1
     (task,) = read_tasks(tmp_path / "own.jsonl")
-    assert f"stay beside H4/t77 on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
+    assert f"stay with H4/t77 on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
     (tmp_path / "run" / "tasks.jsonl").unlink()
-    with pytest.raises(OptionError, match=r"not one of the published test tasks, and tasks\.jsonl beside the results"):
+    with pytest.raises(OptionError, match=r"is neither a published test task nor in the results' tasks\.jsonl"):
         CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)

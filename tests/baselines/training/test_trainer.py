@@ -17,9 +17,11 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
 from baselines.methods.registry import get_method
-from baselines.training.histories import HistoryOptions, hold_out, prepare
-from baselines.training.run_folder import Checkpoints
-from baselines.training.trainer import Data, State, Trainer, TrainOptions, train
+from baselines.training.histories import hold_out, prepare
+from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.run_folder import CHECKPOINTS
+from baselines.training.trainer import Trainer, TrainingData, TrainState, learning_rate_schedule, make_optimizer, train
+from generation.learners.resume import Checkpoints
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import LabelsMissingError, OptionError
 from tests.helpers.flat_world import FLAT, TINY, ad_batch
@@ -49,14 +51,14 @@ class Rows:
         return self.batch(0)
 
 
-def trained(folder: Path, die_at: int | None = None, tensorboard: bool = False) -> State:
+def trained(folder: Path, die_at: int | None = None, tensorboard: bool = False) -> TrainState:
     method = get_method("amago_offline")(MODEL, FLAT)
-    data = Data(Rows(0, die_at), {"held out": Rows(1)})
+    data = TrainingData(Rows(0, die_at), {"held out": Rows(1)})
     return train(method, data, OPTIONS, folder, {}, tensorboard=tensorboard)
 
 
 @pytest.fixture(scope="module")
-def through(tmp_path_factory) -> tuple[Path, State]:
+def through(tmp_path_factory) -> tuple[Path, TrainState]:
     """An uninterrupted run, of the method with most state: slow parameters too."""
     folder = tmp_path_factory.mktemp("runs") / "through"
     return folder, trained(folder)
@@ -83,7 +85,7 @@ class TestResume:
     def test_a_killed_run_goes_on_to_the_same_bits(self, through, tmp_path):
         with pytest.raises(KeyboardInterrupt):
             trained(tmp_path, die_at=5, tensorboard=True)  # behind the checkpoint of step 3, and behind a logged line
-        assert Checkpoints(tmp_path).latest == 3
+        assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
         with (tmp_path / "metrics.jsonl").open("a") as log:
             log.write('{"step": 5, "cut o')
         assert {step for _, step, *_ in scalars(tmp_path)} == {2, 3, 4}
@@ -139,9 +141,9 @@ class TestResume:
         method = get_method("amago_offline")(MODEL, FLAT)
         other = dataclasses.replace(OPTIONS, seed=3)
         with pytest.raises(
-            OptionError, match=r"other settings \(train.seed: the run has 0, asked for 3\); give another"
+            OptionError, match=r"other settings \(train.seed: the run has 0, expected 3\); give another"
         ):
-            train(method, Data(Rows(), {}), other, through[0], {})
+            train(method, TrainingData(Rows(), {}), other, through[0], {})
 
 
 class TestStep:
@@ -164,13 +166,13 @@ class TestStep:
             np.testing.assert_allclose(one[name], two[name], rtol=1e-5, err_msg=name)
 
     def test_the_learning_rate_is_the_papers(self):
-        schedule = TrainOptions(steps=100, warmup=0.05).schedule
+        schedule = learning_rate_schedule(TrainOptions(steps=100, warmup=0.05))
         rates = [np.asarray(schedule(t)) for t in (0, 3, 5, 50, 100)]
         cosine = 1e-3 * (1 + np.cos(np.pi * (50 - 5) / 95)) / 2
         np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
 
     def test_gradients_are_clipped(self):
-        optimizer = dataclasses.replace(OPTIONS, clip=1.0, warmup=0.0).optimizer
+        optimizer = make_optimizer(dataclasses.replace(OPTIONS, clip=1.0, warmup=0.0))
         params = {"w": jnp.zeros(4)}
         for scale in (1e3, 1e6):
             _, state = optimizer.update({"w": scale * jnp.ones(4)}, optimizer.init(params), params)
@@ -224,8 +226,8 @@ if len(sys.argv) > 2:
     jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
 from pathlib import Path
 from baselines.training.histories import HistoryOptions, prepare
-from baselines.methods.method import ModelOptions
-from baselines.training.trainer import TrainOptions, train
+from baselines.methods.options import ModelOptions
+from baselines.training.options import TrainOptions, train
 options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
 model = ModelOptions(layers=1, width=8, heads=2)
 root, out = sys.argv[1].split(",")

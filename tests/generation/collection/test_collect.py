@@ -12,7 +12,7 @@ import pytest
 from generation.collection import task as collect
 from generation.collection import task_folder as artefacts
 from generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, partial_folder
-from generation.learners.state_file import read_card
+from generation.learners.resume import StateFile
 from generation.profiles import Profile, load_profile
 from generation.releases.check import compare
 from icrl4aht_data.benchmark.tasks import Task
@@ -92,7 +92,7 @@ def test_what_came_after_the_last_save_is_done_again(built, task, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run_task(task, folder, stop_after(6), save_seconds=0)
     partial = partial_folder(folder)
-    assert (read_card(partial / LEARNER) or {})["updates"] == "6"
+    assert StateFile(partial / LEARNER).progress == 6
     with (partial / METRICS).open("a") as stream:
         stream.write('{"update": 6, "half a li')
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
@@ -146,7 +146,7 @@ def test_a_damaged_state_is_named_not_guessed_at(task, tmp_path):
     partial = partial_folder(tmp_path / "task")
     partial.mkdir()
     (partial / LEARNER).write_bytes(b"junk")
-    with pytest.raises(OptionError, match=r"learner\.safetensors: not a state of this learner: .*begin the task anew"):
+    with pytest.raises(OptionError, match=r"learner\.safetensors: not a state of this training: .*start again"):
         run_task(task, tmp_path / "task")
 
 

@@ -12,16 +12,15 @@ from pathlib import Path
 
 import psutil
 import pytest
-from filelock import FileLock
 from rich.console import Console
 
 from generation.cli import main
-from generation.collection import run
+from generation.collection import job
 from generation.collection.job import CollectionError
 from generation.collection.options import Options
 from generation.collection.run import collect_tasks
-from generation.collection.task import TaskBusyError
-from generation.collection.task_folder import LEARNER, lock_file, partial_folder
+from generation.collection.task_folder import LEARNER, partial_folder
+from generation.learners.resume import BusyError, run_lock
 from generation.profiles import load_profile
 from generation.progress import Board
 from generation.releases import build
@@ -59,7 +58,7 @@ def failing(monkeypatch, *errors: Exception | None) -> list[int]:
             raise error
         return True
 
-    monkeypatch.setattr(run, "run_task", run_task)
+    monkeypatch.setattr(job, "run_task", run_task)
     return calls
 
 
@@ -103,7 +102,7 @@ def test_an_interrupt_is_no_failure(tasks, tmp_path, monkeypatch):
 
 
 def test_a_task_that_another_collector_is_at_comes_last(tasks, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, TaskBusyError("busy"))
+    calls = failing(monkeypatch, BusyError("busy"))
     assert "another collector is at it" in collect(tasks, tmp_path)
     assert calls == [0, 1, 0]
 
@@ -113,11 +112,11 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     task, profile = tasks[0][0], tasks[1]
     folder = tmp_path / "artefacts" / task.task_id
     folder.parent.mkdir()
-    with FileLock(lock_file(folder)):
-        assert run.Job(profile, folder.parent, None, wait=False)(task) == "busy"
+    with run_lock(folder):
+        assert job.Job(profile, folder.parent, None, wait=False)(task) == "busy"
         shutil.copytree(pair / "artefacts" / task.task_id, folder)
     before = (folder / "metadata.json").stat().st_mtime_ns
-    assert run.Job(profile, folder.parent, None, wait=True)(task) == "done"
+    assert job.Job(profile, folder.parent, None, wait=True)(task) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
@@ -180,7 +179,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     (line,) = failures(tmp_path)
     assert line["attempts"] == 2
     assert line["error"].startswith("OptionError: ")
-    assert "in load_state" in line["traceback"] or "in read_card" in line["traceback"]
+    assert "in progress" in line["traceback"]
     assert "\x1b" not in line["traceback"]
     assert artefact(tmp_path).name == artefact(pair).name
     shutil.rmtree(broken)

@@ -22,6 +22,7 @@ import pytest
 from generation.env import Environment
 from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
 from generation.learners.network import ActorCritic, Widths
+from generation.learners.resume import BusyError, run_lock
 from generation.learners.rollout import init_rollout, network_player, policy_player, random_player, roll_out
 from generation.policy import stacked
 from generation.populations import cross_play
@@ -262,7 +263,10 @@ def stopped(tmp_path, monkeypatch) -> Path:
 
 def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(trained, stopped):
     before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
-    with pytest.raises(OptionError, match=r"lbrdiv: holds an unfinished run of other settings, .*; remove it"):
+    with pytest.raises(
+        OptionError,
+        match=r"lbrdiv.resume\.safetensors: saved by a training of other settings: seed was 0, now it is 1",
+    ):
         train(replace(run_of("lbrdiv"), seed=1), stopped)
     assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
 
@@ -275,7 +279,7 @@ def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(
 
 
 def test_a_run_beside_another_in_the_same_folder_is_refused(tmp_path):
-    with suite.FileLock(tmp_path / ".fcp.lock"), pytest.raises(OptionError, match="another process is training"):
+    with run_lock(tmp_path / "fcp"), pytest.raises(BusyError, match="another process works in"):
         train(run_of("fcp"), tmp_path / "fcp")
 
 

@@ -1,4 +1,4 @@
-"""The command line: list, show, errors, exit codes."""
+"""The command line: list, show, errors as a process prints them, and the version."""
 
 from __future__ import annotations
 
@@ -56,16 +56,6 @@ def test_errors_become_one_line_and_exit_code_1(tmp_path):
     assert result.stderr.startswith("error: ")
     assert "no release here" in result.stderr
     assert "Traceback" not in result.stderr
-
-
-def test_unknown_layout_on_the_command_line(lite):
-    result = run("list", str(lite[0]), "--layout", "demo_wild")
-    assert result.returncode == 2
-    assert "Did you mean 'demo_wide'?" in result.stderr
-
-
-def test_misuse_is_exit_code_2():
-    assert run("verify", "--deeep").returncode == 2
 
 
 def test_version():

@@ -1,4 +1,4 @@
-"""A release made ready for other people: what is in it, that its card and descriptions are true and valid."""
+"""Releases built for publication: their files, and that card and descriptions are true and valid."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
 from icrl4aht_data.utils.templates import card_file, fill
+from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.dataset_card import dataset_card, evaluated_on, size_category
-from icrl4aht_data.writing.field_descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.paths import ROOT
 from tests.helpers.random_play import play, random_release
@@ -41,7 +42,7 @@ DAY = datetime.date(2026, 1, 2)
 
 @pytest.fixture(scope="session")
 def release(tmp_path_factory) -> Path:
-    """Random play on layouts of both tracks, of the training and the test split, one of them full. Read only."""
+    """A full release of random play on layouts of both tracks, of the training and the test split. Read only."""
     root = tmp_path_factory.mktemp("source") / "release"
     random_release(root, "full", ("coord_simple", "cramped_up", "cramped_down"), streams=2)
     return root
@@ -49,13 +50,13 @@ def release(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def published(release, tmp_path_factory) -> Path:
-    """What is built of it. Read only."""
+    """The release built from `release`. Read only."""
     return build_release(release, tmp_path_factory.mktemp("published") / "release", published=DAY)
 
 
 @pytest.fixture(scope="session")
-def beside_learned(tmp_path_factory) -> Path:
-    """A release of one task beside a learned teammate, with a checkpoint. Read only."""
+def with_learned(tmp_path_factory) -> Path:
+    """A release of one task with a learned teammate and its checkpoint. Read only."""
     folder = tmp_path_factory.mktemp("learned")
     weights = folder / "policy.safetensors"
     weights.write_bytes(b"weights")
@@ -88,14 +89,11 @@ def front_matter(card: str) -> dict:
     return yaml.safe_load(card.split("---\n")[1])
 
 
-def test_it_holds_the_source_and_is_whole(release, published):
-    report = verify_release(published, deep=True)
+def test_it_contains_the_source_and_is_valid(release, published):
+    report = verify_release(published, level="deep")
     assert report.ok, report.findings
-    made_anew = {"README.md"}
     old, new = read_manifest(release), read_manifest(published)
-    assert {name: new[name] for name in old if name not in made_anew} == {
-        name: digest for name, digest in old.items() if name not in made_anew
-    }
+    assert {name for name in old if new[name] != old[name]} == {"README.md"}
     assert new.keys() - old.keys() == {
         "CITATION.cff",
         "LICENSE",
@@ -108,16 +106,16 @@ def test_it_holds_the_source_and_is_whole(release, published):
         "index/cramped_up/train.parquet",
         "meta/source_card.md",
     }
-    assert (published / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
-    assert (published / "CITATION.cff").read_bytes() == (ROOT / "CITATION.cff").read_bytes()
+    for name in ("LICENSE", "CITATION.cff"):
+        assert (published / name).read_bytes() == (ROOT / name).read_bytes()
 
 
-def test_built_of_a_built_one_it_is_the_same(published, tmp_path):
+def test_building_a_built_release_changes_nothing(published, tmp_path):
     again = build_release(published, tmp_path / "again", published=DAY)
     assert (again / "MANIFEST.sha256").read_bytes() == (published / "MANIFEST.sha256").read_bytes()
 
 
-def test_a_combination_of_built_ones_says_of_what(published, tmp_path):
+def test_a_combination_lists_its_sources(published, tmp_path):
     random_release(tmp_path / "other", "full", ("demo_wide",))
     both = combine_releases(tmp_path / "both", [published, tmp_path / "other"])
     card = (both / "README.md").read_text()
@@ -136,35 +134,28 @@ def test_a_combination_of_built_ones_says_of_what(published, tmp_path):
     assert (out / "meta/source_card.md").read_text() == sources
 
 
-def test_links_are_not_written_through(published, tmp_path):
-    """A built release whose card somebody rewrote."""
-    source = tmp_path / "source"
-    shutil.copytree(published, source)
+def test_linked_files_take_no_space_and_are_not_written_through(published, tmp_path):
+    source = shutil.copytree(published, tmp_path / "source")
     (source / "README.md").write_text("# mine\n")
     write_manifest(source)
-    build_release(source, tmp_path / "linked", link=True)
-    assert verify_release(source).ok
-    assert verify_release(tmp_path / "linked").ok
+    linked = build_release(source, tmp_path / "linked", link=True)
+    shard = load_icrl4aht(source).entries[0].shard
+    assert (linked / shard).stat().st_ino == (source / shard).stat().st_ino
+    for root in (source, linked):
+        assert verify_release(root).ok
 
 
-def test_links_cost_no_space(release, tmp_path):
-    linked = build_release(release, tmp_path / "linked", link=True)
-    shard = load_icrl4aht(release).entries[0].shard
-    assert (linked / shard).stat().st_ino == (release / shard).stat().st_ino
-    assert verify_release(linked).ok
-
-
-def test_a_source_that_is_not_whole_is_refused(damaged, tmp_path):
+def test_an_invalid_source_is_refused(damaged, tmp_path):
     shard = next(damaged.rglob("*.h5"))
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
-    with pytest.raises(ReleaseError, match=r"release: not whole: .*\.h5: sha256: expected .*; see `icrl4aht"):
+    with pytest.raises(ReleaseError, match=r"release: not valid: .*\.h5: sha256: expected .*; see `icrl4aht"):
         build_release(damaged, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(OptionError, match="the release itself"):
         build_release(damaged, damaged)
 
 
-def test_what_changes_while_it_is_copied_is_noticed(damaged, tmp_path):
+def test_changes_during_copying_are_detected(damaged, tmp_path):
     def change(what, done, total):
         if what == "copying" and done == total:
             (tmp_path / ".out.partial/meta/provenance.json").write_text("{}")
@@ -174,7 +165,7 @@ def test_what_changes_while_it_is_copied_is_noticed(damaged, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_index_and_its_twin_say_the_same(published):
+def test_the_parquet_files_have_the_index(published):
     import pyarrow.parquet as pq
 
     lines = [json.loads(line) for line in (published / "meta/histories.jsonl").read_text().splitlines()]
@@ -194,16 +185,17 @@ def test_datasets_loads_every_configuration(published, tmp_path):
         loaded: Any = datasets.load_dataset(str(published), name, cache_dir=str(tmp_path))
         found[name] = {split: sorted(rows["history_id"]) for split, rows in loaded.items()}
     index = load_icrl4aht(published).index
-    for name, asked in ((None, {}), ("cramped_down", {"layout": "cramped_down"})):
-        splits = {"train", "test"} if name is None else {"test"}
-        assert found[name] == {split: index.query(split=split, **asked).tolist() for split in splits}
+    assert found == {
+        None: {split: index.query(split=split).tolist() for split in ("train", "test")},
+        "cramped_down": {"test": index.query(split="test", layout="cramped_down").tolist()},
+    }
 
 
 def test_croissant_is_valid_and_its_records_are_the_index(published):
     import mlcroissant
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what mlcroissant is built on
+        warnings.simplefilter("ignore")  # raised by libraries that mlcroissant is built on
         described = mlcroissant.Dataset(str(published / "croissant.json"))
         records = list(described.records("histories"))
     assert (described.metadata.ctx.issues.errors, described.metadata.ctx.issues.warnings) == (set(), set())
@@ -225,7 +217,7 @@ def test_croissant_is_valid_and_its_records_are_the_index(published):
     assert hashed == {name: listed[name] for name in listed if name != "croissant.json"}
 
 
-def test_the_card_says_what_the_release_is(published):
+def test_the_card_describes_the_release(published):
     card = (published / "README.md").read_text()
     facts = front_matter(card)
     assert facts["license"] == "mit"
@@ -251,7 +243,7 @@ def test_the_cards_snippet_runs(published, monkeypatch):
     exec(snippet.replace("path/of/this/folder", str(published)), {})
 
 
-def test_a_release_that_nobody_published_has_a_card_without_pictures(release):
+def test_the_card_of_an_unpublished_release_has_no_figures(release):
     card = dataset_card(release)
     assert "figures/" not in card
     assert "configs" not in front_matter(card)
@@ -262,7 +254,7 @@ def test_a_release_that_nobody_published_has_a_card_without_pictures(release):
     "provenance",
     ['{"a": 1}', '{"a": {"ego": 3}}', "[]", '{"a": {"ego": {"total_steps": "many", "environments": 2}}}'],
 )
-def test_a_provenance_of_another_form_is_named(damaged, provenance):
+def test_malformed_provenance_is_named(damaged, provenance):
     (damaged / "meta/provenance.json").write_text(provenance)
     with pytest.raises(IndexFormatError, match=r"provenance\.json: not as `generation` writes it"):
         dataset_card(damaged)
@@ -271,66 +263,63 @@ def test_a_provenance_of_another_form_is_named(damaged, provenance):
 @pytest.mark.parametrize(
     "algorithms", [{"algorithms": {"demo_wide": ["fcp"]}}, {"algorithms": ["fcp"], "layouts": ["demo_wide"]}]
 )
-def test_the_card_says_where_learned_teammates_are_missing(damaged, algorithms):
-    """Also of a combination, whose tasks come from several suites."""
+def test_the_card_names_missing_learned_teammates(damaged, algorithms):
+    """The tasks come from several suites, as in a combination."""
     suite = algorithms | {"members": 2, "train": 3, "total_steps": 10**6, "threshold": 20.0}
     path = damaged / "meta/provenance.json"
     suites = chain([suite | {"train": 1}], repeat(suite))
     path.write_text(json.dumps({task: {"suite": next(suites)} for task in json.loads(path.read_text())}))
     card = dataset_card(damaged)
-    assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps a member" in card
+    assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps per member" in card
     others = ", ".join(name for name in read_info(damaged).layouts if name != "demo_wide")
-    assert f"* Learned on {others}: its profile has no learned teammates there, only presets of H4." in card
-    assert "fewer training teammates than its profile wanted of fcp on demo_wide (0 of 3)." in card
+    assert f"* No learned teammates on {others}: the profile trains only with presets of H4 there." in card
+    assert "fewer training teammates than its profile asks for: fcp on demo_wide (0 of 3)." in card
 
 
-def test_sizes_have_the_hubs_names():
+def test_size_categories_are_the_hubs():
     names = [size_category(rows) for rows in (0, 999, 1000, 10**6 - 1, 10**6, 10**12)]
     assert names == ["n<1K", "n<1K", "1K<n<10K", "100K<n<1M", "1M<n<10M", "n>1T"]
 
 
-def test_those_who_learn_on_a_layout_are_tested_on_these():
+def test_layouts_of_the_evaluation():
     assert evaluated_on(["demo_wide", "asymm_both"]) == ["demo_wide", "asymm_right", "cramped_down"]
     assert evaluated_on(["cramped_up", "cramped_down"]) == ["cramped_down"]
 
 
 def test_every_field_is_described():
-    assert list(ARRAY_TEXTS) == list(FIELDS)
-    assert list(ENTRY_TEXTS) == list(JSON_TYPES)
+    assert list(card_texts("arrays")) == list(FIELDS)
+    assert list(card_texts("index")) == list(ENTRY_HINTS)
 
 
-def test_learned_teammates_have_cards(beside_learned, tmp_path):
-    out = build_release(beside_learned, tmp_path / "out")
+def test_learned_teammates_have_cards(with_learned, tmp_path):
+    out = build_release(with_learned, tmp_path / "out")
     (folder,) = (out / "teammates").iterdir()
     card = (folder / "README.md").read_text()
     assert front_matter(card)["tags"][-1] == "fcp"
     assert "member 1 of a\npopulation trained with fcp, checkpoint 4, after 4,000 environment steps" in card
     assert "| mean return as a teammate | 35.5 |" in card
     assert folder.name in card
-    report = verify_release(out, deep=True)
+    report = verify_release(out, level="deep")
     assert report.ok and not report.notes, report
     assert not (out / "meta/source_card.md").exists()
     card = (out / "README.md").read_text()
     assert "policies learned by fcp, which act greedily" in card
-    assert "stand in for the learned ones" not in card
+    assert "in place of the learned teammates" not in card
     assert verify_release(build_release(out, tmp_path / "again")).ok
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("algorithm", "x\nlicense: none"), ("layout", "nowhere"), ("step", "many"), ("widths", 3), ("seed", None)],
+    "wrong",
+    [{"algorithm": "x\nlicense: none"}, {"layout": "nowhere"}, {"step": "many"}, {"widths": 3}, {"seed": None}],
 )
-def test_a_teammate_that_is_not_one_is_named(beside_learned, tmp_path, name, value):
-    shutil.copytree(beside_learned / "teammates", tmp_path / "teammates")
-    (path,) = tmp_path.glob("teammates/*/policy.json")
-    path.write_text(json.dumps(json.loads(path.read_text()) | {name: value}))
+def test_a_malformed_policy_is_named(with_learned, tmp_path, wrong):
+    (source,) = with_learned.glob("teammates/*/policy.json")
+    (tmp_path / source.name).write_text(json.dumps(json.loads(source.read_text()) | wrong))
     with pytest.raises(IndexFormatError, match=r"policy\.json: not the card of a learned teammate"):
-        teammate_card(path.parent)
+        teammate_card(tmp_path)
 
 
-def test_observations_alone_are_published_too(release, tmp_path):
-    from icrl4aht_data.writing.convert import to_release
-
+def test_releases_of_observations_are_built(release, tmp_path):
     source = to_release(load_icrl4aht(release), tmp_path / "source", "observations")
     out = build_release(source, tmp_path / "out")
     assert verify_release(out).ok
@@ -339,7 +328,7 @@ def test_observations_alone_are_published_too(release, tmp_path):
     assert "`state`" not in card
 
 
-def test_the_card_of_a_baseline_takes_what_it_names():
+def test_the_baseline_card_uses_its_names():
     names = set(re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text()))
     card = fill("baseline.md", **{name: f"<{name}>" for name in names})
     assert front_matter(card)["license"] == "mit"
@@ -383,9 +372,10 @@ def test_the_command_builds(release, tmp_path):
     assert result.exit_code == 2
 
 
-def test_without_its_libraries_it_says_what_to_install(release, tmp_path, monkeypatch):
-    monkeypatch.setattr("icrl4aht_data.publishing.build.find_spec", lambda name: None if name == "pyarrow" else name)
-    with pytest.raises(OptionError, match=r"needs pyarrow: pip install 'icrl4aht-data\[plot,hf\]'"):
+def test_missing_libraries_are_named(release, tmp_path, monkeypatch):
+    absent = ("pyarrow", "mlcroissant")
+    monkeypatch.setattr("icrl4aht_data.publishing.build.find_spec", lambda name: None if name in absent else name)
+    with pytest.raises(OptionError, match=r"needs pyarrow, mlcroissant: pip install 'icrl4aht-data\[plot,hf\]'"):
         build_release(release, tmp_path / "out")
 
 

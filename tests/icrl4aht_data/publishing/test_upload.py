@@ -1,4 +1,4 @@
-"""Releases go to a Hub whole, go on after a cut, and are tagged only if what is there is what was sent."""
+"""Uploads are complete, resume after an interruption, and are tagged only if the repository equals the release."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def next_version(release: Path, target: Path) -> Path:
 
 
 def sent(hub: Hub) -> list[str]:
-    """The large files that were sent whole."""
+    """Return the large files that were sent completely."""
     return [request.path for request in hub.log if request.method == "PUT" and request.status == 200]
 
 
@@ -71,7 +71,7 @@ def test_dry_run_uploads_nothing(hub, published):
     assert {request.method for request in hub.log} == {"GET"}
 
 
-def test_an_upload_is_whole_and_tagged(hub, published, tmp_path):
+def test_an_upload_is_complete_and_tagged(hub, published, tmp_path):
     done = upload_release(published, ADDRESS, private=True)
     assert (done.done, done.creates, done.tag, done.deletes) == ("uploaded", True, "v0.0.1", [])
     assert hub.repo(REPO).tags == {"v0.0.1": done.commit}
@@ -86,7 +86,7 @@ def test_an_upload_is_whole_and_tagged(hub, published, tmp_path):
     assert verify_release(copy).ok
 
 
-def test_a_second_upload_says_that_it_is_there(hub, published):
+def test_a_second_upload_sends_nothing(hub, published):
     first = upload_release(published, ADDRESS)
     hub.log.clear()
     result = CliRunner().invoke(cli, ["upload", str(published), ADDRESS])
@@ -105,7 +105,7 @@ def test_a_tag_does_not_move(hub, published, tmp_path):
     assert hub.repo(REPO).tags == {"v0.0.1": first.commit}
 
 
-def test_the_next_version_takes_the_place_of_the_last(hub, published, tmp_path):
+def test_the_next_version_replaces_the_last(hub, published, tmp_path):
     first = upload_release(published, ADDRESS)
     new = next_version(published, tmp_path / "new")
     looked = upload_release(new, ADDRESS, dry_run=True)
@@ -124,7 +124,7 @@ def test_a_repository_with_other_peoples_files_is_left_alone(hub, published, tmp
     (tmp_path / "mine/thesis.txt").write_text("years")
     hub.add_repo(REPO, tmp_path / "mine")
     for dry_run in (True, False):
-        with pytest.raises(UploadError, match=r"holds 1 files that are no release's, such as thesis\.txt"):
+        with pytest.raises(UploadError, match=r"has 1 files that belong to no release, such as thesis\.txt"):
             upload_release(published, ADDRESS, dry_run=dry_run)
     assert hub.files(REPO) == {"thesis.txt": b"years"}
 
@@ -135,21 +135,22 @@ def test_a_public_repository_is_not_taken_for_a_private_one(hub, published, tmp_
         upload_release(next_version(published, tmp_path / "new"), ADDRESS, private=True)
 
 
-def test_what_is_not_whole_is_not_uploaded(hub, damaged):
+def test_an_invalid_release_is_not_uploaded(hub, damaged):
     (damaged / "meta/info.json").unlink()
-    with pytest.raises(ReleaseError, match=r"not whole: meta/info\.json: listed in the manifest, but missing"):
+    with pytest.raises(ReleaseError, match=r"not valid: meta/info\.json: listed in the manifest, but missing"):
         upload_release(damaged, ADDRESS)
     assert not hub.log
 
 
 @pytest.mark.parametrize("address", ["us/histories", "hf://us/histories", "hf://datasets/us", f"{ADDRESS}@v1"])
-def test_addresses_that_are_none(published, address):
+def test_other_addresses_are_refused(published, address):
     with pytest.raises(OptionError, match=r"expected hf://datasets/ORG/REPO"):
         upload_release(published, address)
 
 
-def test_killed_half_way_it_goes_on(hub, published):
-    """What was sent whole is not sent again."""
+@pytest.mark.slow
+def test_a_killed_upload_resumes(hub, published):
+    """Files that were sent completely are not sent again."""
     puts = 0
 
     def rule(request: Request) -> Slow | None:
@@ -187,11 +188,11 @@ def test_a_burst_of_server_errors_is_survived(hub, published):
     [
         ("*/refs", "GET", 403, r"token that may write to us: `hf auth login`, or set HF_TOKEN"),
         ("*/repos/create", "POST", 401, r"token that may write to us"),
-        ("*/commit/main", "POST", 500, r"what was sent stays there: go on with the same command"),
-        ("*/tag/*", "POST", 500, r"what was sent stays there"),
+        ("*/commit/main", "POST", 500, r"files sent so far are kept: run the same command"),
+        ("*/tag/*", "POST", 500, r"files sent so far are kept"),
     ],
 )
-def test_server_errors_become_ours_and_the_same_command_goes_on(hub, published, path, method, status, message):
+def test_server_errors_are_wrapped_and_the_same_command_resumes(hub, published, path, method, status, message):
     hub.faults.next(Status(status), times=9, path=path, method=method)
     with pytest.raises(UploadError, match=rf"^us/histories at http://127\.0\.0\.1:\d+: .*{status}.*; .*{message}"):
         upload_release(published, ADDRESS)
@@ -200,15 +201,15 @@ def test_server_errors_become_ours_and_the_same_command_goes_on(hub, published, 
     assert upload_release(published, ADDRESS).done == "uploaded"
 
 
-def test_a_hub_that_is_not_there(published, tmp_path):
+def test_an_unreachable_hub(published, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         hub.close()
-        with pytest.raises(UploadError, match=r"us/histories at http://127\.0\.0\.1:\d+: .*go on with the same"):
+        with pytest.raises(UploadError, match=r"us/histories at http://127\.0\.0\.1:\d+: .*run the same command"):
             upload_release(published, ADDRESS)
 
 
 def test_what_differs_after_the_upload_gets_no_tag(hub, published, tmp_path):
-    """Somebody else commits in between."""
+    """Another user commits in between."""
     shutil.copytree(published, tmp_path / "theirs")
     (tmp_path / "theirs/LICENSE").write_text("all rights reserved")
     next(tmp_path.glob("theirs/data/*/*/*.h5")).write_bytes(b"no data")
@@ -224,7 +225,7 @@ def test_what_differs_after_the_upload_gets_no_tag(hub, published, tmp_path):
         upload_release(published, ADDRESS)
     assert not hub.repo(REPO).tags
     hub.faults.clear()
-    with pytest.raises(UploadError, match=r"no release's, such as more\.txt"):
+    with pytest.raises(UploadError, match=r"belong to no release, such as more\.txt"):
         upload_release(published, ADDRESS)
 
 
@@ -234,7 +235,7 @@ def test_a_card_that_the_hub_refuses(hub, published, tmp_path):
     card = (root / "README.md").read_text()
     (root / "README.md").write_text(card.replace("license: mit", "license: mine"))
     write_manifest(root)
-    with pytest.raises(UploadError, match=r"README\.md.*license.*; correct it, then give the same command"):
+    with pytest.raises(UploadError, match=r"README\.md.*license.*; correct it, then run the same command"):
         upload_release(root, ADDRESS)
 
 
@@ -248,7 +249,7 @@ def test_cards_are_valid_to_the_hub(hub, published):
     assert [request.path for request in hub.log] == ["/api/validate-yaml"] * 3
 
 
-def test_json_says_it_all(hub, published):
+def test_json_output(hub, published):
     result = CliRunner().invoke(cli, ["upload", str(published), ADDRESS, "--json"])
     done = json.loads(result.output)
     assert done["done"] == "uploaded"
@@ -256,10 +257,10 @@ def test_json_says_it_all(hub, published):
     assert done["url"] == f"{hub.endpoint}/datasets/{REPO}"
 
 
-def test_what_was_uploaded_loads(hub, published, tmp_path, monkeypatch):
+def test_an_uploaded_release_loads(hub, published, tmp_path, monkeypatch):
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     done = upload_release(published, ADDRESS)
     there, here = (load_icrl4aht(root, layout="demo_wide") for root in (f"{ADDRESS}@v0.0.1", published))
     assert str(there.origin) == f"{ADDRESS}@{done.commit}" and there.info == here.info
     assert_equal(there.ad(batch_size=4, length=30)[0], here.ad(batch_size=4, length=30)[0])
-    assert verify_release(f"{ADDRESS}@v0.0.1", deep=True).ok
+    assert verify_release(f"{ADDRESS}@v0.0.1", level="deep").ok

@@ -1,10 +1,8 @@
-"""Several releases as one."""
+"""Combination of releases."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +32,7 @@ def test_histories_are_those_of_the_parts(parts, tmp_path):
     result = CliRunner().invoke(cli, ["combine", str(tmp_path / "out"), *map(str, parts)], catch_exceptions=False)
     assert result.exit_code == 0
     assert "Filtered transitions" in result.output
-    report = verify_release(tmp_path / "out", deep=True)
+    report = verify_release(tmp_path / "out", level="deep")
     assert report.ok, report.findings
     combined = load_icrl4aht(tmp_path / "out")
     before = {(h.entry.task_id, h.entry.env_idx): h for part in parts for h in load_icrl4aht(part)}
@@ -82,12 +80,3 @@ def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
     (d / INFO).write_text(json.dumps(info | {"format_version": 99}))
     with pytest.raises(FormatTooNewError, match="format version 99"):
         combine_releases(tmp_path / "out", [a, d])
-
-
-def test_a_refusal_is_one_line_and_exit_code_1(lite, tmp_path):
-    command = [sys.executable, "-m", "icrl4aht_data", "combine", str(tmp_path / "out"), str(lite[0]), str(lite[0])]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 1
-    assert result.stderr.startswith("error: ")
-    assert "is also in" in result.stderr
-    assert result.stderr.count("\n") == 1

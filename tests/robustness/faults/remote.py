@@ -133,7 +133,7 @@ def anywhere(
         serve: the server.
         longest: most requests that meet a fault that passes.
         methods: HTTP methods that meet the fault.
-        hub_retries: whether a download from the Hub succeeds in spite of a fault that passes.
+        hub_retries: whether the Hub's client retries after the fault.
     """
 
     def family(workspace: Workspace, n: int) -> Iterator[Attempt]:
@@ -146,7 +146,7 @@ def anywhere(
                 use, succeeds = uses[number % len(uses)], number // len(uses) % 2 == 0
                 times = int(workspace.rng.integers(1, longest + 1)) if succeeds else ALWAYS
                 first = int(workspace.rng.integers(requests[use]))
-                path = "/[!a]*" if target.is_hub and methods == ("GET",) else "*"  # no hash protects answers of /api
+                path = "/[!a]*" if target.is_hub and methods != ANY else "*"  # the answers of /api have no hash
                 rule = FaultRule(make(workspace.rng), first, times, path, methods)
                 yield partial(attempt, workspace, target, rule, succeeds and (hub_retries or not target.is_hub), *use)
 

@@ -226,7 +226,7 @@ add_hashed("of length <= 512", {"index: wide names": lines(many_names)})
 add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
 add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
 add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
-add_hashed("promises this shard", {"index: many sets of shards": many_sets_of_shards})
+add_hashed("implies this shard", {"index: many sets of shards": many_sets_of_shards})
 _lists = json_file(PROVENANCE, lambda value: value.update({name: [] for name in value}))
 add_hashed(
     "an object of objects",

@@ -121,7 +121,7 @@ def sample(root: Path) -> None:
 
 def findings(root: Path) -> str:
     """Return what `verify` finds, which must be something."""
-    report = verify_release(root, deep=True)
+    report = verify_release(root, level="deep")
     assert not report.ok, "verify finds nothing"
     return "\n".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:1000])
 
@@ -148,7 +148,7 @@ def steps_of(case: Case, root: Path, out: Path) -> Steps:
         "read": lambda: read(root),
         "sample": lambda: sample(root),
         "verify": lambda: findings(root),
-        "quick": lambda: verify_release(root, quick=True),
+        "quick": lambda: verify_release(root, level="quick"),
         "convert": lambda: to_release(load_icrl4aht(root), out / "full", "full"),
         "published": lambda: to_published(load_icrl4aht(root), out / "published"),
         "combine": lambda: combine_releases(out / "combined", [root]),

@@ -1,0 +1,358 @@
+"""Saving and resuming a training: its state, its log, its lock, and when to save.
+
+Every training of this project (egos, populations, in-context learners) is a pure function of its settings and of its
+state after the last update. So it resumes to the same bits if three things hold, and each has one class here:
+`StateFile` restores the state exactly and refuses one of other settings, `RunLog` drops the log lines that came after
+the state was saved, and `run_lock` keeps a second process out of the folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from filelock import FileLock, Timeout
+from jax.experimental import multihost_utils
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import atomic_write
+
+METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
+
+_FORMAT = "1"
+_SUFFIX = ".safetensors"
+
+
+class BusyError(OptionError):
+    """Another process works in this folder."""
+
+
+class OtherSettingsError(OptionError):
+    """A saved state belongs to a training of other settings."""
+
+
+def software_versions() -> dict[str, str]:
+    """Versions that must agree for a resumed training to reach the bits of an uninterrupted one."""
+    return {
+        "jax": jax.__version__,
+        "platform": jax.default_backend(),
+        "code_version": version("icrl4aht-data"),
+    }
+
+
+def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Settings that differ, by dotted name: (found, expected), None for a missing one. Tuples equal JSON's lists."""
+    one, other = _flat(json.loads(json.dumps(found))), _flat(json.loads(json.dumps(expected)))
+    names = sorted(one.keys() | other.keys())
+    return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
+
+
+def lock_file(folder: Path) -> Path:
+    """Path of a folder's lock: next to the folder, so that the folder can be renamed while the lock is held."""
+    return folder.with_name(f".{folder.name}.lock")
+
+
+@contextmanager
+def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold a folder's lock.
+
+    Args:
+        folder: need not exist; its parent is made.
+        wait: until another process releases the lock, instead of raising.
+
+    Raises:
+        BusyError: if another process holds the lock.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(lock_file(folder), timeout=-1 if wait else 0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise BusyError(f"{folder}: another process works in this folder; wait for it, or choose another") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class SaveInterval:
+    """Decides after which updates a training is saved: after the last one, and at least as often as stated.
+
+    Args:
+        last: number of the last update.
+        updates: save when the number of updates is a multiple of this.
+        seconds: save when this much time has passed since the last save. Not for several processes, whose clocks
+            disagree: all must call `save` together.
+    """
+
+    def __init__(self, last: int, *, updates: int | None = None, seconds: float | None = None) -> None:
+        self._last, self._updates, self._seconds = last, updates, seconds
+        self._saved = time.monotonic()
+
+    def due(self, update: int) -> bool:
+        """Whether to save after this many updates; a positive answer starts the next interval."""
+        now = time.monotonic()
+        due = (
+            update == self._last
+            or (self._updates is not None and update % self._updates == 0)
+            or (self._seconds is not None and now - self._saved >= self._seconds)
+        )
+        self._saved = now if due else self._saved
+        return due
+
+
+class StateFile:
+    """One safetensors file with the state of a training, the settings it belongs to, and its progress.
+
+    Arrays are named by their path in the state's pytree ("params/actor/kernel"); typed keys (of JAX's default kind) are
+    stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). The file is replaced
+    atomically. With several processes, all call `save`, process 0 writes, and every process can `load`.
+
+    Args:
+        path: the file, which need not exist.
+        settings: values that JSON can hold; a state saved under others is refused. None accepts any.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any] | None = None) -> None:
+        self.path, self.settings = path, settings
+
+    @property
+    def progress(self) -> int | None:
+        """Number of updates that led to the saved state; None if nothing is saved.
+
+        Raises:
+            OtherSettingsError: if the state was saved under other settings; names the first that differs.
+            OptionError: if the file is damaged.
+        """
+        if not self.path.is_file():
+            return None
+        try:
+            with safe_open(self.path, "numpy") as file:
+                metadata = dict(file.metadata() or {})
+            if metadata["format"] != _FORMAT:
+                raise ValueError(f"format {metadata['format']!r}, expected {_FORMAT!r}")
+            settings, progress = json.loads(metadata["settings"]), int(metadata["progress"])
+        except (SafetensorError, KeyError, ValueError) as error:
+            raise self._unreadable(repr(error)) from error
+        different = {} if self.settings is None else differing_settings(settings, self.settings)
+        for name, (found, expected) in different.items():
+            raise OtherSettingsError(
+                f"{self.path}: saved by a training of other settings: {name} was {found!r}, now it is {expected!r}; "
+                f"remove the file to start again, or choose another folder"
+            )
+        return progress
+
+    def save(self, state: Any, progress: int) -> None:
+        """Write a pytree of arrays and typed keys, sharded or replicated over any devices."""
+        arrays = {name: _host_array(leaf) for name, leaf in _named_leaves(state).items()}
+        if jax.process_index() == 0:
+            metadata = {
+                "format": _FORMAT,
+                "settings": json.dumps(self.settings if self.settings is not None else {}),
+                "progress": str(progress),
+            }
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self.path) as partial:
+                save_file(arrays, partial, metadata=metadata)
+        if jax.process_count() > 1:
+            multihost_utils.sync_global_devices(f"saved {self.path.name}")
+
+    def load(self, like: Any, part: str = "") -> Any:
+        """The saved state.
+
+        Args:
+            like: a pytree of arrays or `jax.ShapeDtypeStruct`s with the state's structure, shapes and dtypes; leaves
+                with a sharding are placed by it, the others on the default device.
+            part: path of a subtree in the saved state ("params") to load alone; `like` describes that subtree.
+
+        Raises:
+            OtherSettingsError: if the state was saved under other settings.
+            OptionError: if there is no file, if it is damaged, or if it holds other arrays.
+        """
+        if self.progress is None:
+            raise self._unreadable("no such file")
+        wanted = _named_leaves(like, part)
+        try:
+            with safe_open(self.path, "numpy") as file:
+                names = [name for name in file.keys() if not part or f"{name}/".startswith(f"{part}/")]  # noqa: SIM118
+                saved = {name: file.get_tensor(name) for name in names}
+        except SafetensorError as error:
+            raise self._unreadable(str(error)) from error
+        expected = {name: _shape_text(_data_shape(leaf)) for name, leaf in wanted.items()}
+        found = {name: _shape_text(array) for name, array in saved.items()}
+        for name in sorted(expected.keys() | found.keys()):
+            if expected.get(name) != found.get(name):
+                raise self._unreadable(
+                    f"{name}: expected {expected.get(name, 'nothing')}, found {found.get(name, 'nothing')}"
+                )
+        leaves = [_place(saved[name], leaf) for name, leaf in wanted.items()]
+        return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+    def _unreadable(self, problem: str) -> OptionError:
+        return OptionError(f"{self.path}: not a state of this training: {problem}; remove the file to start again")
+
+
+class Checkpoints:
+    """The latest states of a training, one `StateFile` each: FOLDER/<step>.safetensors.
+
+    Args:
+        folder: need not exist.
+        settings: see `StateFile`.
+        keep: how many to keep; older ones are removed.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any] | None = None, keep: int = 2) -> None:
+        self.folder, self.settings, self.keep = folder, settings, keep
+
+    @property
+    def steps(self) -> list[int]:
+        """Steps of the checkpoints, ascending."""
+        return sorted(int(path.stem) for path in self.folder.glob(f"*{_SUFFIX}") if path.stem.isdecimal())
+
+    @property
+    def latest(self) -> int | None:
+        """Step of the last checkpoint; None if there is none."""
+        steps = self.steps
+        return steps[-1] if steps else None
+
+    def at(self, step: int) -> StateFile:
+        """The checkpoint of a step."""
+        return StateFile(self.folder / f"{step}{_SUFFIX}", self.settings)
+
+    def save(self, state: Any, step: int) -> None:
+        """Write a checkpoint, then remove the oldest ones."""
+        self.at(step).save(state, step)
+        if jax.process_index() == 0:
+            for old in self.steps[: -self.keep]:
+                self.at(old).path.unlink()
+
+    def load(self, like: Any, part: str = "") -> tuple[Any, int]:
+        """The last checkpoint's state, or a part of it, and its step; see `StateFile.load`.
+
+        Raises:
+            OptionError: if there is no checkpoint, and as `StateFile.load`.
+        """
+        step = self.latest
+        if step is None:
+            raise OptionError(f"{self.folder}: no checkpoint yet; continue the training with the same command")
+        return self.at(step).load(like, part), step
+
+
+class RunLog:
+    """The log of a training: FOLDER/metrics.jsonl and FOLDER/timing.jsonl, JSON lines in the order of the updates.
+
+    Metrics are a function of the settings, timing is not, so the two are apart. Opening the log cuts both files at the
+    first line that `keep` refuses: lines that a killed run wrote after its last save, or half a line. Only process 0
+    writes.
+
+    Args:
+        folder: an existing folder.
+        keep: whether a line was written before the state was saved from which the training resumes.
+    """
+
+    def __init__(self, folder: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
+        self._writes = jax.process_index() == 0
+        paths = [folder / METRICS, folder / TIMING]
+        if self._writes:
+            for path in paths:
+                _cut(path, keep)
+        self._metrics, self._timing = (
+            (path if self._writes else Path(os.devnull)).open("a", encoding="utf-8") for path in paths
+        )
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def write(self, *metrics: dict[str, Any], timing: dict[str, Any] | None = None) -> None:
+        """Append lines; readers see them at once."""
+        for file, lines in ((self._metrics, metrics), (self._timing, [timing] if timing else [])):
+            file.writelines(json.dumps(line) + "\n" for line in lines)
+            file.flush()
+
+    def sync(self) -> None:
+        """Force the metrics to the disk; call before saving the state that they led to."""
+        if self._writes:
+            os.fsync(self._metrics.fileno())
+
+    def close(self) -> None:
+        self._metrics.close()
+        self._timing.close()
+
+
+def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    kept = next((number for number, line in enumerate(lines) if not _is_kept(line, keep)), len(lines))
+    if kept < len(lines):
+        with atomic_write(path) as partial:
+            partial.write_bytes(b"".join(lines[:kept]))
+
+
+def _is_kept(line: bytes, keep: Callable[[dict[str, Any]], bool]) -> bool:
+    try:
+        return line.endswith(b"\n") and keep(json.loads(line))
+    except ValueError:
+        return False
+
+
+def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in content.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
+
+
+def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
+    """Leaves by path: "params/actor/kernel" for attributes, items and indices alike."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
+    named = {"/".join(filter(None, (part, name))): leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
+    if len(named) < len(leaves):
+        raise ValueError("two leaves of the state have the same path")
+    return named
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _data_shape(leaf: Any) -> Any:
+    return jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+
+
+def _shape_text(array: Any) -> str:
+    return f"{np.dtype(array.dtype)} {tuple(array.shape)}"
+
+
+def _host_array(leaf: Any) -> np.ndarray:
+    data = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    if isinstance(data, jax.Array) and not (data.is_fully_addressable or data.is_fully_replicated):
+        data = multihost_utils.process_allgather(data, tiled=True)
+    return np.require(np.asarray(data), requirements="C")
+
+
+def _place(array: np.ndarray, like: Any) -> Any:
+    """A loaded array with the sharding of `like`, if it has one."""
+    sharding = getattr(like, "sharding", None)
+    if _is_key(like):
+        wrap: Any = jax.random.wrap_key_data
+        return wrap(array) if sharding is None else jax.jit(wrap, out_shardings=sharding)(array)
+    if sharding is None:
+        return jnp.asarray(array)
+    return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])

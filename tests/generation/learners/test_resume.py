@@ -1,0 +1,177 @@
+"""Saved states, logs and locks of trainings."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import SingleDeviceSharding
+
+from generation.learners import resume
+from generation.learners.resume import (
+    BusyError,
+    Checkpoints,
+    OtherSettingsError,
+    RunLog,
+    SaveInterval,
+    StateFile,
+    differing_settings,
+    run_lock,
+)
+from icrl4aht_data.errors import OptionError
+
+
+class State(NamedTuple):
+    params: dict
+    rest: tuple
+
+
+SETTINGS = {"ego": {"rate": 0.1, "layers": (1, 2)}, "seed": 3}
+
+
+def state() -> State:
+    """A pytree with every kind of leaf and node that a training's state may have."""
+    params = {"kernel": jnp.arange(6.0).reshape(2, 3).T, "empty": jnp.zeros((0, 4)), "nothing": ()}
+    keys = {"one": jax.random.key(5), "many": jax.random.split(jax.random.key(3), 4)}
+    record, ended = jnp.arange(256, dtype=jnp.uint8), jnp.array([True, False])
+    return State(params, (jnp.int32(7), record, ended, keys))
+
+
+def assert_equal(found, expected) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for after, before in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert (before.dtype, before.shape) == (after.dtype, after.shape)
+        if jnp.issubdtype(before.dtype, jax.dtypes.prng_key):
+            before, after = jax.random.key_data(before), jax.random.key_data(after)
+        assert np.array_equal(before, after)
+
+
+@pytest.fixture
+def file(tmp_path) -> StateFile:
+    return StateFile(tmp_path / "s.safetensors", SETTINGS)
+
+
+class TestStateFile:
+    def test_round_trip(self, file):
+        assert file.progress is None
+        saved = state()
+        file.save(saved, 7)
+        again = StateFile(file.path, json.loads(json.dumps(SETTINGS)))
+        assert again.progress == 7
+        assert_equal(again.load(jax.eval_shape(lambda: saved)), saved)
+        assert [path.name for path in file.path.parent.iterdir()] == ["s.safetensors"]
+
+    def test_one_part_alone_and_given_shardings(self, file):
+        saved = state()
+        file.save(saved, 7)
+        shapes = jax.eval_shape(lambda: saved.params)
+        assert_equal(file.load(shapes, "params"), saved.params)
+        assert_equal(file.load(jax.eval_shape(lambda: saved.rest[3]["one"]), "rest/3/one"), saved.rest[3]["one"])
+        device = SingleDeviceSharding(jax.devices()[0])
+        placed = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), jax.eval_shape(lambda: saved)
+        )
+        found = file.load(placed)
+        assert_equal(found, saved)
+        assert all(leaf.sharding == device for leaf in jax.tree.leaves(found))
+
+    def test_a_save_that_is_cut_short_leaves_the_one_before(self, file, monkeypatch):
+        file.save(state(), 1)
+
+        def cut(arrays, partial, metadata):
+            partial.write_bytes(b"half")
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(resume, "save_file", cut)
+        with pytest.raises(KeyboardInterrupt):
+            file.save(state(), 2)
+        assert file.progress == 1
+
+    @pytest.mark.parametrize(
+        ("like", "message"),
+        [
+            ({"count": jnp.float32(0)}, r"count: expected float32 \(\), found int32 \(\)"),
+            ({"count": jnp.zeros(2, jnp.int32)}, r"count: expected int32 \(2,\), found int32 \(\)"),
+            ({"count": jnp.int32(0), "more": jnp.int32(0)}, r"more: expected int32 \(\), found nothing"),
+            ({}, r"count: expected nothing, found int32 \(\)"),
+        ],
+    )
+    def test_other_arrays_are_named(self, file, like, message):
+        file.save({"count": jnp.int32(7)}, 1)
+        with pytest.raises(OptionError, match=rf"s\.safetensors: not a state of this training: {message}; remove"):
+            file.load(like)
+
+    def test_other_settings_are_named(self, file):
+        file.save({}, 1)
+        other = StateFile(file.path, {"ego": {"rate": 0.2, "layers": [1, 2]}, "seed": 3})
+        with pytest.raises(OtherSettingsError, match=r"s\.safetensors: .*ego\.rate was 0\.1, now it is 0\.2"):
+            other.load({})
+        assert StateFile(file.path).progress == 1
+
+    def test_a_damaged_or_missing_file_is_named(self, file):
+        with pytest.raises(OptionError, match=r"s\.safetensors: .*no such file"):
+            file.load({})
+        file.path.write_bytes(b"not a state")
+        for read in (lambda: file.progress, lambda: file.load({})):
+            with pytest.raises(OptionError, match=r"s\.safetensors: not a state of this training: .*remove the file"):
+                read()
+
+    def test_two_leaves_of_one_path_are_refused(self, file):
+        with pytest.raises(ValueError, match="same path"):
+            file.save({"a/b": jnp.int32(0), "a": {"b": jnp.int32(1)}}, 1)
+
+
+def test_checkpoints_keep_the_latest(tmp_path):
+    checkpoints = Checkpoints(tmp_path / "checkpoints", SETTINGS, keep=2)
+    assert checkpoints.latest is None
+    with pytest.raises(OptionError, match="no checkpoint yet"):
+        checkpoints.load({})
+    for step in (5, 10, 100):
+        checkpoints.save({"step": jnp.int32(step)}, step)
+    assert checkpoints.steps == [10, 100]
+    like = {"step": jnp.int32(0)}
+    found, step = checkpoints.load(like)
+    assert (int(found["step"]), step) == (100, 100)
+    assert int(checkpoints.at(10).load(like)["step"]) == 10
+
+
+def test_the_log_is_cut_after_what_was_saved(tmp_path):
+    with RunLog(tmp_path, lambda line: False) as log:
+        for update in range(4):
+            log.write({"update": update}, {"update": update, "part": "b"}, timing={"update": update})
+        log.sync()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"update": 4, "half a li')
+    with RunLog(tmp_path, lambda line: line["update"] < 2) as log:
+        log.write({"update": 2})
+    metrics, timing = ((tmp_path / name).read_text().splitlines() for name in ("metrics.jsonl", "timing.jsonl"))
+    assert [json.loads(line)["update"] for line in metrics] == [0, 0, 1, 1, 2]
+    assert [json.loads(line)["update"] for line in timing] == [0, 1]
+
+
+def test_when_to_save(monkeypatch):
+    clock = iter([0.0, 1.0, 2.0, 4.0, 4.5, 5.0])
+    monkeypatch.setattr(resume.time, "monotonic", lambda: next(clock))
+    interval = SaveInterval(5, seconds=2.0)
+    assert [interval.due(update) for update in range(1, 6)] == [False, True, True, False, True]
+    monkeypatch.undo()
+    interval = SaveInterval(7, updates=3)
+    assert [update for update in range(1, 8) if interval.due(update)] == [3, 6, 7]
+
+
+def test_a_folder_has_one_owner(tmp_path):
+    with run_lock(tmp_path / "run"):
+        with pytest.raises(BusyError, match="run: another process works in this folder"), run_lock(tmp_path / "run"):
+            pass
+        assert not (tmp_path / "run").exists()
+    with run_lock(tmp_path / "run"):
+        pass
+
+
+def test_settings_that_differ():
+    assert not differing_settings({"a": (1, 2)}, {"a": [1, 2]})
+    assert differing_settings({"a": {"b": 1}, "c": 2}, {"a": {"b": 3}}) == {"a.b": (1, 3), "c": (2, None)}
