@@ -24,7 +24,7 @@ QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", 
 
 _VERSION = 1  # of the cached columns
 _UNCACHED = 2**20  # bytes: a smaller index is decoded as quickly as its columns are opened
-_BLOCK = 2**22  # bytes decoded at a time
+_BLOCK = 2**19  # bytes decoded at a time
 
 _DERIVED = ("history_id", "obs_shape")  # checked, but not stored: they follow from the row and the layout
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64}

@@ -180,7 +180,7 @@ def read_info(root: Path) -> ReleaseInfo:
 
 
 def _instead(root: Path) -> str:
-    """What to do about a folder that is not a release."""
+    """Advice for a folder that is not a release."""
     if not root.is_dir():
         hint = "there is no such folder: check the path"
     elif below := sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}")):

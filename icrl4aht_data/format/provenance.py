@@ -79,7 +79,7 @@ class TeammateSuite:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """How the histories of one task were made. Whatever was not recorded is None.
+    """Origin of one task's histories. Everything that was not recorded is None.
 
     Args:
         profile: name of the profile that sized the rebuild.

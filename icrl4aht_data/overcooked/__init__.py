@@ -1,1 +1,1 @@
-"""The game: maps, state record, rules, observations, frames. Batch first, NumPy or JAX, no randomness of its own."""
+"""OvercookedV2: layouts, state record, rules, observations, pictures. Batch first, for NumPy and JAX, no randomness."""

@@ -1,17 +1,14 @@
-"""TODO."""
+"""Numbers of actions and of the two agents."""
 
 from __future__ import annotations
 
 ACTIONS = ("up", "down", "left", "right", "stay", "interact")
-"""Action names in id order (paper, App. D, table of dataset fields)."""
-
+"""Action names by id (paper, App. D, table of dataset fields)."""
 
 UP, DOWN, LEFT, RIGHT, STAY, INTERACT = range(6)
 
-
 PUBLISHED_ACTIONS = ("right", "down", "left", "up", "stay", "interact")
-"""Action names in the id order of the published code's files; they are remapped on reading."""
-
+"""Action names by their id in the published code's files, which are remapped on reading."""
 
 EGO, TEAMMATE = 0, 1
-"""Seats. The ego learns or is evaluated (drawn blue); the teammate is fixed and unknown (drawn red)."""
+"""Agent slots. The ego learns or is evaluated (drawn blue); the teammate is fixed and unknown to it (drawn red)."""

@@ -66,7 +66,7 @@ class _Renderer:
         self._first: int = fixed.stop  # first channel of what changes on a cell
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.unique(np.array([0, *layout.recipe_items], np.uint8))
-        self._in_window = layout.place_in_window.astype(np.intp)
+        self._in_window = layout.window_position.astype(np.intp)
         self._background = self._make_background()
         self._agents = _as_items(self._make_agents())
         self._patches = _as_items(self._make_patches())

@@ -1,4 +1,4 @@
-"""The ten kitchens: maps, recipes, aliases, and the lookup tables computed from them.
+"""The ten layouts: maps, recipes, aliases, and the lookup tables computed from them.
 
 A cell is (x, y), x = column, y = row, origin top-left; its flat number is y * width + x.
 Map letters: W wall (= counter), A agent, X goal, B plate pile, P pot, R recipe indicator, L button,
@@ -18,16 +18,16 @@ from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
-"""What stands on a cell. A wall is a counter that holds one item; PLATES and PILE are endless."""
+"""Kinds of cells. A wall is a counter that holds one item; PLATES and PILE are endless supplies."""
 
 FACINGS = ("up", "down", "right", "left")
-"""Facing names in the order of the observation's facing channels."""
+"""Facing names by number, the order of the observation's facing channels."""
 
 STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
 """Facing name -> (dx, dy) to the cell ahead."""
 
 FACING_OF = np.array([FACINGS.index(name) for name in ACTIONS if name in FACINGS])
-"""int64 (4,): the facing that a directional action (up, down, left, right) turns to."""
+"""int64 (4,): the facing after a directional action (up, down, left, right)."""
 
 PLATE, COOKED = 1, 2
 """Flag bits of an item byte. The counts of the layout's piled ingredients follow, two bits each."""
@@ -36,13 +36,13 @@ WINDOW = 5
 """Side of the square observation window."""
 
 VISIBLE = WINDOW * WINDOW
-"""Cells of it."""
+"""Number of cells in the window."""
 
 CENTRE = VISIBLE // 2
-"""The one among them, in reading order, on which the agent stands that sees them."""
+"""Position in the window, in reading order, of the observing agent's own cell."""
 
 NOWHERE = 255
-"""Table entry for 'no such column' or 'not in view'."""
+"""Entry of lookup tables for a cell that is outside the window; also the largest byte."""
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
 _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
@@ -50,18 +50,18 @@ _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """One kitchen. Everything below `indicates_delivery` is derived from the map.
+    """One layout. Every property is derived from the arguments.
 
     Args:
         name: the paper's short name.
         alias: the environment name used by OvercookedV2 and by the published manifests.
-        rows: the map, one string a row, all of one width.
+        rows: the map, one string per row, all of one width.
         recipes: triples of ingredient ids; the current recipe is drawn uniformly from them.
         indicates_delivery: whether the observation has the delivery channel.
 
     Raises:
-        ValueError: if the map is not rectangular, has an unknown letter, has not exactly two agents, piles more
-            than three ingredient types (an item is one byte), or lets a chef reach the map's edge.
+        ValueError: if the map is not rectangular, has an unknown letter, does not have exactly two agents, has piles of
+            more than three ingredient types (an item is one byte), or an agent can reach the map's edge.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Layout:
         for cell in self.walkable.nonzero()[0]:
             x, y = cell % self.width, cell // self.width
             if x in (0, self.width - 1) or y in (0, self.height - 1):
-                raise ValueError(f"layout {self.name}: a chef can stand on the map's edge at ({x}, {y})")
+                raise ValueError(f"layout {self.name}: an agent can reach the map's edge at ({x}, {y})")
 
     @property
     def width(self) -> int:
@@ -110,7 +110,7 @@ class Layout:
 
     @cached_property
     def kinds(self) -> np.ndarray:
-        """uint8 (cells,): what stands on each cell."""
+        """uint8 (cells,): the kind of each cell."""
         return np.array([PILE if c in digits else _LETTERS[c] for c in "".join(self.rows)], np.uint8)
 
     @cached_property
@@ -125,7 +125,7 @@ class Layout:
 
     @cached_property
     def piles(self) -> np.ndarray:
-        """uint8 (cells,): the item byte that a pile gives, 0 elsewhere."""
+        """uint8 (cells,): the item byte taken from a pile, 0 elsewhere."""
         items = [PLATE if c == "B" else self.ingredient_item(int(c)) if c in digits else 0 for c in "".join(self.rows)]
         return np.array(items, np.uint8)
 
@@ -153,7 +153,7 @@ class Layout:
 
     @cached_property
     def rooms(self) -> tuple[np.ndarray, np.ndarray]:
-        """For each agent, the floor cells of the connected room in which the map puts it, ascending."""
+        """uint8, ascending: the floor cells that each agent can reach from its start."""
         first, second = (self._room(cell) for cell in self.agent_cells)
         return first, second
 
@@ -172,7 +172,7 @@ class Layout:
 
     @cached_property
     def walkable(self) -> np.ndarray:
-        """bool (cells,): floor that some agent can reach."""
+        """bool (cells,): floor cells that some agent can reach."""
         floor = np.zeros(self.cells, bool)
         floor[np.concatenate(self.rooms)] = True
         return floor
@@ -188,7 +188,7 @@ class Layout:
 
     @cached_property
     def moves(self) -> np.ndarray:
-        """uint8 (cells, 6): the cell that an action leads to when nobody is in the way."""
+        """uint8 (cells, 6): the cell after an action if the other agent is not in the way."""
         table = np.repeat(np.arange(self.cells, dtype=np.uint8)[:, None], len(ACTIONS), axis=1)
         for action, name in enumerate(ACTIONS):
             if name in FACINGS:
@@ -226,11 +226,11 @@ class Layout:
         return table
 
     @cached_property
-    def place_in_window(self) -> np.ndarray:
-        """uint8 (cells, cells): where in the first cell's window the second one is, or NOWHERE."""
+    def window_position(self) -> np.ndarray:
+        """uint8 (cells, cells): position of the second cell in the first one's window, or NOWHERE."""
         table = np.full((self.cells, self.cells), NOWHERE, np.uint8)
-        cell, place = np.nonzero(self.window >= 0)
-        table[cell, self.window[cell, place]] = place
+        cell, position = np.nonzero(self.window >= 0)
+        table[cell, self.window[cell, position]] = position
         return table
 
     def __repr__(self) -> str:
@@ -297,7 +297,7 @@ _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 
 
 def get_layout(name: str) -> Layout:
-    """The layout of that short name, or of that environment name.
+    """The layout with this short name or environment name.
 
     Raises:
         UnknownNameError: lists the valid names and the nearest.

@@ -3,11 +3,11 @@
 Channels, in order, for n ingredient types:
 
     self        7 + n   position 1, facing 4 (up, down, right, left), item in hand 2 + n (plate, cooked, counts)
-    other       7 + n   the same of the other agent
+    other       7 + n   the same for the other agent
     static      6       wall, goal, pot, recipe indicator, button, plate pile
     piles       n       ingredient piles
-    item        2 + n   the item on the cell, also a pot's content
-    recipe      2 + n   on recipe indicators always, on buttons while lit; plate and cooked stay 0
+    item        2 + n   the item on the cell, or the pot's content
+    recipe      2 + n   on recipe indicators always, on buttons while lit; plate and cooked are always 0
     pot timer   1       0..19
     delivery    1       on goal cells in the step after a correct delivery; only test_simple and test_wide
 
@@ -39,24 +39,35 @@ from icrl4aht_data.overcooked.state import Array, unpack
 
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
 
-# A visible cell is one 32-bit word: item 8 bits, pot timer 5, recipe 6, delivery 1, static 6, piles 3 (one for each
-# piled type). A second word holds the agents on it: self 13 bits (position 1, facing 4, hand 8), then other 13 bits.
+# Every visible cell is packed into two 32-bit words, so that lookups move words and only the last operation writes C
+# channels. Bits of the cell's word: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, static 20..25, one bit per
+# piled type 26..28. Bits of the word of the agents on the cell: self 0..12 (position 1, facing 4, hand 8), other 13..25.
 _TIMER, _RECIPE, _DELIVERY, _FIXED, _PILES = 8, 13, 19, 20, 26
 _AGENT_BITS = 13
 
 
-class _Tables(NamedTuple):
-    view: np.ndarray  # int32 (cells, 25): column of the cell's changing word | fixed word's bits from _FIXED up
-    shift: np.ndarray  # uint32 (C,)
-    mask: np.ndarray  # uint32 (C,); 0 for an ingredient type without a pile
+class _Lookup(NamedTuple):
+    """Constants of one layout.
+
+    Args:
+        view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word, then from
+            bit 8 on the fixed bits of its word, shifted down by _FIXED.
+        shift: uint32 (C,), lowest bit of each channel in its word.
+        mask: uint32 (C,), bits of each channel; 0 for an ingredient type without a pile.
+        agent_channels: the first channels, which come from the word of the agents.
+    """
+
+    view: np.ndarray
+    shift: np.ndarray
+    mask: np.ndarray
     agent_channels: int
 
 
 def observe(layout: Layout, record: Array, agent: int) -> Array:
-    """What one agent sees.
+    """Observations of one agent.
 
     Args:
-        layout: the kitchen.
+        layout: the layout.
         record: uint8 (B, S), state records.
         agent: 0 (ego) or 1 (teammate).
 
@@ -67,52 +78,54 @@ def observe(layout: Layout, record: Array, agent: int) -> Array:
 
 
 def observe_both(layout: Layout, record: Array) -> Array:
-    """uint8 (B, 2, 5, 5, C): the observations of ego and teammate; see `observe`."""
+    """Observations uint8 (B, 2, 5, 5, C) of ego and teammate; see `observe`."""
     xp = record.__array_namespace__()
     ego, teammate = (_words(layout, record, agent) for agent in (0, 1))
     return _expand(layout, *(xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True)))
 
 
 def fixed_channels(layout: Layout) -> slice:
-    """The channels of what never changes on a cell: its kind, and the ingredient piled on it."""
-    first = _tables(layout).agent_channels
+    """The channels that are constant for a cell: its kind, and the ingredient piled on it."""
+    first = _lookup(layout).agent_channels
     return slice(first, first + len(_STATIC) + layout.ingredient_types)
 
 
 def _expand(layout: Layout, agents: Array, cells: Array) -> Array:
-    """uint32 (B, 25) twice -> uint8 (B, 5, 5, C): every channel is some bits of one of the two words."""
+    """Unpack words uint32 (B, 25) of agents and of cells to uint8 (B, 5, 5, C)."""
     xp = agents.__array_namespace__()
-    tables = _tables(layout)
-    of_agents = xp.asarray(np.arange(layout.channels) < tables.agent_channels)
+    lookup = _lookup(layout)
+    of_agents = xp.asarray(np.arange(layout.channels) < lookup.agent_channels)
     word = xp.where(of_agents, agents[..., None], cells[..., None])
-    values = xp.astype(word >> xp.asarray(tables.shift) & xp.asarray(tables.mask), xp.uint8)
+    values = xp.astype(word >> xp.asarray(lookup.shift) & xp.asarray(lookup.mask), xp.uint8)
     return xp.reshape(values, (*agents.shape[:-1], *layout.obs_shape))
 
 
 def _words(layout: Layout, record: Array, agent: int) -> tuple[Array, Array]:
-    """uint32 (B, 25) twice: who is on each visible cell, and what is on it."""
+    """uint32 (B, 25) twice: the word of the agents on each visible cell, and the word of the cell itself."""
     xp = record.__array_namespace__()
-    tables = _tables(layout)
+    lookup = _lookup(layout)
     state = unpack(layout, record)
     me, other = state.positions[..., agent], state.positions[..., 1 - agent]
 
-    view = look_up(tables.view, me)
+    view = look_up(lookup.view, me)
     changing = _changing_words(xp, state)
     cells = xp.take_along_axis(changing, view & NOWHERE, axis=-1) | xp.astype(view >> 8, xp.uint32) << _FIXED
 
     bodies = 1 | xp.astype(1 << (xp.astype(state.facings, xp.uint32) + 1), xp.uint32)
     bodies = bodies | xp.astype(state.hands, xp.uint32) << 5
-    relative = look_up(layout.place_in_window.reshape(-1), xp.astype(me, xp.int32) * layout.cells + other)
-    place = xp.arange(VISIBLE, dtype=xp.uint8)
+    relative = look_up(layout.window_position.reshape(-1), xp.astype(me, xp.int32) * layout.cells + other)
+    # The observer is always in the centre. An agent out of view is at NOWHERE, which equals no position in the window.
+    position = xp.arange(VISIBLE, dtype=xp.uint8)
     none = xp.zeros_like(cells)
-    agents = xp.where(place == CENTRE, bodies[..., agent, None], none) | xp.where(
-        place == relative[..., None], bodies[..., 1 - agent, None] << _AGENT_BITS, none
+    agents = xp.where(position == CENTRE, bodies[..., agent, None], none) | xp.where(
+        position == relative[..., None], bodies[..., 1 - agent, None] << _AGENT_BITS, none
     )
     return agents, cells
 
 
 def _changing_words(xp, state) -> Array:
-    """uint32 (B, 3 + P + L + K): the words that cells point to: nothing, indicator, goal, pots, buttons, counters."""
+    """uint32 (B, 3 + P + L + K): the words that cells refer to: nothing, indicator, goal, pots, buttons, counters."""
+    # Without the flags of plate and cooked, which a recipe does not have.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << _RECIPE
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << _DELIVERY
     pots = xp.astype(state.pot_items, xp.uint32) | xp.astype(state.pot_timers, xp.uint32) << _TIMER
@@ -123,7 +136,7 @@ def _changing_words(xp, state) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _tables(layout: Layout) -> _Tables:
+def _lookup(layout: Layout) -> _Lookup:
     column = np.zeros(layout.cells, np.int32)
     column[layout.kinds == INDICATOR] = 1
     column[layout.kinds == GOAL] = 2
@@ -135,6 +148,7 @@ def _tables(layout: Layout) -> _Tables:
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - _FIXED + bit)
+    # Outside the map both parts are 0: word number 0 is always zero.
     view = np.where(layout.window >= 0, (column | fixed << 8)[layout.window], 0)
 
     agent = [(0, 1), *((1 + facing, 1) for facing in range(4)), *_item_bits(layout, 5)]
@@ -151,14 +165,15 @@ def _tables(layout: Layout) -> _Tables:
         *([(_DELIVERY, 1)] if layout.indicates_delivery else []),
     ]
     shift, mask = np.array(shifts, np.uint32).T
-    return _Tables(view.astype(np.int32), shift, mask, 2 * len(agent))
+    return _Lookup(view.astype(np.int32), shift, mask, 2 * len(agent))
 
 
 def _item_bits(layout: Layout, first: int) -> list[tuple[int, int]]:
+    """(shift, mask) of the channels of an item byte that starts at bit `first`: plate, cooked, counts."""
     return [(first, 1), (first + 1, 1), *_ingredient_bits(layout, first + 2, 2, 3)]
 
 
 def _ingredient_bits(layout: Layout, first: int, width: int, mask: int) -> list[tuple[int, int]]:
-    """(shift, mask) of each ingredient channel; mask 0 for a type that has no pile."""
+    """(shift, mask) of each ingredient channel; mask 0 for a type without a pile."""
     order = {ingredient: number for number, ingredient in enumerate(layout.ingredients)}
     return [(first + width * order[i], mask) if i in order else (0, 0) for i in range(layout.ingredient_types)]

@@ -1,6 +1,6 @@
 """Pictures of state records, for people: a frame as an array or PNG, an episode as an animated GIF.
 
-Places and lengths are in cells, (0, 0) the map's top left corner. Drawn enlarged, then shrunk, for smooth edges.
+Positions and lengths are in cells, (0, 0) is the map's top left corner. Drawn enlarged, then reduced, for smooth edges.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ from icrl4aht_data.utils.files import atomic_write
 if TYPE_CHECKING:
     from PIL import Image
 
-_ENLARGE, _FOOTER, _SMALLEST_CELL, _GIF_COLOURS = 4, 0.8, 16, 127  # and one transparent, for what stays
+_ENLARGE, _FOOTER, _SMALLEST_CELL, _GIF_COLOURS = (
+    4,
+    0.8,
+    16,
+    127,
+)  # and one transparent colour for pixels that do not change
 
 _INK, _STEEL, _DARK_STEEL, _WHITE = (43, 48, 58), (124, 133, 146), (58, 64, 75), (255, 255, 255)
 _FLOOR, _FAR_WALL, _PAPER = ((248, 245, 238), (239, 234, 224)), (199, 193, 184), (255, 252, 240)
@@ -56,7 +61,7 @@ _INGREDIENTS = {
         (0.36, (90, 170, 80), (0.48, -0.44), (0.72, -0.7)),
     ),
 }
-"""The edge colour of each ingredient and the strokes that draw it within a radius of 1, see `_Canvas.strokes`."""
+"""ingredient id -> its edge colour and the strokes that draw it within a radius of 1, see `_Canvas.strokes`."""
 _OTHER_INGREDIENT = (_INK, (1.6, _STEEL, (0, 0)))
 
 
@@ -66,16 +71,18 @@ def draw_frame(
     """A picture of one state: ego blue, teammate red, and a footer with the current recipe and a one-line caption.
 
     Args:
-        layout, record: the kitchen, and a state record uint8 (S,).
+        layout: the layout.
+        record: state record uint8 (S,).
         cell: side of a map cell in pixels, at least 16.
-        caption: text for the footer; a long one is written smaller.
+        caption: text for the footer; a long one gets a smaller font.
         view: whether to outline the cells that the ego observes.
 
     Returns:
-        uint8 (height, width, 3), RGB: the map's rows and columns times `cell`, and below them 0.8 cells of footer.
+        uint8 (height, width, 3), RGB: `cell` pixels per row and column of the map, and a footer of 0.8 cells below.
 
     Raises:
-        OptionError: no Pillow, a record of another shape or dtype or with impossible values, or too small a cell.
+        OptionError: if Pillow is missing, the record has another shape or dtype or impossible values, or `cell` is too
+            small.
     """
     return np.array(_picture(layout, _checked(layout, record, 1, cell), cell, caption, view))
 
@@ -98,12 +105,15 @@ def save_episode(
     """Write an episode as a GIF of T frames that loops endlessly. The file appears complete or not at all.
 
     Args:
-        path, layout, records: the file, the kitchen, and the state records uint8 (T, S) in order.
+        path: the file to write.
+        layout: the layout.
+        records: state records uint8 (T, S) in order.
         rewards: real (T,), the reward of the step from each record; the captions then show the return so far.
-        cell, fps: side of a map cell in pixels, at least 16; frames a second, 1 to 50.
+        cell: side of a map cell in pixels, at least 16.
+        fps: frames per second, 1 to 50.
 
     Raises:
-        OptionError: as in `draw_frame`, or there is no record, or rewards or fps do not fit.
+        OptionError: as in `draw_frame`, if there is no record, or if rewards or fps do not fit.
     """
     records = _checked(layout, records, 2, cell)
     rewards = np.full(len(records), np.nan) if rewards is None else np.asarray(rewards)
@@ -117,7 +127,7 @@ def save_episode(
     colours, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
     timing = {"duration": round(1000 / fps), "loop": 0}
-    palette = bytes(colours.getpalette() or [])  # given here, Pillow writes it once instead of once a frame
+    palette = bytes(colours.getpalette() or [])  # passed explicitly, it is written once instead of once per frame
     _write(Path(path), first, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **timing)
 
 
@@ -151,7 +161,7 @@ def _write(path: Path, image: Image.Image, **options: Any) -> None:
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:
-    """The colours that are most frequent in any one frame, so that a short flash keeps its colour."""
+    """The colours that are most frequent in any single frame, so that a colour of few frames is kept."""
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
@@ -166,7 +176,7 @@ def _font(pixels: int) -> Any:
 
 
 class _Canvas:
-    """Shapes in cell units on an enlarged picture."""
+    """An enlarged picture with methods that draw shapes in units of cells."""
 
     def __init__(self, width: float, height: float, cell: int) -> None:
         image, draw, _ = _pillow()
@@ -208,14 +218,14 @@ def _picture(layout: Layout, record: np.ndarray, cell: int, caption: str, view: 
     canvas = _Canvas(layout.width, layout.height + _FOOTER, cell)
     state = unpack(layout, record)
     recipe = _contents(layout, int(state.recipe))
-    for place in range(layout.cells):
-        _draw_fixture(canvas, layout, place, recipe, bool(state.delivered))
-    for place, item, timer in zip(layout.pots, state.pot_items.tolist(), state.pot_timers.tolist(), strict=True):
-        _draw_pot(canvas, *_centre(layout, place), _contents(layout, item), timer, item & COOKED > 0)
-    for place, timer in zip(layout.buttons, state.buttons.tolist(), strict=True):
-        _draw_button(canvas, *_centre(layout, place), recipe, timer)
-    for place, item in zip(layout.counters, state.counters.tolist(), strict=True):
-        _draw_item(canvas, layout, item, *_centre(layout, place), 0.33)
+    for position in range(layout.cells):
+        _draw_fixture(canvas, layout, position, recipe, bool(state.delivered))
+    for position, item, timer in zip(layout.pots, state.pot_items.tolist(), state.pot_timers.tolist(), strict=True):
+        _draw_pot(canvas, *_centre(layout, position), _contents(layout, item), timer, item & COOKED > 0)
+    for position, timer in zip(layout.buttons, state.buttons.tolist(), strict=True):
+        _draw_button(canvas, *_centre(layout, position), recipe, timer)
+    for position, item in zip(layout.counters, state.counters.tolist(), strict=True):
+        _draw_item(canvas, layout, item, *_centre(layout, position), 0.33)
     if view:
         _draw_view(canvas, layout, int(state.positions[EGO]))
     for agent in (EGO, TEAMMATE):
@@ -238,7 +248,7 @@ def _contents(layout: Layout, item: int) -> list[int]:
 
 
 def _draw_fixture(canvas: _Canvas, layout: Layout, cell: int, recipe: list[int], delivered: bool) -> None:
-    """What never moves on a cell; under pots and buttons only the counter."""
+    """The constant part of a cell; under pots and buttons only the counter."""
     (x, y), kind = _centre(layout, cell), layout.kinds[cell]
     floor, far_wall = kind == layouts.EMPTY, kind == layouts.WALL and cell not in layout.counters
     canvas.box(x, y, 1, 1, _FLOOR[int(x + y) % 2] if floor else _FAR_WALL if far_wall else _COUNTER)
@@ -266,7 +276,7 @@ def _draw_fixture(canvas: _Canvas, layout: Layout, cell: int, recipe: list[int],
 
 
 def _draw_pot(canvas: _Canvas, x: float, y: float, contents: list[int], timer: int, cooked: bool) -> None:
-    """A pot: empty places as rings; while cooking an orange rim and the steps left; when cooked green and ticked."""
+    """A pot: free slots as rings; while cooking an orange rim and the steps left; when cooked green with a tick."""
     canvas.box(x, y, 0.9, 0.9, _DARK_STEEL, 0.08)
     canvas.strokes([(0.12, _STEEL, (-0.4, 0), (0.4, 0))], x, y - 0.05)
     canvas.disc(x, y - 0.05, 0.38, _READY if cooked else _STEEL)
@@ -283,7 +293,7 @@ def _draw_pot(canvas: _Canvas, x: float, y: float, contents: list[int], timer: i
 
 
 def _draw_button(canvas: _Canvas, x: float, y: float, recipe: list[int], timer: int) -> None:
-    """A knob with a question mark; while lit a lamp that shows the recipe, its ring the time left."""
+    """A knob with a question mark; while lit a lamp with the recipe, whose ring shows the time left."""
     canvas.box(x, y, 0.88, 0.88, _DARK_STEEL, 0.2)
     canvas.disc(x, y, 0.42, _LAMP, timer / BUTTON_STEPS)
     canvas.disc(x, y, 0.35, _PAPER if timer else _STEEL)
@@ -294,7 +304,7 @@ def _draw_button(canvas: _Canvas, x: float, y: float, recipe: list[int], timer: 
 
 
 def _draw_item(canvas: _Canvas, layout: Layout, item: int, x: float, y: float, radius: float) -> None:
-    """An item byte: nothing, one ingredient, or a plate with what is on it."""
+    """An item byte: nothing, one ingredient, or a plate with its content."""
     contents = _contents(layout, item)
     if item & PLATE:
         for part, colour in ((1, _PLATE_RIM), (0.88, _WHITE), (0.7, _PLATE_RIM), (0.62, _WHITE)):
@@ -305,14 +315,14 @@ def _draw_item(canvas: _Canvas, layout: Layout, item: int, x: float, y: float, r
 
 
 def _draw_trio(canvas: _Canvas, contents: list[int], x: float, y: float, radius: float, empty=None) -> None:
-    """Up to three ingredients in a triangle, and rings of the colour `empty` on the free places."""
+    """Up to three ingredients in a triangle, and rings of the colour `empty` in the free slots."""
     for number, (dx, dy) in enumerate(((0, -0.95), (-1.02, 0.75), (1.02, 0.75))):
-        place = (x + dx * radius, y + dy * radius)
+        centre = (x + dx * radius, y + dy * radius)
         if number < len(contents):
-            _draw_ingredient(canvas, contents[number], *place, radius)
+            _draw_ingredient(canvas, contents[number], *centre, radius)
         elif empty:
-            canvas.disc(*place, radius * 0.8, empty)
-            canvas.disc(*place, radius * 0.6, _INK)
+            canvas.disc(*centre, radius * 0.8, empty)
+            canvas.disc(*centre, radius * 0.6, _INK)
 
 
 def _draw_ingredient(canvas: _Canvas, ingredient: int, x: float, y: float, radius: float) -> None:
@@ -321,7 +331,7 @@ def _draw_ingredient(canvas: _Canvas, ingredient: int, x: float, y: float, radiu
 
 
 def _draw_view(canvas: _Canvas, layout: Layout, cell: int) -> None:
-    """The outline of the ego's window, as far as it is on the map."""
+    """The outline of the ego's window, clipped to the map."""
     x, y = _centre(layout, cell)
     reach = WINDOW / 2
     corners = np.clip([x - reach, y - reach, x + reach, y + reach], 0, [layout.width, layout.height] * 2)
@@ -330,7 +340,7 @@ def _draw_view(canvas: _Canvas, layout: Layout, cell: int) -> None:
 
 
 def _draw_chef(canvas: _Canvas, layout: Layout, agent: int, cell: int, facing: int, hand: int) -> None:
-    """A chef from above: coat in the agent's colour, white hat; eyes, arms and what it holds on the side it faces."""
+    """A chef from above: coat in the agent's colour, white hat; eyes, arms and the item in hand point forward."""
     x, y = _centre(layout, cell)
     front_x, front_y = _centre(layout, int(layout.ahead[cell, facing]))
     forward = front_x - x, front_y - y

@@ -1,7 +1,8 @@
 """The rules: one step of the game as a pure function of its arguments, batch first, for NumPy and JAX alike.
 
-Order of a step (paper, App. A.1; constants checked against OvercookedV2): move, collide, swap, agent 0 interacts,
-agent 1 interacts on what agent 0 left, timers tick, the recipe changes after a correct delivery.
+Order of a step (paper, App. A.1; constants checked against OvercookedV2):
+1. agents turn and move; 2. collisions and 3. exchanges of cells are undone; 4. agent 0 interacts, then agent 1, in the
+state that agent 0 left; 5. timers count down; 6. a correct delivery changes the recipe.
 """
 
 from __future__ import annotations
@@ -30,34 +31,48 @@ SHAPED_DISH_PICKUP = 5.0
 SHAPED_PLATE_PICKUP = 3.0
 
 CORRECT, WRONG, PRESSED, PLACED, USEFUL_PLACEMENT, TOOK_DISH, USEFUL_DISH, USEFUL_PLATE = (1 << i for i in range(8))
-"""Event bits of one agent in one step: it delivered correctly or wrongly, pressed a button, put an ingredient into a
-pot (one the recipe still needs), took a dish out of a pot (the current recipe's), took a plate that is needed."""
+"""Event bits of one agent in one step.
+
+    CORRECT, WRONG      delivered the current recipe's dish, or another one
+    PRESSED             pressed a button
+    PLACED              put an ingredient into a pot; USEFUL_PLACEMENT: one that the recipe still needs there
+    TOOK_DISH           took a dish out of a pot; USEFUL_DISH: the current recipe's
+    USEFUL_PLATE        took a plate while more pots are in use than plates in hands, and no plate is on a counter
+"""
 
 
 class StepResult(NamedTuple):
-    """What a step gives. `B` denotes the batch dimensions."""
+    """The result of one step. `B` denotes the batch dimensions.
 
-    state: Array  # uint8 (B, S)
-    reward: Array  # float32 (B,), the team's
-    shaped: Array  # float32 (B, 2), each agent's own, apart from the team's
-    events: Array  # uint8 (B, 2), event bits of each agent
+    Args:
+        state: uint8 (B, S), the next state record.
+        reward: float32 (B,), the team's reward.
+        shaped: float32 (B, 2), each agent's own shaped reward, not part of the team's.
+        events: uint8 (B, 2), event bits of each agent.
+    """
+
+    state: Array
+    reward: Array
+    shaped: Array
+    events: Array
 
 
 def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> StepResult:
     """One step of the game.
 
     Args:
-        layout: the kitchen.
+        layout: the layout.
         record: uint8 (B, S), the state record.
         actions: integers (B, 2), action ids 0..5 of ego and teammate.
-        next_recipe: uint8 (B,), item byte of the recipe that a correct delivery in this step brings.
+        next_recipe: uint8 (B,), item byte of the recipe that follows if this step has a correct delivery.
 
     Returns:
-        A `StepResult`. Equal bytes from NumPy and JAX.
+        The next states, rewards and events; equal bytes from NumPy and JAX.
     """
     xp = record.__array_namespace__()
     state = unpack(layout, record)
     state = _move(layout, xp, state, actions)
+    # Both agents are judged by the plates in hand before either interacts.
     plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
     recipe = state.recipe
     events = []
@@ -68,6 +83,7 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
     happened = xp.stack(events, axis=-1)
     correct = xp.any((happened & CORRECT) > 0, axis=-1)
 
+    # Timers set in this step count down in it as well: a press is visible in BUTTON_STEPS - 1 observations.
     ticking = state.pot_timers > 0
     pot_timers = xp.astype(state.pot_timers - ticking, xp.uint8)
     pot_items = xp.astype(state.pot_items | ((ticking & (pot_timers == 0)) * np.uint8(COOKED)), xp.uint8)
@@ -111,14 +127,14 @@ def look_up(table: np.ndarray, index: Array) -> Array:
 
 
 def _move(layout: Layout, xp, state: State, actions: Array) -> State:
-    """Steps 1 to 3: a directional action always turns; nobody enters an occupied or contested cell."""
+    """Steps 1 to 3: a directional action always turns; no agent enters an occupied or contested cell."""
     moved = look_up(layout.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
     old0, old1 = state.positions[..., 0], state.positions[..., 1]
     new0, new1 = moved[..., 0], moved[..., 1]
     # With two agents, undoing until no conflict remains has a closed form: if the wanted cells coincide both go
     # back, which leaves no further conflict; exchanging cells sends both back too.
     undo = (new0 == new1) | ((new0 == old1) & (new1 == old0))
-    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # FACING_OF, without a table
+    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # equals FACING_OF, without a lookup
     return state._replace(
         positions=xp.where(undo[..., None], state.positions, moved),
         facings=xp.where(actions < len(FACINGS), facing, state.facings),
@@ -128,19 +144,19 @@ def _move(layout: Layout, xp, state: State, actions: Array) -> State:
 def _interact(
     layout: Layout, xp, state: State, agent: int, acting: Array, plates_in_hand: Array
 ) -> tuple[State, Array]:
-    """Step 4 for one agent where `acting` (B,): the new state and the agent's event bits uint8 (B,)."""
+    """Step 4 for one agent, where `acting` bool (B,): the new state and the agent's event bits uint8 (B,)."""
     hand = state.hands[..., agent]
-    place = xp.astype(state.positions[..., agent], xp.int32) * 4 + state.facings[..., agent]
-    faced = look_up(_faced(layout), place)
-    kind, pile, slot = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
+    pose = xp.astype(state.positions[..., agent], xp.int32) * 4 + state.facings[..., agent]
+    faced = look_up(_faced(layout), pose)
+    kind, pile, number = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
+    facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
     # One-hot over the few cells that hold items: reads and writes without a scatter, in either library.
-    at_pot = (slot[..., None] == _range(xp, len(layout.pots))) & (acting & (kind == POT))[..., None]
-    at_counter = (slot[..., None] == _range(xp, len(layout.counters))) & (acting & (kind == WALL))[..., None]
-    at_button = (slot[..., None] == _range(xp, len(layout.buttons))) & (acting & (kind == BUTTON))[..., None]
+    at_pot = (number[..., None] == _range(xp, len(layout.pots))) & facing_pot[..., None]
+    at_counter = (number[..., None] == _range(xp, len(layout.counters))) & facing_counter[..., None]
+    at_button = (number[..., None] == _range(xp, len(layout.buttons))) & (acting & (kind == BUTTON))[..., None]
     content = _read(xp, at_pot, state.pot_items) | _read(xp, at_counter, state.counters)
     timer = _read(xp, at_pot, state.pot_timers)
 
-    facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
     empty_hand = hand == 0
     takes_pile = acting & (pile > 0) & empty_hand
     takes_item = facing_counter & (content > 0) & empty_hand
@@ -154,12 +170,13 @@ def _interact(
 
     dish = state.recipe | np.uint8(PLATE | COOKED)
     correct = delivers & (hand == dish)
-    same_type = hand | hand << 1  # both count bits of the type in hand
+    # The hand has a count of 1, the lower bit of its type; with the upper bit it masks the type's count.
+    same_type = hand | hand << 1
     useful_placement = adds & ((content & same_type) < (state.recipe & same_type))
     useful_dish = takes_dish & ((content | PLATE) == dish)
     pots_in_use = xp.sum(state.pot_items > 0, axis=-1, dtype=xp.uint8)
-    plates_lie = xp.any(state.counters == PLATE, axis=-1)
-    useful_plate = takes_pile & (pile == PLATE) & (plates_in_hand < pots_in_use) & ~plates_lie
+    plate_on_counter = xp.any(state.counters == PLATE, axis=-1)
+    useful_plate = takes_pile & (pile == PLATE) & (plates_in_hand < pots_in_use) & ~plate_on_counter
 
     nothing = xp.zeros_like(hand)
     new_content = xp.where(adds, content + hand, xp.where(puts_down, hand, content))
@@ -191,15 +208,15 @@ def _interact(
 
 
 def _faced(layout: Layout) -> np.ndarray:
-    """int32 (cells * 4,): kind | pile << 8 | slot << 16 of the cell that an agent faces, by position and facing.
+    """int32 (cells * 4,): kind | pile << 8 | number << 16 of the cell that an agent faces, by position and facing.
 
-    The slot is the cell's number among the pots, the counters or the buttons.
+    The number counts the cells of the same kind: pots, counters or buttons.
     """
-    slot = np.zeros(layout.cells, np.int32)
+    number = np.zeros(layout.cells, np.int32)
     for cells in (layout.pots, layout.counters, layout.buttons):
-        slot[list(cells)] = range(len(cells))
+        number[list(cells)] = range(len(cells))
     ahead = layout.ahead.reshape(-1)
-    return layout.kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | slot[ahead] << 16
+    return layout.kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | number[ahead] << 16
 
 
 def _range(xp, n: int) -> Array:
@@ -207,5 +224,5 @@ def _range(xp, n: int) -> Array:
 
 
 def _read(xp, at: Array, values: Array) -> Array:
-    """uint8 (B,): the one value (B, K) where `at`, else 0."""
+    """uint8 (B,): the value of (B, K) selected by the one-hot `at` (B, K), or 0 if it selects none."""
     return xp.sum(xp.where(at, values, xp.zeros_like(values)), axis=-1, dtype=xp.uint8)

@@ -9,7 +9,7 @@ Columns, in order (a = agent 0, the ego, then agent 1, the teammate):
     delivered   1   1 in the step after a correct delivery, else 0
     pot_items   P   item byte of each pot's content, pots in reading order
     pot_timers  P   steps until cooked, 0..20
-    buttons     L   steps that each button's lamp stays lit, 0..10
+    buttons     L   steps for which each button stays lit, 0..10
     counters    K   item byte on each wall that an agent can face, in reading order
 
 Item byte: bit 0 plate, bit 1 cooked, then two bits (a count 0..3) for each ingredient type that has a pile, in
@@ -37,21 +37,33 @@ BUTTON_STEPS = 10
 
 
 class State(NamedTuple):
-    """A state record's columns, uint8. `B` denotes the batch dimensions, which come first everywhere."""
+    """A state record's columns, uint8. `B` denotes the batch dimensions, which come first everywhere.
 
-    positions: Array  # (B, 2)
-    facings: Array  # (B, 2)
-    hands: Array  # (B, 2)
-    recipe: Array  # (B,)
-    delivered: Array  # (B,)
-    pot_items: Array  # (B, P)
-    pot_timers: Array  # (B, P)
-    buttons: Array  # (B, L)
-    counters: Array  # (B, K)
+    Args:
+        positions: (B, 2), flat cell numbers of ego and teammate.
+        facings: (B, 2), positions in `FACINGS`.
+        hands: (B, 2), item bytes.
+        recipe: (B,), item byte of the current recipe.
+        delivered: (B,), 1 in the step after a correct delivery.
+        pot_items: (B, P), item byte of each pot's content.
+        pot_timers: (B, P), steps until the content is cooked.
+        buttons: (B, L), steps for which each button stays lit.
+        counters: (B, K), item byte on each counter.
+    """
+
+    positions: Array
+    facings: Array
+    hands: Array
+    recipe: Array
+    delivered: Array
+    pot_items: Array
+    pot_timers: Array
+    buttons: Array
+    counters: Array
 
 
 def columns(layout: Layout) -> State:
-    """Where each field stands in the record: slices, and an int for the two single columns."""
+    """Position of each field in the record: slices, and an int for the two single columns."""
     pots, buttons, counters = len(layout.pots), len(layout.buttons), len(layout.counters)
     ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
     rest = [slice(a, b) for a, b in pairwise(ends)]
@@ -59,24 +71,24 @@ def columns(layout: Layout) -> State:
 
 
 def record_size(layout: Layout) -> int:
-    """S, the bytes of a state record."""
+    """S, the number of bytes of a state record."""
     return 8 + 2 * len(layout.pots) + len(layout.buttons) + len(layout.counters)
 
 
 def unpack(layout: Layout, record: Array) -> State:
-    """uint8 (B, S) -> its columns."""
+    """Split state records uint8 (B, S) into their columns."""
     return State(*(record[..., column] for column in columns(layout)))
 
 
 def pack(state: State) -> Array:
-    """The columns -> uint8 (B, S)."""
+    """Join columns to state records uint8 (B, S)."""
     xp = state.positions.__array_namespace__()
     single = (state.recipe[..., None], state.delivered[..., None])
     return xp.concat([*state[:3], *single, *state[5:]], axis=-1)
 
 
 def swapped(record: Array) -> Array:
-    """The same records with the two agents exchanged: uint8 (B, S); the ego's view of it is the teammate's."""
+    """Exchange the two agents in state records uint8 (B, S), so that the ego's observation becomes the teammate's."""
     order = np.arange(record.shape[-1])
     order[:6] = 1, 0, 3, 2, 5, 4  # positions, facings, hands
     return record[..., order]
@@ -86,9 +98,9 @@ def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Ar
     """The record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
 
     Args:
-        layout: the kitchen.
-        positions: uint8 (B, 2), flat cells of the two agents.
-        facings: uint8 (B, 2).
+        layout: the layout.
+        positions: uint8 (B, 2), flat cell numbers of the two agents.
+        facings: uint8 (B, 2), positions in `FACINGS`.
         recipe: uint8 (B,), item byte of the first recipe.
 
     Returns:
@@ -101,9 +113,9 @@ def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Ar
 
 
 def faults(layout: Layout, record: np.ndarray) -> list[str]:
-    """What is impossible in the records uint8 (B, S); empty if every value is in range.
+    """Descriptions of impossible values in the records uint8 (B, S); empty if every value is in range.
 
-    Checks ranges only (positions on floor and apart, item bytes that the rules can make, timers, recipe made of three
+    Checks ranges only (distinct positions on floor, item bytes that the rules can produce, timers, recipe made of three
     ingredients), not whether the state can be reached.
     """
     state = unpack(layout, record)
@@ -123,7 +135,7 @@ def faults(layout: Layout, record: np.ndarray) -> list[str]:
         "an impossible recipe": ~recipes[state.recipe],
         "a delivery flag that is not 0 or 1": state.delivered > 1,
         "a pot timer above its limit": state.pot_timers > POT_STEPS,
-        "a pot that does not cook exactly while it holds three raw ingredients": cooking
+        "a pot that does not cook exactly while it contains three raw ingredients": cooking
         != ((ingredient_count(state.pot_items) == 3) & (state.pot_items & COOKED == 0)),
         "a button timer above its limit": state.buttons > BUTTON_STEPS,
     }
@@ -136,7 +148,7 @@ def ingredient_count(item: Array) -> Array:
 
 
 def possible_items(layout: Layout) -> np.ndarray:
-    """bool (256,): the item bytes that the rules can make: nothing, a plate, 1..3 ingredients, soups, dishes."""
+    """bool (256,): the item bytes that the rules can produce: nothing, a plate, 1..3 ingredients, soups, dishes."""
     item = np.arange(256)
     count = ingredient_count(item)
     known = item >> (2 + 2 * len(layout.ingredients)) == 0

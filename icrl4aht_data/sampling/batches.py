@@ -73,8 +73,8 @@ class Batches(Iterator[B], Generic[B]):
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
         self._closed = False
         self._pool: ThreadPoolExecutor | None = None
-        self._ordered = start
-        self._pending: deque[tuple[Future[B], B | None]] = deque()  # ordered batches with their buffers
+        self._submitted = start
+        self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
         self._free: list[B] = []
         self._lent: B | None = None  # the buffer of the batch that the consumer has
 
@@ -105,25 +105,25 @@ class Batches(Iterator[B], Generic[B]):
             buffer = self._buffer()
             batch = _make(self._sampler, self.next, buffer, self._put)
         else:
-            # One is taken before the last one is ordered, so that `prefetch + 1` buffers are enough.
-            self._order(self.next + self._prefetch)
+            # One is taken off before the last one is submitted, so that `prefetch + 1` buffers are enough.
+            self._submit(self.next + self._prefetch)
             future, buffer = self._pending.popleft()
-            self._order(self.next + self._prefetch + 1)
+            self._submit(self.next + self._prefetch + 1)
             batch = future.result()
         if self._put is None:
             self._lent = buffer
         return batch
 
-    def _order(self, stop: int) -> None:
-        """Have all batches below `stop` made that are not yet ordered."""
+    def _submit(self, stop: int) -> None:
+        """Submit all batches below `stop` that are not yet submitted to the thread."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
-            self._ordered = self.next
+            self._submitted = self.next
         stop = stop if self._stop is None else min(stop, self._stop)
-        for i in range(self._ordered, stop):
+        for i in range(self._submitted, stop):
             buffer = self._buffer()
             self._pending.append((self._pool.submit(_make, self._sampler, i, buffer, self._put), buffer))
-            self._ordered = i + 1
+            self._submitted = i + 1
 
     def _buffer(self) -> B | None:
         """The buffer for one more batch; None for new memory."""

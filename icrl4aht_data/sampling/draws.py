@@ -173,13 +173,16 @@ def _episode_range(episodes: Episodes | None, counts: np.ndarray) -> tuple[np.nd
     Raises:
         OptionError: if the range is malformed, or some history has no episode in it.
     """
+    if episodes is None:
+        return np.zeros_like(counts), counts
     try:
-        if not isinstance(episodes, tuple | None):
+        if not isinstance(episodes, tuple):
             raise TypeError
-        bounds = slice(*(episodes or (None, None)))
+        first, stop = episodes
+        bounds = slice(first, stop)
         distinct, number = np.unique(counts, return_inverse=True)
         first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise OptionError(
             f"episodes = {episodes!r}: expected a pair of integers or None such as (0, 10), (None, 10) or (-10, None)"
         ) from error

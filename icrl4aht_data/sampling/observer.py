@@ -1,4 +1,4 @@
-"""From records to what egos saw, as the selection's `obs` option presents it."""
+"""Rendering of records as the observations that the `obs` option of a selection names."""
 
 from __future__ import annotations
 

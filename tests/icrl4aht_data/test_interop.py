@@ -1,7 +1,8 @@
-"""Other libraries' loaders over our samplers, each with the library itself."""
+"""Loaders of other libraries over samplers, each with the library itself."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows
+from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows, torch_loader
+from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
 
@@ -21,11 +23,10 @@ def sampler(lite):
     return load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=4, length=25, seed=6)
 
 
-class TestPlainLoop:
-    def test_a_loop_ends_after_as_many_steps_as_the_selection_has(self, sampler):
-        batches = list(sampler)
-        assert len(batches) == len(sampler) == 6 * 120 // (4 * 25)
-        assert_equal(batches[3], sampler[3])
+def test_a_plain_loop_ends_after_as_many_steps_as_the_selection_has(sampler):
+    batches = list(sampler)
+    assert len(batches) == len(sampler) == 6 * 120 // (4 * 25)
+    assert_equal(batches[3], sampler[3])
 
 
 class TestGrain:
@@ -59,6 +60,7 @@ class TestGrain:
 
 
 TORCH = """
+import json
 import sys
 import numpy as np
 import torch
@@ -66,38 +68,51 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import torch_loader
 
 if __name__ == "__main__":
-    for cache in ("mmap", "stream"):
+    for cache, kind, workers, context in json.loads(sys.argv[2]):
         dataset = load_icrl4aht(sys.argv[1], layout="demo_wide", obs="float32", cache=cache, threads=2)
-        samplers = dataset.ad(batch_size=4, length=25, seed=6), dataset.dpt(batch_size=4, context=25, seed=6)
-        for sampler in samplers[: 1 if cache == "stream" else 2]:
-            sampler[0]  # what a forked worker inherits has been used: threads, locks, open files
-            for workers, context in ((0, "spawn"), (2, "fork"), (1, "spawn")):
-                loader = torch_loader(sampler, start=1, stop=6, workers=workers, context=context)
-                for epoch in range(2 if context == "fork" else 1):  # workers persist
-                    for i, batch in enumerate(loader, start=1):
-                        for name, array in sampler[i]._asdict().items():
-                            if array is not None:
-                                found = getattr(batch, name)
-                                assert isinstance(found, torch.Tensor)
-                                np.testing.assert_array_equal(found.numpy(), array)
-                    assert i == 5
-                print(cache, type(batch).__name__, workers, context)
+        options = {"batch_size": 4, "seed": 6}
+        sampler = dataset.ad(length=25, **options) if kind == "ad" else dataset.dpt(context=25, **options)
+        sampler[0]  # a forked worker inherits what has been used: threads, locks, open files
+        loader = torch_loader(sampler, start=1, stop=6, workers=workers, context=context)
+        for epoch in range(2 if context == "fork" else 1):  # workers persist
+            for i, batch in enumerate(loader, start=1):
+                assert type(batch) is type(sampler[i])
+                for name, array in sampler[i]._asdict().items():
+                    if array is not None:
+                        found = getattr(batch, name)
+                        assert isinstance(found, torch.Tensor)
+                        np.testing.assert_array_equal(found.numpy(), array)
+            assert i == 5
+        print(cache, kind, workers, context)
 """
 
+COMBINATIONS = [
+    (cache, kind, workers, context)
+    for cache, kind in (("mmap", "ad"), ("mmap", "dpt"), ("stream", "ad"))
+    for workers, context in ((0, "spawn"), (2, "fork"), (1, "spawn"))
+]
 
-def test_pytorch_with_any_workers(lite, tmp_path):
-    """In a process of its own, since a process that has run JAX must not fork."""
+
+@pytest.mark.parametrize(
+    "combinations",
+    [
+        pytest.param([("mmap", "ad", 1, "spawn")], id="one"),
+        pytest.param(COMBINATIONS, id="all", marks=pytest.mark.slow),
+    ],
+)
+def test_pytorch_workers(lite, tmp_path, combinations):
+    """In a separate process, since a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
     run = subprocess.run(
-        [sys.executable, "-W", "error", str(script), str(lite[0])],
+        [sys.executable, "-W", "error", str(script), str(lite[0]), json.dumps(combinations)],
         capture_output=True,
         text=True,
         timeout=300,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert run.returncode == 0, run.stderr
-    assert len(run.stdout.splitlines()) == 9
+    assert len(run.stdout.splitlines()) == len(combinations)
 
 
 class TestHuggingFace:
@@ -137,24 +152,12 @@ class TestHuggingFace:
 @pytest.mark.parametrize(
     ("module", "call", "extra"),
     [
-        ("datasets", lambda s: hf_index(s.dataset), "hf"),
-        ("torch.utils.data", lambda s: _torch(s), "torch"),
-        ("pyarrow", lambda s: _parquet(s), "hf"),
+        ("datasets", lambda sampler: hf_index(sampler.dataset), "hf"),
+        ("torch.utils.data", torch_loader, "torch"),
+        ("pyarrow", lambda sampler: to_parquet(sampler.dataset, Path("never.parquet")), "hf"),
     ],
 )
 def test_a_missing_library_names_its_extra(sampler, monkeypatch, module, call, extra):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(Exception, match=rf"pip install 'icrl4aht-data\[{extra}\]'"):
         call(sampler)
-
-
-def _torch(sampler):
-    from icrl4aht_data.interop import torch_loader
-
-    return torch_loader(sampler)
-
-
-def _parquet(sampler):
-    from icrl4aht_data.writing.parquet import to_parquet
-
-    return to_parquet(sampler.dataset, Path("never.parquet"))

@@ -1,4 +1,4 @@
-"""The index as columns: equal to the lines, kept by content, rebuilt when the content changes, safe to share."""
+"""The index as columns: equal to the lines, cached by content, rebuilt when the content changes, safe to share."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ import pytest
 
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
 from icrl4aht_data.format import columns
-from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.utils import cache
 from tests.helpers.random_play import long_index
@@ -36,7 +37,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache"
 
 
-def kept(folder: Path) -> list[str]:
+def cached(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if not path.name.startswith(".")] if folder.exists() else []
 
 
@@ -47,21 +48,55 @@ def test_entries_are_the_lines(long, folder):
         assert [index.entries[i] for i in range(len(entries))] == entries
         assert index.entries[-1] == entries[-1]
         assert index.entries[5:8] == entries[5:8]
-        assert len(kept(folder)) == 1
+        assert len(cached(folder)) == 1
 
 
-def test_both_ways_of_parsing_agree(long, tmp_path):
-    root, entries = long
-    shutil.copytree(root, tmp_path / "other")
-    path = tmp_path / "other" / "meta" / "histories.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    path.write_text("".join(json.dumps(line, separators=(",", ":"), sort_keys=True) + "\n" for line in lines))
-    assert list(read_index(tmp_path / "other").entries) == entries
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines).rstrip("\n"))
-    assert list(read_index(tmp_path / "other").entries) == entries
+@pytest.fixture
+def rewritten(long, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
+    """Reads the long index after a change of its lines."""
+    shutil.copytree(long[0] / "meta", tmp_path / "meta")
+    path = tmp_path / "meta" / "histories.jsonl"
+    lines = path.read_text().splitlines()
+
+    def read(change: Callable[[list[str]], str]) -> Index:
+        path.write_text(change(lines), newline="")
+        return read_index(tmp_path)
+
+    return read
 
 
-def test_queries_are_what_a_scan_finds(long, folder):
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda lines: "".join(
+            json.dumps(json.loads(line), separators=(",", ":"), sort_keys=True) + "\n" for line in lines
+        ),
+        lambda lines: "\n".join(lines),
+        lambda lines: "".join(f" {line} \r\n" for line in lines),
+    ],
+    ids=["compact", "no last newline", "spaces"],
+)
+def test_lines_may_be_formatted_otherwise(long, rewritten, change):
+    assert list(rewritten(change).entries) == long[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "number"),
+    [
+        (lambda lines: [*lines[:7], "", *lines[7:]], 8),
+        (lambda lines: [*lines[:7], f"{lines[7]} {lines[8]}", *lines[9:]], 8),
+        (lambda lines: [lines[0][:20], f"{lines[0][20:]} {lines[1]}", *lines[2:]], 1),
+        (lambda lines: [*lines[:7], lines[7].replace('"T": ', '"T": 0'), *lines[8:]], 8),
+        (lambda lines: [*lines[:7], lines[7].replace('"score": ', '"score": NaN, "x": '), *lines[8:]], 8),
+    ],
+    ids=["empty", "two on one line", "one on two lines", "leading zero", "not finite"],
+)
+def test_each_line_has_exactly_one_object(rewritten, change, number):
+    with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {number}: "):
+        rewritten(lambda lines: "".join(f"{line}\n" for line in change(lines)))
+
+
+def test_queries_find_what_a_scan_finds(long, folder):
     root, entries = long
     index = read_index(root)
     for wanted in (
@@ -97,7 +132,7 @@ def test_rows_of_a_shard(long):
     assert len(index.entries.shard_rows("data/none.h5")) == 0
 
 
-def test_a_changed_index_is_parsed_anew(tmp_path, folder):
+def test_a_changed_index_is_parsed_again(tmp_path, folder):
     root = tmp_path / "release"
     entries = long_index(root)
     path = root / "meta" / "histories.jsonl"
@@ -108,7 +143,7 @@ def test_a_changed_index_is_parsed_anew(tmp_path, folder):
     path.write_text(changed)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # even if the clock says that nothing happened
     assert read_index(root).entry(9).env_idx != entries[9].env_idx
-    assert len(kept(folder)) == 2
+    assert len(cached(folder)) == 2
 
 
 def test_a_file_is_hashed_once_however_new_it_is(tmp_path, folder, monkeypatch):
@@ -124,7 +159,7 @@ def test_a_file_is_hashed_once_however_new_it_is(tmp_path, folder, monkeypatch):
     ("age", "fraction", "unsettled"),
     [(50, 1, True), (150, 1, False), (150, 0, True), (1900, 0, True), (2100, 0, False)],
 )
-def test_when_a_files_times_tell_of_every_change(monkeypatch, age, fraction, unsettled):
+def test_when_a_files_times_show_every_change(monkeypatch, age, fraction, unsettled):
     """Age in milliseconds; a clock that shows no parts of a millisecond is taken to tick every two seconds."""
     changed = 1_700_000_000 * 10**9 + fraction
     monkeypatch.setattr(cache.time, "time_ns", lambda: changed + age * 10**6)
@@ -135,7 +170,7 @@ def test_when_a_files_times_tell_of_every_change(monkeypatch, age, fraction, uns
 def test_a_damaged_cache_is_rebuilt(long, folder):
     root, entries = long
     read_index(root)
-    (made,) = kept(folder)
+    (made,) = cached(folder)
     (folder / made / "T.npy").write_bytes(b"junk")
     assert read_index(root).entry(2999) == entries[2999]
     shutil.rmtree(folder / made)
@@ -149,7 +184,7 @@ def test_without_a_cache_folder(long, tmp_path, monkeypatch):
     assert read_index(root).entry(2999) == entries[2999]
 
 
-def test_processes_may_build_at_once(long, folder):
+def test_processes_may_build_at_the_same_time(long, folder):
     root, entries = long
     code = (
         "import sys; from pathlib import Path; from icrl4aht_data.format.index import read_index; "
@@ -163,7 +198,7 @@ def test_processes_may_build_at_once(long, folder):
 
     with ThreadPoolExecutor(3) as pool:
         assert set(pool.map(run, range(3))) == {str(entries[7].score)}
-    assert len(kept(folder)) == 1
+    assert len(cached(folder)) == 1
 
 
 @pytest.mark.parametrize("where", [0, 1500, 2999])
@@ -180,15 +215,28 @@ def test_processes_may_build_at_once(long, folder):
         ({"history_id": 5000}, "ids count up"),
     ],
 )
-def test_a_bad_line_of_many_is_named(tmp_path, long, where, change, message):
-    root, _ = long
-    lines = (root / "meta" / "histories.jsonl").read_text().splitlines()
-    lines[where] = json.dumps(json.loads(lines[where]) | change)
-    (tmp_path / "meta").mkdir()
-    shutil.copy(root / "meta" / "info.json", tmp_path / "meta")
-    (tmp_path / "meta" / "histories.jsonl").write_text("\n".join(lines) + "\n")
+def test_a_bad_line_of_many_is_named(rewritten, where, change, message):
+    def spoil(lines: list[str]) -> str:
+        bad = json.dumps(json.loads(lines[where]) | change)
+        return "".join(f"{line}\n" for line in [*lines[:where], bad, *lines[where + 1 :]])
+
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {where + 1}: .*({message})"):
-        read_index(tmp_path)
+        rewritten(spoil)
+
+
+def test_default_folders_follow_the_environment(monkeypatch):
+    for name in ("ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", "/home/someone")
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert cache.cache_folder() == Path("/home/someone/.cache/icrl4aht")
+    assert cache.data_folder() == Path("/home/someone/.local/share/icrl4aht")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/x")
+    monkeypatch.setenv("XDG_DATA_HOME", "/y")
+    assert (cache.cache_folder(), cache.data_folder()) == (Path("/x/icrl4aht"), Path("/y/icrl4aht"))
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", "~/own")
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", "/data")
+    assert (cache.cache_folder(), cache.data_folder()) == (Path("/home/someone/own"), Path("/data"))
 
 
 def test_the_least_used_arrays_make_room(folder, monkeypatch):
@@ -200,7 +248,7 @@ def test_the_least_used_arrays_make_room(folder, monkeypatch):
         cache.cached_arrays(key, 1128, build)
     held = cache.cached_arrays("one", 1128, build)["a"]
     cache.cached_arrays("four", 1128, build)
-    assert sorted(kept(folder)) == ["four", "one", "three"]
+    assert sorted(cached(folder)) == ["four", "one", "three"]
     assert held.sum() == 0
     with pytest.raises(cache.OptionError, match="raise ICRL4AHT_CACHE_BYTES"):
         cache.cached_arrays("huge", 4000, build)

@@ -1,4 +1,4 @@
-"""The published test tasks: their ids come out of the parameter tables, and the bundled manifests are these."""
+"""The published test tasks: ids made from the parameters, and bundled manifests that equal them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ cramped_room_down utility_greedy 187d848e ed1fd3ea 4016d5da 610b126b c35fde55
 """layout, family, and the last eight digits of the ids of t0..t4, as the published manifests have them."""
 
 
-def test_all_160_published_ids_come_out():
+def test_the_ids_are_the_160_published_ones():
     expected = []
     for line in PUBLISHED_HASHES.split("\n")[1:-1]:
         layout, family, *hashes = line.split()
@@ -61,7 +61,7 @@ def test_all_160_published_ids_come_out():
 
 
 @pytest.mark.parametrize("track", TRACKS)
-def test_bundled_manifests_are_the_tables(track):
+def test_bundled_manifests_are_the_published_tasks(track):
     assert read_tasks(manifest_path(track, "test")) == published_tasks(track)
 
 

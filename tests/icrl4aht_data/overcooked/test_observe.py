@@ -1,4 +1,4 @@
-"""What agents see, in hand-drawn scenes; the layouts' table; the state record's columns and faults.
+"""Observations in hand-drawn scenes; layouts; the state record's columns and faults.
 
 Most scenes are in cramped_up:
 
@@ -27,7 +27,7 @@ CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_r
 PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
 RECIPE_000, RECIPE_111 = 3 * ZERO, 3 * ONE
 
-TABLE = {  # name: (alias, width, height, n, C), the specification's
+SPECIFIED = {  # name: (alias, width, height, n, C), from the specification
     "coord_simple": ("grounded_coord_simple", 8, 5, 3, 40),
     "coord_ring": ("grounded_coord_ring", 9, 9, 3, 40),
     "test_simple": ("test_time_simple", 8, 5, 3, 41),
@@ -63,8 +63,8 @@ def channel_names(n: int, delivery: bool) -> list[str]:
 
 
 def seen(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
-    """Channel -> map cell (x, y) -> value, of everything that is not 0; channels without any are left out."""
-    _, _, _, n, channels = TABLE[layout.name]
+    """Channel -> map cell (x, y) -> value, for all values that are not 0."""
+    _, _, _, n, channels = SPECIFIED[layout.name]
     names = channel_names(n, layout.name in ("test_simple", "test_wide"))
     assert len(names) == channels
     view = observe(layout, record, agent)[0]
@@ -89,24 +89,24 @@ def at(value: int, *cells: tuple[int, int]) -> Cells:
 # Layouts
 
 
-def test_the_layouts_are_those_of_the_table():
-    assert list(LAYOUTS) == list(TABLE)
+def test_layouts_are_those_of_the_specification():
+    assert list(LAYOUTS) == list(SPECIFIED)
 
 
 @each_layout
-def test_sizes_and_channels_are_those_of_the_table(layout):
+def test_sizes_and_channels_are_those_of_the_specification(layout):
     found = (layout.alias, layout.width, layout.height, layout.ingredient_types, layout.channels)
-    assert found == TABLE[layout.name]
+    assert found == SPECIFIED[layout.name]
     records = random_records(layout, 7, np.random.default_rng(0))
     for observed, shape in ((observe(layout, records, 1), (7,)), (observe_both(layout, records), (7, 2))):
-        assert observed.shape == (*shape, 5, 5, TABLE[layout.name][-1])
+        assert observed.shape == (*shape, 5, 5, SPECIFIED[layout.name][-1])
         assert observed.dtype == np.uint8
 
 
 @each_layout
 def test_layouts_are_found_by_name_and_by_alias(layout):
     assert get_layout(layout.name) is layout
-    assert get_layout(TABLE[layout.name][0]) is layout
+    assert get_layout(SPECIFIED[layout.name][0]) is layout
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
     with pytest.raises(UnknownNameError, match=f"unknown layout '{wrong}'.*mean '{nearest}'") as error:
         get_layout(wrong)
     listed = str(error.value).split("valid: ")[1].split(".")[0].split(", ")
-    assert set(listed) == {*TABLE, *(alias for alias, *_ in TABLE.values())}
+    assert set(listed) == {*SPECIFIED, *(alias for alias, *_ in SPECIFIED.values())}
 
 
 def test_an_unknown_layout_like_no_other_gets_no_hint():
@@ -163,10 +163,10 @@ def test_values_are_0_to_19_in_every_state_that_a_step_leads_to(layout):
     observed = observe_both(layout, after.state)
     assert observed.max() == 19
     timer = channel_names(layout.ingredient_types, layout.indicates_delivery).index("pot timer")
-    assert np.delete(observed, timer, axis=-1).max() == 3  # of all else, the counts are the largest
+    assert np.delete(observed, timer, axis=-1).max() == 3  # the largest other values are counts
 
 
-def test_a_whole_scene_seen_by_the_ego():
+def test_a_complete_scene_seen_by_the_ego():
     """Every channel that is not 0; from (1, 1) the window reaches x = -1..3, y = -1..3."""
     record = scene(
         CRAMPED,
@@ -328,20 +328,20 @@ def test_a_pots_content_and_timer(timer):
 
 
 @pytest.mark.parametrize(
-    ("layout", "goal", "places", "deliverer"),
+    ("layout", "goal", "poses", "deliverer"),
     [(SIMPLE, (7, 2), [(1, 1, "up"), (6, 2, "right")], 1), (WIDE, (2, 0), [(2, 1, "up"), (2, 4, "up")], 0)],
 )
-def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, places, deliverer):
+def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, deliverer):
     hands, actions = [0, 0], [STAY, STAY]
     hands[deliverer], actions[deliverer] = RECIPE_000 + PLATE + COOKED, INTERACT
-    record = scene(layout, *places, hands=hands)
-    brings = np.array([RECIPE_111], np.uint8)
+    record = scene(layout, *poses, hands=hands)
+    next_recipe = np.array([RECIPE_111], np.uint8)
     assert "delivery" not in seen(layout, record, deliverer)
-    after = rules.step(layout, record, np.array([actions]), brings)
+    after = rules.step(layout, record, np.array([actions]), next_recipe)
     assert after.reward == 20
     assert seen(layout, after.state, deliverer)["delivery"] == at(1, goal)
     assert "delivery" not in seen(layout, after.state, 1 - deliverer)  # the goal is not in this window
-    later = rules.step(layout, after.state, np.array([[STAY, STAY]]), brings)
+    later = rules.step(layout, after.state, np.array([[STAY, STAY]]), next_recipe)
     assert "delivery" not in seen(layout, later.state, deliverer)
 
 
@@ -426,7 +426,7 @@ def test_possible_states_have_no_faults(layout):
         ("an impossible item in hand", {"hands": [COOKED + RECIPE_000, 0]}),
         ("an impossible item in hand", {"hands": [PLATE + COOKED, 0]}),
         ("an impossible item in hand", {"hands": [PLATE + COOKED + 2 * ZERO, 0]}),
-        ("an impossible item in hand", {"hands": [0, 64]}),  # a third type, which the layout has not
+        ("an impossible item in hand", {"hands": [0, 64]}),  # a third type, which the layout does not have
         ("an impossible item on a counter", {"counters": {(1, 0): 2 * ONE}}),
         ("an impossible item on a counter", {"counters": {(2, 3): COOKED + RECIPE_111}}),
         ("an impossible item in a pot", {"pot_items": [PLATE]}),
@@ -439,13 +439,13 @@ def test_possible_states_have_no_faults(layout):
         ("an impossible recipe", {"recipe": 64 * 3}),
         ("a delivery flag that is not 0 or 1", {"delivered": 2}),
         ("a pot timer above its limit", {"pot_items": [RECIPE_000], "pot_timers": [21]}),
-        ("a pot that does not cook exactly while it holds three raw ingredients", {"pot_items": [RECIPE_000]}),
+        ("a pot that does not cook exactly while it contains three raw ingredients", {"pot_items": [RECIPE_000]}),
         (
-            "a pot that does not cook exactly while it holds three raw ingredients",
+            "a pot that does not cook exactly while it contains three raw ingredients",
             {"pot_items": [8], "pot_timers": [5]},
         ),
         (
-            "a pot that does not cook exactly while it holds three raw ingredients",
+            "a pot that does not cook exactly while it contains three raw ingredients",
             {"pot_items": [COOKED + RECIPE_000], "pot_timers": [5]},
         ),
     ],

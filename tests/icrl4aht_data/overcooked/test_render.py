@@ -1,4 +1,4 @@
-"""Pictures of states: each thing that a person must see changes the pixels where it stands, and nowhere else."""
+"""Pictures of states: every visible thing changes the pixels of its own cell, and no others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl4aht_data.overcooked.state import columns
 from tests.helpers.scenes import random_records, scene
 
 CELL = 32
-COORD = LAYOUTS["coord_simple"]  # it has all there is: a pot, a button, an indicator, three ingredients
+COORD = LAYOUTS["coord_simple"]  # it has everything: a pot, a button, an indicator, three ingredients
 ONION, TOMATO = COORD.recipe_items.tolist()[0] // 3, COORD.recipe_items.tolist()[1] // 3
 DISH = 3 * ONION | PLATE | COOKED
 
@@ -117,10 +117,10 @@ def test_the_recipe_shows_on_the_indicator_in_the_footer_and_on_a_lit_button():
         assert np.any(first[footer:] != second[footer:])
 
 
-def test_items_lie_on_counters_and_each_kind_looks_different():
+def test_items_show_on_counters_and_each_kind_looks_different():
     cell = COORD.counters[0]
-    place = (cell % COORD.width, cell // COORD.width)
-    frames = [frame_of(counters={place: item}) for item in (0, PLATE, ONION, TOMATO, DISH)]
+    position = (cell % COORD.width, cell // COORD.width)
+    frames = [frame_of(counters={position: item}) for item in (0, PLATE, ONION, TOMATO, DISH)]
     assert len({frame.tobytes() for frame in frames}) == len(frames)
     assert all(changed_cells(frames[0], frame) == {cell} for frame in frames[1:])
 
@@ -141,14 +141,14 @@ def test_a_delivery_lights_the_hatch():
     assert changed_cells(frame_of(delivered=0), frame_of(delivered=1)) == goals
 
 
-def test_walls_that_no_chef_can_face_are_plain_and_counters_are_not():
+def test_walls_that_no_agent_can_face_are_plain_and_counters_are_not():
     frame = frame_of()
     plain = {cell for cell in range(COORD.cells) if np.ptp(cell_pixels(frame, COORD, cell), axis=(0, 1)).max() == 0}
     walls = set((COORD.kinds == WALL).nonzero()[0].tolist())
     assert plain & walls == walls - set(COORD.counters)
 
 
-def test_the_view_is_outlined_only_when_asked():
+def test_the_view_is_outlined_only_on_request():
     layout = LAYOUTS["coord_ring"]
     record = scene(layout, (4, 3, "up"), (1, 1, "up"))[0]
     with_view, without = (draw_frame(layout, record, cell=CELL, view=view).astype(int) for view in (True, False))

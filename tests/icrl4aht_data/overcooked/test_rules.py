@@ -31,8 +31,8 @@ RECIPE_000, RECIPE_001, RECIPE_111 = 3 * ZERO, 2 * ZERO + ONE, 3 * ONE
 SOUP_000, SOUP_001, SOUP_111 = (recipe + COOKED for recipe in (RECIPE_000, RECIPE_001, RECIPE_111))
 DISH_000, DISH_001, DISH_111 = (soup + PLATE for soup in (SOUP_000, SOUP_001, SOUP_111))
 
-Place = tuple[int, int, str]
-ASIDE: Place = (2, 2, "down")
+Pose = tuple[int, int, str]
+ASIDE: Pose = (2, 2, "down")
 AT_POT, AT_COUNTER, AT_PILE_0, AT_PILE_1 = (2, 1, "up"), (1, 1, "up"), (1, 1, "left"), (3, 1, "right")
 AT_PLATES, AT_GOAL, AT_INDICATOR = (1, 2, "down"), (3, 2, "down"), (3, 2, "right")
 COUNTER = (1, 0)
@@ -44,7 +44,7 @@ class Seen(NamedTuple):
     """One state in plain Python, and the rewards of the step that led to it."""
 
     record: np.ndarray
-    places: list[Place]
+    poses: list[Pose]
     hands: list[int]
     recipe: int
     delivered: int
@@ -55,42 +55,48 @@ class Seen(NamedTuple):
     shaped: list[float]
 
 
-def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, brings: int = RECIPE_111) -> Seen:
-    """One step of the scene; `brings` is the recipe that a correct delivery leads to."""
-    after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([brings], np.uint8))
+def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Seen:
+    """One step of the scene; a correct delivery leads to `next_recipe`."""
+    after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([next_recipe], np.uint8))
     state = unpack(layout, after.state)
     xy = [(int(cell) % layout.width, int(cell) // layout.width) for cell in state.positions[0]]
-    lying = zip(layout.counters, state.counters[0].tolist(), strict=True)
+    items = zip(layout.counters, state.counters[0].tolist(), strict=True)
     return Seen(
         record=after.state,
-        places=[(x, y, FACINGS[facing]) for (x, y), facing in zip(xy, state.facings[0], strict=True)],
+        poses=[(x, y, FACINGS[facing]) for (x, y), facing in zip(xy, state.facings[0], strict=True)],
         hands=state.hands[0].tolist(),
         recipe=int(state.recipe[0]),
         delivered=int(state.delivered[0]),
         pots=list(zip(state.pot_items[0].tolist(), state.pot_timers[0].tolist(), strict=True)),
         buttons=state.buttons[0].tolist(),
-        counters={(cell % layout.width, cell // layout.width): item for cell, item in lying if item},
+        counters={(cell % layout.width, cell // layout.width): item for cell, item in items if item},
         reward=float(after.reward[0]),
         shaped=after.shaped[0].tolist(),
     )
 
 
 @pytest.fixture(params=[0, 1], ids=["ego", "teammate"])
-def seat(request: pytest.FixtureRequest) -> int:
+def slot(request: pytest.FixtureRequest) -> int:
     return request.param
 
 
-def solo(seat: int, at: Place, hand: int = 0, layout: Layout = CRAMPED, aside: Place = ASIDE, **fields) -> np.ndarray:
-    """A scene where the agent of that seat stands `at` with `hand`, the other one aside with nothing."""
-    if seat == 0:
+def solo(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
+    """A scene with the agent of that slot at pose `at` with an item in hand, the other one aside with none."""
+    if slot == 0:
         return scene(layout, at, aside, hands=[hand, 0], **fields)
     return scene(layout, aside, at, hands=[0, hand], **fields)
 
 
-def interact(seat: int, record: np.ndarray, layout: Layout = CRAMPED, brings: int = RECIPE_111) -> Seen:
-    """The agent of that seat interacts, the other one stays."""
-    ego, teammate = (INTERACT, STAY) if seat == 0 else (STAY, INTERACT)
-    return act(layout, record, ego, teammate, brings)
+def act_alone(
+    slot: int, record: np.ndarray, action: int, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111
+) -> Seen:
+    """One step in which the agent of that slot acts and the other one stays."""
+    ego, teammate = (action, STAY) if slot == 0 else (STAY, action)
+    return act(layout, record, ego, teammate, next_recipe)
+
+
+def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Seen:
+    return act_alone(slot, record, INTERACT, layout, next_recipe)
 
 
 # Moving
@@ -102,27 +108,27 @@ def test_action_ids_are_in_the_papers_order():
 
 
 @pytest.mark.parametrize(("action", "x", "y"), [(UP, 2, 1), (DOWN, 2, 3), (LEFT, 1, 2), (RIGHT, 3, 2)])
-def test_a_direction_turns_and_advances(seat, action, x, y):
-    record = solo(seat, (2, 2, "up"), layout=DEMO, aside=(8, 2, "left"))
-    after = act(DEMO, record, *((action, STAY) if seat == 0 else (STAY, action)))
-    assert (after.places[seat], after.places[1 - seat]) == ((x, y, ACTIONS[action]), (8, 2, "left"))
+def test_a_direction_turns_and_advances(slot, action, x, y):
+    record = solo(slot, (2, 2, "up"), layout=DEMO, aside=(8, 2, "left"))
+    after = act_alone(slot, record, action, DEMO)
+    assert (after.poses[slot], after.poses[1 - slot]) == ((x, y, ACTIONS[action]), (8, 2, "left"))
     assert (after.reward, after.shaped) == (0, [0, 0])
 
 
 @pytest.mark.parametrize("at", [AT_COUNTER, AT_PILE_0, AT_PILE_1, AT_POT, AT_PLATES, AT_GOAL, AT_INDICATOR])
-def test_an_agent_turns_in_place_before_anything_but_floor(seat, at):
+def test_an_agent_only_turns_before_anything_but_floor(slot, at):
     x, y, facing = at
-    record = solo(seat, (x, y, "up" if facing != "up" else "down"))
+    record = solo(slot, (x, y, "up" if facing != "up" else "down"))
     action = ACTIONS.index(facing)
-    after = act(CRAMPED, record, *((action, STAY) if seat == 0 else (STAY, action)))
-    assert after.places[seat] == at
+    after = act_alone(slot, record, action)
+    assert after.poses[slot] == at
 
 
 @pytest.mark.parametrize("action", [STAY, INTERACT])
 def test_stay_and_interact_neither_turn_nor_move(action):
     for facing in FACINGS:
         after = act(CRAMPED, scene(CRAMPED, (2, 2, facing), (3, 1, "left")), action)
-        assert after.places == [(2, 2, facing), (3, 1, "left")]
+        assert after.poses == [(2, 2, facing), (3, 1, "left")]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +137,7 @@ def test_stay_and_interact_neither_turn_nor_move(action):
         # both want one free cell
         ([(1, 1), (3, 1)], (RIGHT, LEFT), [(1, 1), (3, 1)]),
         ([(2, 1), (1, 2)], (LEFT, UP), [(2, 1), (1, 2)]),
-        # one walks into the other, who stands, interacts, or walks against the wall
+        # one walks into the other, who stays, interacts, or walks against the wall
         ([(2, 1), (3, 1)], (RIGHT, STAY), [(2, 1), (3, 1)]),
         ([(3, 1), (2, 1)], (INTERACT, RIGHT), [(3, 1), (2, 1)]),
         ([(2, 1), (3, 1)], (RIGHT, UP), [(2, 1), (3, 1)]),
@@ -147,7 +153,7 @@ def test_agents_in_each_others_way(cells, actions, moved):
     ego, teammate = ((x, y, "up") for x, y in cells)
     after = act(CRAMPED, scene(CRAMPED, ego, teammate), *actions)
     facings = [ACTIONS[action] if action in DELTA else "up" for action in actions]
-    assert after.places == [(x, y, facing) for (x, y), facing in zip(moved, facings, strict=True)]
+    assert after.poses == [(x, y, facing) for (x, y), facing in zip(moved, facings, strict=True)]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -182,7 +188,7 @@ FULL_HANDS = (PLATE, ZERO, ONE, DISH_000)
 WITHOUT_EFFECT = {
     "full hands at a pile": [(at, hand, {}) for at in (AT_PILE_0, AT_PILE_1, AT_PLATES) for hand in FULL_HANDS],
     "full hands at a full counter": [
-        (AT_COUNTER, hand, {"counters": {COUNTER: lies}}) for hand in FULL_HANDS for lies in FULL_HANDS
+        (AT_COUNTER, hand, {"counters": {COUNTER: item}}) for hand in FULL_HANDS for item in FULL_HANDS
     ],
     "empty hands at an empty counter": [(AT_COUNTER, 0, {"counters": {(3, 0): ZERO}})],
     "no plate at cooked soup": [(AT_POT, hand, {"pot_items": [SOUP_000]}) for hand in (0, ZERO, ONE, DISH_000)],
@@ -195,58 +201,58 @@ WITHOUT_EFFECT = {
 
 
 @pytest.mark.parametrize("what", WITHOUT_EFFECT)
-def test_interactions_without_effect_leave_the_state_as_it_is(seat, what):
+def test_interactions_without_effect_leave_the_state_as_it_is(slot, what):
     for at, hand, fields in WITHOUT_EFFECT[what]:
-        record = solo(seat, at, hand, **fields)
-        after = interact(seat, record)
+        record = solo(slot, at, hand, **fields)
+        after = interact(slot, record)
         np.testing.assert_array_equal(after.record, record, err_msg=f"{hand=}, {fields}")
         assert (after.reward, after.shaped) == (0, [0, 0])
 
 
 @pytest.mark.parametrize(("at", "item"), [(AT_PILE_0, ZERO), (AT_PILE_1, ONE), (AT_PLATES, PLATE)])
-def test_piles_give_without_end(seat, at, item):
-    record = solo(seat, at)
+def test_piles_are_endless(slot, at, item):
+    record = solo(slot, at)
     hands = columns(CRAMPED).hands
     for _ in range(5):
-        after = interact(seat, record)
-        assert (after.hands[seat], after.hands[1 - seat]) == (item, 0)
+        after = interact(slot, record)
+        assert (after.hands[slot], after.hands[1 - slot]) == (item, 0)
         after.record[:, hands] = 0
         np.testing.assert_array_equal(after.record, record)  # nothing else changed
         record = after.record
 
 
 @pytest.mark.parametrize("item", [PLATE, ZERO, ONE, DISH_000, DISH_111])
-def test_a_counter_takes_one_item_and_gives_it_back(seat, item):
-    down = interact(seat, solo(seat, AT_COUNTER, item))
+def test_a_counter_takes_one_item_and_gives_it_back(slot, item):
+    down = interact(slot, solo(slot, AT_COUNTER, item))
     assert (down.hands, down.counters, down.reward, down.shaped) == ([0, 0], {COUNTER: item}, 0, [0, 0])
-    up = interact(seat, down.record)  # not even the recipe's dish pays when it comes off a counter
-    assert (up.hands[seat], up.counters, up.reward, up.shaped) == (item, {}, 0, [0, 0])
+    up = interact(slot, down.record)  # not even the recipe's dish pays when it comes off a counter
+    assert (up.hands[slot], up.counters, up.reward, up.shaped) == (item, {}, 0, [0, 0])
 
 
 # Pots
 
 
-def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(seat):
-    record = solo(seat, AT_POT, ZERO)
+def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(slot):
+    record = solo(slot, AT_POT, ZERO)
     for content in (ZERO, 2 * ZERO):
-        after = interact(seat, record)
+        after = interact(slot, record)
         assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
         assert act(CRAMPED, after.record, STAY).pots == [(content, 0)]  # two do not cook
         record = after.record.copy()
-        record[:, columns(CRAMPED).hands.start + seat] = ZERO
-    after = interact(seat, record)
+        record[:, columns(CRAMPED).hands.start + slot] = ZERO
+    after = interact(slot, record)
     timeline = []
     for _ in range(21):
-        timeline.append((*after.pots[0], int(observe(CRAMPED, after.record, seat)[0, 1, 2, -1])))
+        timeline.append((*after.pots[0], int(observe(CRAMPED, after.record, slot)[0, 1, 2, -1])))
         after = act(CRAMPED, after.record, STAY)
     cooking = [(RECIPE_000, timer, timer) for timer in range(19, 0, -1)]
     assert timeline == [*cooking, (SOUP_000, 0, 0), (SOUP_000, 0, 0)]
 
 
 @pytest.mark.parametrize("content", [RECIPE_001, ZERO + 2 * ONE])
-def test_wrong_mixes_cook_too(seat, content):
+def test_wrong_mixes_cook_too(slot, content):
     assert content not in CRAMPED.recipe_items
-    after = interact(seat, solo(seat, AT_POT, ONE, pot_items=[content - ONE]))
+    after = interact(slot, solo(slot, AT_POT, ONE, pot_items=[content - ONE]))
     assert after.pots == [(content, 19)]
     for _ in range(19):
         assert after.pots[0][0] == content
@@ -263,40 +269,40 @@ def test_pots_that_cook_tick_and_others_do_not():
 
 @pytest.mark.parametrize(("content", "timer"), [(RECIPE_000, 9), (RECIPE_000, 1), (SOUP_000, 0), (SOUP_111, 0)])
 @pytest.mark.parametrize("hand", [ZERO, ONE])
-def test_a_pot_takes_no_fourth_ingredient(seat, hand, content, timer):
-    record = solo(seat, AT_POT, hand, pot_items=[content], pot_timers=[timer])
-    after = interact(seat, record)
-    assert (after.hands[seat], after.shaped) == (hand, [0, 0])
+def test_a_pot_takes_no_fourth_ingredient(slot, hand, content, timer):
+    record = solo(slot, AT_POT, hand, pot_items=[content], pot_timers=[timer])
+    after = interact(slot, record)
+    assert (after.hands[slot], after.shaped) == (hand, [0, 0])
     np.testing.assert_array_equal(after.record, act(CRAMPED, record, STAY).record)
 
 
-def test_a_plate_takes_the_soup_and_empties_the_pot(seat):
-    after = interact(seat, solo(seat, AT_POT, PLATE, pot_items=[SOUP_001]))
-    assert (after.hands[seat], after.pots) == (DISH_001, [(0, 0)])
+def test_a_plate_takes_the_soup_and_empties_the_pot(slot):
+    after = interact(slot, solo(slot, AT_POT, PLATE, pot_items=[SOUP_001]))
+    assert (after.hands[slot], after.pots) == (DISH_001, [(0, 0)])
 
 
 @pytest.mark.parametrize("hand", [0, PLATE, DISH_000])
-def test_nothing_leaves_a_cooking_pot(seat, hand):
-    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[RECIPE_000], pot_timers=[1]))
-    assert after.hands[seat] == hand  # it is cooked only at the end of this step
+def test_nothing_leaves_a_cooking_pot(slot, hand):
+    after = interact(slot, solo(slot, AT_POT, hand, pot_items=[RECIPE_000], pot_timers=[1]))
+    assert after.hands[slot] == hand  # it is cooked only at the end of this step
     assert after.pots == [(SOUP_000, 0)]
 
 
 # Deliveries
 
 
-@pytest.mark.parametrize("brings", [RECIPE_000, RECIPE_111])
-def test_a_correct_delivery_pays_20_and_brings_the_next_recipe(seat, brings):
-    after = interact(seat, solo(seat, AT_GOAL, DISH_000, recipe=RECIPE_000), brings=brings)
+@pytest.mark.parametrize("next_recipe", [RECIPE_000, RECIPE_111])
+def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
+    after = interact(slot, solo(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
     assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
-    assert (after.recipe, after.delivered) == (brings, 1)  # it may be the same again
-    later = act(CRAMPED, after.record, STAY, brings=RECIPE_001)
-    assert (later.delivered, later.recipe, later.reward) == (0, brings, 0)
+    assert (after.recipe, after.delivered) == (next_recipe, 1)  # it may be the same again
+    later = act(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
+    assert (later.delivered, later.recipe, later.reward) == (0, next_recipe, 0)
 
 
 @pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
-def test_a_wrong_delivery_costs_20_and_the_recipe_stays(seat, recipe, dish):
-    after = interact(seat, solo(seat, AT_GOAL, dish, recipe=recipe), brings=RECIPE_001)
+def test_a_wrong_delivery_costs_20_and_the_recipe_stays(slot, recipe, dish):
+    after = interact(slot, solo(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
     assert (after.reward, after.shaped, after.hands) == (-20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (recipe, 0)
 
@@ -312,7 +318,7 @@ def test_a_wrong_delivery_costs_20_and_the_recipe_stays(seat, recipe, dish):
 )
 def test_two_deliveries_in_one_step_both_count(dishes, reward):
     record = scene(ASYMM, (3, 2, "up"), (7, 1, "right"), hands=dishes, recipe=RECIPE_000)
-    after = act(ASYMM, record, INTERACT, INTERACT, brings=RECIPE_111)
+    after = act(ASYMM, record, INTERACT, INTERACT, next_recipe=RECIPE_111)
     assert (after.reward, after.hands) == (reward, [0, 0])
     assert (after.recipe, after.delivered) == ((RECIPE_111, 1) if DISH_000 in dishes else (RECIPE_000, 0))
 
@@ -323,36 +329,36 @@ AT_BUTTON = ((4, 1, "down"), (4, 3, "up"))
 FAR = ((1, 4, "up"), (3, 5, "up"))
 
 
-def ring(seat: int, hand: int = 0, **fields) -> np.ndarray:
-    return solo(seat, AT_BUTTON[seat], hand, layout=RING, aside=FAR[1 - seat], **fields)
+def ring(slot: int, hand: int = 0, **fields) -> np.ndarray:
+    return solo(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
 
 
-def test_a_press_costs_5_and_lights_one_button_for_9_observations(seat):
-    record = ring(seat, recipe=RECIPE_000)
-    row = 3 if seat == 0 else 1
+def test_a_press_costs_5_and_lights_one_button_for_9_observations(slot):
+    record = ring(slot, recipe=RECIPE_000)
+    row = 3 if slot == 0 else 1
     recipe_channel = 2 * 10 + 6 + 3 + 5 + 2  # count of ingredient 0 in the recipe, n = 3
-    after = interact(seat, record, RING)
+    after = interact(slot, record, RING)
     assert (after.reward, after.shaped, after.hands) == (-5, [0, 0], [0, 0])
     timers, visible = [], []
     for _ in range(11):
         timers.append(after.buttons)
-        visible.append(int(observe(RING, after.record, seat)[0, row, 2, recipe_channel]))
+        visible.append(int(observe(RING, after.record, slot)[0, row, 2, recipe_channel]))
         after = act(RING, after.record, STAY)
         assert after.reward == 0
     assert timers == [[timer, 0] for timer in (9, 8, 7, 6, 5, 4, 3, 2, 1, 0, 0)]
     assert visible == [3] * 9 + [0, 0]
 
 
-def test_a_press_while_lit_costs_again_and_lights_anew(seat):
-    after = interact(seat, ring(seat, buttons=[4, 7]), RING)
+def test_a_press_while_lit_costs_again_and_lights_for_the_full_time(slot):
+    after = interact(slot, ring(slot, buttons=[4, 7]), RING)
     assert (after.reward, after.buttons) == (-5, [9, 6])
 
 
 @pytest.mark.parametrize("hand", [PLATE, ZERO, DISH_000])
 @pytest.mark.parametrize("lit", [0, 4])
-def test_full_hands_press_no_button(seat, hand, lit):
-    after = interact(seat, ring(seat, hand, buttons=[lit, 0]), RING)
-    assert (after.reward, after.hands[seat], after.buttons) == (0, hand, [max(lit - 1, 0), 0])
+def test_full_hands_press_no_button(slot, hand, lit):
+    after = interact(slot, ring(slot, hand, buttons=[lit, 0]), RING)
+    assert (after.reward, after.hands[slot], after.buttons) == (0, hand, [max(lit - 1, 0), 0])
 
 
 def test_what_both_agents_earn_in_one_step_adds_up():
@@ -367,20 +373,20 @@ def test_what_both_agents_earn_in_one_step_adds_up():
 
 
 @pytest.mark.parametrize(
-    ("hands", "lies", "hands_after", "lies_after"),
+    ("hands", "item", "hands_after", "counter_after"),
     [
         ([ZERO, 0], 0, [0, ZERO], 0),  # the ego puts down what the teammate takes
         ([0, ZERO], 0, [0, 0], ZERO),  # the ego comes too early
-        ([ZERO, ONE], 0, [0, ONE], ZERO),  # the ego's item lies, the teammate keeps its own
+        ([ZERO, ONE], 0, [0, ONE], ZERO),  # the ego's item is put down, the teammate keeps its own
         ([0, 0], ONE, [ONE, 0], 0),  # the ego takes it
         ([0, ZERO], ONE, [ONE, 0], ZERO),  # the ego makes room for the teammate's
         ([ZERO, 0], ONE, [ZERO, ONE], 0),  # the ego cannot, the teammate takes it
     ],
 )
-def test_agent_0_interacts_first_on_a_shared_counter(hands, lies, hands_after, lies_after):
-    record = scene(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): lies})
+def test_agent_0_interacts_first_on_a_shared_counter(hands, item, hands_after, counter_after):
+    record = scene(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): item})
     after = act(RING, record, INTERACT, INTERACT)
-    assert (after.hands, after.counters) == (hands_after, {(3, 2): lies_after} if lies_after else {})
+    assert (after.hands, after.counters) == (hands_after, {(3, 2): counter_after} if counter_after else {})
 
 
 @pytest.mark.parametrize(
@@ -403,8 +409,8 @@ def test_agent_0_interacts_first_on_a_shared_pot(hands, pot, hands_after, pot_af
 # Shaped rewards: each agent's own, apart from the team's
 
 
-def own(seat: int, value: float) -> list[float]:
-    return [value, 0] if seat == 0 else [0, value]
+def own(slot: int, value: float) -> list[float]:
+    return [value, 0] if slot == 0 else [0, value]
 
 
 @pytest.mark.parametrize(
@@ -421,18 +427,18 @@ def own(seat: int, value: float) -> list[float]:
         (ONE, ONE, RECIPE_001, 0),
     ],
 )
-def test_placing_an_ingredient_pays_3_if_the_recipe_still_needs_it(seat, hand, content, recipe, reward):
-    after = interact(seat, solo(seat, AT_POT, hand, pot_items=[content], recipe=recipe))
+def test_placing_an_ingredient_pays_3_if_the_recipe_still_needs_it(slot, hand, content, recipe, reward):
+    after = interact(slot, solo(slot, AT_POT, hand, pot_items=[content], recipe=recipe))
     assert (after.pots[0][0], after.reward) == (content + hand, 0)
-    assert after.shaped == own(seat, reward)
+    assert after.shaped == own(slot, reward)
 
 
 @pytest.mark.parametrize("soup", [SOUP_000, SOUP_001, SOUP_111])
 @pytest.mark.parametrize("recipe", [RECIPE_000, RECIPE_001, RECIPE_111])
-def test_taking_a_dish_out_of_a_pot_pays_5_if_it_is_the_recipes(seat, soup, recipe):
-    after = interact(seat, solo(seat, AT_POT, PLATE, pot_items=[soup], recipe=recipe))
-    assert (after.hands[seat], after.reward) == (soup + PLATE, 0)
-    assert after.shaped == own(seat, 5 if soup == recipe + COOKED else 0)
+def test_taking_a_dish_out_of_a_pot_pays_5_if_it_is_the_recipes(slot, soup, recipe):
+    after = interact(slot, solo(slot, AT_POT, PLATE, pot_items=[soup], recipe=recipe))
+    assert (after.hands[slot], after.reward) == (soup + PLATE, 0)
+    assert after.shaped == own(slot, 5 if soup == recipe + COOKED else 0)
 
 
 # Plates in asymm_both: two pots, (4, 2) and (4, 3); piles of plates at (3, 4) and (5, 4)
@@ -455,20 +461,20 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
         ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # neither is a plate
     ],
 )
-def test_taking_a_plate_pays_3_if_it_is_needed(seat, pots, other_hand, counters, reward):
-    places, hands = list(AWAY), [other_hand, other_hand]
-    places[seat], hands[seat] = AT_PLATES_ASYMM[seat], 0
-    record = scene(ASYMM, places[0], places[1], hands=hands, pot_items=pots, counters=counters)
-    after = interact(seat, record, ASYMM)
-    assert (after.hands[seat], after.reward) == (PLATE, 0)
-    assert after.shaped == own(seat, reward)
+def test_taking_a_plate_pays_3_if_it_is_needed(slot, pots, other_hand, counters, reward):
+    poses, hands = list(AWAY), [other_hand, other_hand]
+    poses[slot], hands[slot] = AT_PLATES_ASYMM[slot], 0
+    record = scene(ASYMM, poses[0], poses[1], hands=hands, pot_items=pots, counters=counters)
+    after = interact(slot, record, ASYMM)
+    assert (after.hands[slot], after.reward) == (PLATE, 0)
+    assert after.shaped == own(slot, reward)
 
 
 @pytest.mark.parametrize("pots", [[0, 0], [ZERO, 0], [ZERO, ONE]])
-def test_a_plate_taken_off_a_counter_was_lying_there_and_pays_nothing(seat, pots):
-    record = scene(ASYMM, *AWAY, pot_items=pots, counters={(AWAY[seat][0], 4): PLATE})
-    after = interact(seat, record, ASYMM)
-    assert (after.hands[seat], after.counters, after.shaped) == (PLATE, {}, [0, 0])
+def test_a_plate_taken_off_a_counter_pays_nothing(slot, pots):
+    record = scene(ASYMM, *AWAY, pot_items=pots, counters={(AWAY[slot][0], 4): PLATE})
+    after = interact(slot, record, ASYMM)
+    assert (after.hands[slot], after.counters, after.shaped) == (PLATE, {}, [0, 0])
 
 
 def test_plates_in_hands_count_as_before_the_steps_interactions():
@@ -486,21 +492,21 @@ def test_pots_and_counters_are_as_agent_0_left_them():
     assert act(ASYMM, filled, INTERACT, INTERACT).shaped == [0, 3]  # the ego's ingredient makes the plate useful
 
     cleared = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], pot_items=[ZERO, ONE], counters={(2, 4): PLATE})
-    assert act(ASYMM, cleared, INTERACT, INTERACT).shaped == [0, 3]  # the ego took the plate that lay about
+    assert act(ASYMM, cleared, INTERACT, INTERACT).shaped == [0, 3]  # the ego took the plate from the counter
 
     dropped = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[ZERO, ONE])
     assert act(ASYMM, dropped, STAY, INTERACT).shaped == [0, 3]
-    assert act(ASYMM, dropped, INTERACT, INTERACT).shaped == [0, 0]  # the ego's plate lies on a counter now
+    assert act(ASYMM, dropped, INTERACT, INTERACT).shaped == [0, 0]  # now the ego's plate is on a counter
 
 
 def test_shaped_rewards_are_each_agents_own():
-    places = (3, 2, "right"), (5, 3, "left")
-    record = scene(ASYMM, *places, hands=[ZERO, PLATE], pot_items=[ZERO, SOUP_000], recipe=RECIPE_000)
+    poses = (3, 2, "right"), (5, 3, "left")
+    record = scene(ASYMM, *poses, hands=[ZERO, PLATE], pot_items=[ZERO, SOUP_000], recipe=RECIPE_000)
     after = act(ASYMM, record, INTERACT, INTERACT)
     assert (after.shaped, after.reward) == ([3, 5], 0)
 
 
-def test_a_move_turns_to_the_facing_that_tables_give_it():
+def test_a_move_turns_to_its_facing():
     record = scene(CRAMPED, (1, 1, "up"), ASIDE)
-    turned = [FACINGS.index(act(CRAMPED, record, move).places[0][2]) for move in (UP, DOWN, LEFT, RIGHT)]
+    turned = [FACINGS.index(act(CRAMPED, record, move).poses[0][2]) for move in (UP, DOWN, LEFT, RIGHT)]
     assert turned == FACING_OF.tolist()

@@ -17,7 +17,16 @@ from tests.helpers.scenes import random_records
 BATCH, STEPS, SCENES = 512, 20, 20  # trajectories: 10,240 steps; single steps from random states: 10,240
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+DEFAULT = ("coord_ring", "demo_wide")  # with buttons; with a type of ingredient that has no pile
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        pytest.param(layout, id=name, marks=[] if name in DEFAULT else pytest.mark.slow)
+        for name, layout in LAYOUTS.items()
+    ],
+)
 def test_step_rewards_and_observations_equal_jaxmarl(layout):
     rng = np.random.default_rng(0)
     env = jaxmarl_environment(layout)

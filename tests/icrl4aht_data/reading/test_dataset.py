@@ -1,4 +1,4 @@
-"""Loading, selecting, lazy arrays."""
+"""Loading, selecting, other options, lazy arrays."""
 
 from __future__ import annotations
 
@@ -7,30 +7,39 @@ import pickle
 import numpy as np
 import pytest
 
-from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import LabelsMissingError, UnknownNameError
+from icrl4aht_data import get_layout, load_icrl4aht
+from icrl4aht_data.errors import LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
+from tests.helpers.batches import assert_equal
+from tests.helpers.random_play import random_release
 
 
-def test_filters_pick_what_they_say(lite):
+@pytest.mark.parametrize(
+    ("wanted", "ids"),
+    [
+        ({"layout": "demo_wide"}, range(6, 12)),
+        ({"layout": "demo_cook_wide"}, range(6, 12)),
+        ({"layout": ["demo_wide", "coord_simple"], "split": "train"}, range(12)),
+        ({"track": "teammate", "teammate_kind": "utility_greedy"}, range(12)),
+    ],
+    ids=str,
+)
+def test_filters(lite, wanted, ids):
     dataset = load_icrl4aht(lite[0])
-    assert {entry.layout for entry in dataset.filter(layout="demo_wide").entries} == {"demo_wide"}
-    assert len(dataset.filter(layout="demo_wide")) == 6
-    assert len(dataset.filter(layout=["demo_wide", "coord_simple"], split="train")) == 12
+    assert dataset.filter(**wanted).ids.tolist() == load_icrl4aht(lite[0], **wanted).ids.tolist() == list(ids)
+
+
+def test_selections_of_a_selection(lite):
+    dataset = load_icrl4aht(lite[0])
     task = dataset.entries[4].task_id
     assert [e.task_id for e in dataset.filter(task_id=task, teammate_family="H4").entries] == [task] * 3
-    assert len(load_icrl4aht(lite[0], track="teammate", teammate_kind="utility_greedy")) == 12
-
-
-def test_environment_names_are_aliases(lite):
-    by_alias = load_icrl4aht(lite[0], layout="demo_cook_wide")
-    assert by_alias.ids.tolist() == load_icrl4aht(lite[0], layout="demo_wide").ids.tolist()
-
-
-def test_filter_works_within_a_selection_and_keeps_its_order(lite):
-    dataset = load_icrl4aht(lite[0]).select([11, 0, 7])
-    assert dataset.ids.tolist() == [11, 0, 7]
-    assert dataset.filter(layout="demo_wide").ids.tolist() == [11, 7]
+    mixed = dataset.select([11, 0, 7])
+    assert mixed.ids.tolist() == [11, 0, 7]
+    assert mixed.filter(layout="demo_wide").ids.tolist() == [11, 7]
+    wide = dataset.filter(layout="demo_wide")
+    assert wide[1:3].ids.tolist() == [7, 8]
+    with pytest.raises(UnknownNameError, match=r"this selection has no history \[0\]"):
+        wide.select([7, 0])
 
 
 def test_positions_ids_and_iteration(lite):
@@ -40,6 +49,23 @@ def test_positions_ids_and_iteration(lite):
     assert dataset.history(9).entry.history_id == 9
     with pytest.raises(UnknownNameError, match=r"no history with id 99; ids: 0\.\.11"):
         dataset.history(99)
+
+
+def test_other_options_share_index_and_shards(lite, ours):
+    dataset = load_icrl4aht(lite[0], layout="demo_wide", threads=1)
+    dataset[0].actions[:]
+    states = dataset.with_options(obs="state", cache="stream")
+    assert (states.obs, states.threads, states.cache.cache, dataset.obs) == ("state", 1, "stream", "float32")
+    assert states.index is dataset.index
+    assert states[0]._shard is dataset[0]._shard
+    expected = load_icrl4aht(lite[0], layout="demo_wide", obs="state").ad(batch_size=3, length=9)
+    assert_equal(states.ad(batch_size=3, length=9)[0], expected[0])
+    with pytest.raises(UnknownNameError, match="unknown obs 'float16'; valid: float32, uint8, state"):
+        dataset.with_options(obs="float16")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="threads = 0"):
+        dataset.with_options(threads=0)
+    with pytest.raises(OptionError, match=r'obs = "state": .* has observations only'):
+        load_icrl4aht(ours).with_options(obs="state")
 
 
 @pytest.mark.parametrize(
@@ -58,6 +84,7 @@ def test_positions_ids_and_iteration(lite):
         [4, 90, 4],
         np.arange(120) % 3 == 0,
         (slice(3, 9), 2),
+        (slice(9, 3, -1), slice(2, 4)),
         (7, 3),
         ...,
         None,
@@ -69,10 +96,8 @@ def test_lazy_arrays_index_as_arrays_do(lite, key):
     root, written = lite
     lazy = load_icrl4aht(root)[4].state
     expected = written[4]["state"]
-    assert lazy.shape == expected.shape
-    assert lazy.dtype == expected.dtype
-    index = np.asarray(key) if isinstance(key, list) else key
-    np.testing.assert_array_equal(lazy[key], expected[index])
+    assert (lazy.shape, lazy.dtype) == (expected.shape, expected.dtype)
+    np.testing.assert_array_equal(lazy[key], expected[np.asarray(key) if isinstance(key, list) else key])
 
 
 def test_lazy_array_out_of_range(lite):
@@ -80,25 +105,17 @@ def test_lazy_array_out_of_range(lite):
         load_icrl4aht(lite[0])[0].actions[120]
 
 
-@pytest.mark.parametrize("dtype", ["float32", "uint8", "state"])
-def test_observations_as_asked(either, dtype):
+@pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
+def test_observations_as_the_option_says(either, obs):
     root, written = either
-    dataset = load_icrl4aht(root, layout="demo_wide", obs=dtype)
-    history = dataset[0]
+    history = load_icrl4aht(root, layout="demo_wide", obs=obs)[0]
     state = written[history.entry.history_id]["state"]
-    expected = state if dtype == "state" else observe(_layout(history), state, 0)
-    obs = history.obs
-    assert obs.shape == expected.shape
-    assert obs.dtype == ("uint8" if dtype == "state" else dtype)
-    assert obs[3:8].dtype == obs.dtype
-    np.testing.assert_array_equal(obs[:], expected)
-    np.testing.assert_array_equal(np.asarray(obs), expected)
-
-
-def _layout(history):
-    from icrl4aht_data import get_layout
-
-    return get_layout(history.entry.layout)
+    expected = state if obs == "state" else observe(get_layout("demo_wide"), state, 0)
+    lazy = history.obs
+    assert lazy.shape == expected.shape
+    assert lazy.dtype == lazy[3:8].dtype == ("uint8" if obs == "state" else obs)
+    np.testing.assert_array_equal(lazy[:], expected)
+    np.testing.assert_array_equal(np.asarray(lazy), expected)
 
 
 def test_recover_environment_and_teammate(lite):
@@ -113,28 +130,18 @@ def test_recover_environment_and_teammate(lite):
 
 def test_returns_are_the_learning_curve(lite):
     root, written = lite
-    np.testing.assert_allclose(
-        load_icrl4aht(root)[3].returns(), written[3]["rewards"].reshape(6, 20).sum(axis=1), rtol=0, atol=1e-9
-    )
-
-
-def test_parts_and_selections_of_a_selection(lite):
-    dataset = load_icrl4aht(lite[0], layout="demo_wide")
-    assert dataset[1:3].ids.tolist() == [7, 8]
-    with pytest.raises(UnknownNameError, match=r"this selection has no history \[0\]"):
-        dataset.select([7, 0])
+    expected = written[3]["rewards"].reshape(6, 20).sum(axis=1)
+    np.testing.assert_allclose(load_icrl4aht(root)[3].returns(), expected, rtol=0, atol=1e-9)
 
 
 def test_a_dataset_travels_by_pickle(lite):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     dataset[0].state[:]
-    again = pickle.loads(pickle.dumps(dataset))
-    np.testing.assert_array_equal(again[0].state[:], dataset[0].state[:])
+    copy = pickle.loads(pickle.dumps(dataset))
+    np.testing.assert_array_equal(copy[0].state[:], dataset[0].state[:])
 
 
 def test_missing_labels_are_an_error(tmp_path):
-    from tests.helpers.random_play import random_release
-
     random_release(tmp_path / "r", labels=False, layouts=("cramped_up",))
     history = load_icrl4aht(tmp_path / "r")[0]
     assert not history.entry.has_expert_actions

@@ -1,4 +1,4 @@
-"""Batches: contents against the histories, purity, uniformity."""
+"""Batches: contents against the histories, purity, fixed draws."""
 
 from __future__ import annotations
 
@@ -32,29 +32,18 @@ def test_ad_windows_are_slices_of_histories(either):
         for row, (history_id, start) in enumerate(zip(*sampler.windows(i), strict=True)):
             arrays, window = written[int(history_id)], slice(start, start + LENGTH)
             at_the_start += start == 0
-            np.testing.assert_array_equal(batch.target_actions[row], arrays["actions"][window])
-            np.testing.assert_array_equal(batch.dones[row], arrays["dones"][window])
-            np.testing.assert_array_equal(batch.prev_actions[row], previous(arrays["actions"])[window])
-            np.testing.assert_array_equal(batch.prev_rewards[row], previous(arrays["rewards"])[window])
-            assert batch.prev_teammate_actions is not None
-            np.testing.assert_array_equal(
-                batch.prev_teammate_actions[row], previous(arrays["teammate_actions"])[window]
-            )
-            np.testing.assert_array_equal(batch.obs[row], dataset.history(int(history_id)).obs[window])
+            expected = {
+                "target_actions": arrays["actions"],
+                "dones": arrays["dones"],
+                "prev_actions": previous(arrays["actions"]),
+                "prev_rewards": previous(arrays["rewards"]),
+                "prev_teammate_actions": previous(arrays["teammate_actions"]),
+                "obs": dataset.history(int(history_id)).obs,
+            }
+            for name, array in expected.items():
+                np.testing.assert_array_equal(getattr(batch, name)[row], array[window], err_msg=name)
         assert batch.attention_mask.all()
-    assert at_the_start, "no window started at step 0: the case of zeros before it was not met"
-
-
-def test_ad_fields_dtypes_and_shapes(lite):
-    batch = load_icrl4aht(lite[0], layout="coord_simple").ad(batch_size=4, length=50, seed=0)[0]
-    assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == {
-        "obs": ("float32", (4, 50, 5, 5, 40)),
-        "prev_actions": ("int32", (4, 50)),
-        "prev_rewards": ("float32", (4, 50)),
-        "target_actions": ("int32", (4, 50)),
-        "dones": ("bool", (4, 50)),
-        "attention_mask": ("bool", (4, 50)),
-    }
+    assert at_the_start, "no window started at step 0, where zeros precede it"
 
 
 def test_short_histories_are_padded_at_the_end(lite):
@@ -74,83 +63,100 @@ def test_short_histories_are_padded_at_the_end(lite):
 def test_dpt_batches_are_transitions_of_the_same_task(either, order):
     root, written = either
     dataset = load_icrl4aht(root, layout="demo_wide", obs="state")
-    tasks = {task: [h for h in dataset if h.entry.task_id == task] for task in {e.task_id for e in dataset.entries}}
+    ids: dict[str, list[int]] = {}
+    for entry in dataset.entries:
+        ids.setdefault(entry.task_id, []).append(entry.history_id)
+    queries = {k: set(_rows(written[k], "state", "expert_actions")) for k in dataset.ids.tolist()}
+    known = {k: set(_transitions(written[k])) for k in dataset.ids.tolist()}
     sampler = dataset.dpt(batch_size=32, context=25, order=order, seed=1, teammate_actions=True)
+    names = ("obs", "next_obs", "actions", "teammate_actions", "rewards")
     ends = 0
     for i in range(3):
         batch = sampler[i]
-        assert batch.context_teammate_actions is not None
         for row in range(32):
-            query = (batch.query_obs[row].tobytes(), int(batch.query_target[row]))
-            context = _rows(batch, row)
-            homes = [
+            (query,) = _rows({"state": batch.query_obs[row, None], "action": batch.query_target[row, None]})
+            context = {name: getattr(batch, f"context_{name}")[row] for name in names}
+            tasks = [
                 task
-                for task, members in tasks.items()
-                if any(query in _labelled(written[h.entry.history_id]) for h in members)
-                and any(context <= _known(written[h.entry.history_id]) for h in members)
+                for task, members in ids.items()
+                if any(query in queries[k] for k in members) and any(set(_rows(context)) <= known[k] for k in members)
             ]
-            assert homes, f"batch {i}, row {row}: query and context come from no common task"
+            assert tasks, f"batch {i}, row {row}: query and context come from no common task"
             if order == "contiguous":
-                assert any(_is_slice(batch.context_obs[row], written[h.entry.history_id]["state"]) for h in dataset)
-            ends += _crosses(batch, row)
-    assert ends, "no context held an episode's last step: that case was not met"
+                assert any(_is_slice(context["obs"], written[k]["state"]) for k in known)
+            ends += (context["next_obs"][:-1] != context["obs"][1:]).any()
+    assert ends, "no context has an episode's last step"
 
 
-def _labelled(arrays):
-    return {(state.tobytes(), int(a)) for state, a in zip(arrays["state"], arrays["expert_actions"], strict=True)}
+def _rows(arrays, *names):
+    """Each step's values as one hashable tuple."""
+    columns = [np.asarray(arrays[name]) for name in names or arrays]
+    return [tuple(x.tobytes() if x.ndim else float(x) for x in row) for row in zip(*columns, strict=True)]
 
 
-def _known(arrays):
+def _transitions(arrays):
+    following = _following(arrays)
+    return _rows(arrays | {"following": following}, "state", "following", "actions", "teammate_actions", "rewards")
+
+
+def _following(arrays):
+    """The state after each step in the same episode."""
     following = np.concatenate([arrays["state"][1:], arrays["state"][:1]])
     following[arrays["dones"]] = arrays["episode_end_state"]
-    rows = zip(
-        arrays["state"], following, arrays["actions"], arrays["teammate_actions"], arrays["rewards"], strict=True
-    )
-    return {(s.tobytes(), f.tobytes(), int(a), int(t), float(r)) for s, f, a, t, r in rows}
-
-
-def _rows(batch, row):
-    fields = (batch.context_obs, batch.context_next_obs, batch.context_actions, batch.context_teammate_actions)
-    states, following, actions, mates = (field[row] for field in fields)
-    rows = zip(states, following, actions, mates, batch.context_rewards[row], strict=True)
-    return {(s.tobytes(), f.tobytes(), int(a), int(t), float(r)) for s, f, a, t, r in rows}
+    return following
 
 
 def _is_slice(window, states):
     return any(np.array_equal(window, states[k : k + len(window)]) for k in range(len(states) - len(window) + 1))
 
 
-def _crosses(batch, row):
-    return bool((batch.context_next_obs[row, :-1] != batch.context_obs[row, 1:]).any())
-
-
-def test_dpt_fields_dtypes_and_shapes(lite):
-    batch = load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=4, context=30)[0]
-    assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == {
-        "query_obs": ("float32", (4, 5, 5, 45)),
-        "query_target": ("int32", (4,)),
-        "context_obs": ("float32", (4, 30, 5, 5, 45)),
-        "context_actions": ("int32", (4, 30)),
-        "context_next_obs": ("float32", (4, 30, 5, 5, 45)),
-        "context_rewards": ("float32", (4, 30)),
-    }
-
-
 @pytest.mark.parametrize("order", ["contiguous", "random"])
 def test_what_follows_an_episodes_last_step_is_its_own_end(lite, order):
     root, written = lite
-    history = load_icrl4aht(root, obs="state").select([2])
-    batch = history.dpt(batch_size=3, context=120, order=order)[0]
-    states, ends = written[2]["state"], written[2]["episode_end_state"]
-    following = np.concatenate([states[1:], states[:1]])
-    following[19::20] = ends
+    batch = load_icrl4aht(root, obs="state").select([2]).dpt(batch_size=3, context=120, order=order)[0]
+    states, following = written[2]["state"], _following(written[2])
     if order == "contiguous":
         np.testing.assert_array_equal(batch.context_obs, np.stack([states] * 3))
         np.testing.assert_array_equal(batch.context_next_obs, np.stack([following] * 3))
     else:
-        pairs = {(before.tobytes(), after.tobytes()) for before, after in zip(states, following, strict=True)}
-        rows = zip(batch.context_obs.reshape(360, -1), batch.context_next_obs.reshape(360, -1), strict=True)
-        assert {(before.tobytes(), after.tobytes()) for before, after in rows} <= pairs
+        found = {"state": batch.context_obs.reshape(360, -1), "next": batch.context_next_obs.reshape(360, -1)}
+        assert set(_rows(found)) <= set(_rows({"state": states, "next": following}))
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (
+            lambda dataset: dataset.ad(batch_size=4, length=50, seed=0),
+            {
+                "obs": ("float32", (4, 50, 5, 5, 45)),
+                "prev_actions": ("int32", (4, 50)),
+                "prev_rewards": ("float32", (4, 50)),
+                "target_actions": ("int32", (4, 50)),
+                "dones": ("bool", (4, 50)),
+                "attention_mask": ("bool", (4, 50)),
+            },
+        ),
+        (
+            lambda dataset: dataset.dpt(batch_size=4, context=30),
+            {
+                "query_obs": ("float32", (4, 5, 5, 45)),
+                "query_target": ("int32", (4,)),
+                "context_obs": ("float32", (4, 30, 5, 5, 45)),
+                "context_actions": ("int32", (4, 30)),
+                "context_next_obs": ("float32", (4, 30, 5, 5, 45)),
+                "context_rewards": ("float32", (4, 30)),
+            },
+        ),
+    ],
+    ids=["ad", "dpt"],
+)
+def test_fields_dtypes_and_shapes(lite, make, expected):
+    sampler = make(load_icrl4aht(lite[0], layout="demo_wide"))
+    batch = sampler[0]
+    assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == expected
+    assert sampler.specs == expected
+    assert batch.describe().splitlines()[0].split() == [next(iter(expected)), "float32", *str(batch[0].shape).split()]
 
 
 def test_same_batches_in_two_processes_and_from_both_kinds(lite, full):
@@ -190,18 +196,21 @@ def test_length_and_iteration(lite):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"batch_size": 0, "length": 5}, "batch_size = 0"),
-        ({"batch_size": 2, "length": 0}, "length = 0"),
-        ({"batch_size": 2, "length": 5, "seed": -1}, "seed = -1"),
-        ({"batch_size": 2, "length": 5, "seed": 0.5}, "seed = 0.5: expected a whole number"),
-        ({"batch_size": 2, "length": 5, "seed": 2**64}, "below"),
-        ({"batch_size": 2.0, "length": 5}, "batch_size = 2.0"),
-        ({"batch_size": 2, "length": None}, "length = None"),
+        ({"batch_size": 0}, "batch_size = 0"),
+        ({"length": 0}, "length = 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"seed": 0.5}, r"seed = 0\.5: expected"),
+        ({"seed": 2**64}, "below"),
+        ({"batch_size": 2.0}, r"batch_size = 2\.0"),
+        ({"length": None}, "length = None"),
+        ({"layout": None}, r"spans layouts coord_simple, demo_wide.*layout='coord_simple'"),
     ],
 )
 def test_impossible_options(lite, options, message):
+    options = {"layout": "demo_wide", "batch_size": 2, "length": 5} | options
+    dataset = load_icrl4aht(lite[0], layout=options.pop("layout"))
     with pytest.raises(OptionError, match=message):
-        load_icrl4aht(lite[0], layout="demo_wide").ad(**options)
+        dataset.ad(**options)
 
 
 def test_impossible_contexts(lite):
@@ -209,13 +218,10 @@ def test_impossible_contexts(lite):
     with pytest.raises(OptionError, match="context = 121: the shortest history has 120 transitions"):
         dataset.dpt(batch_size=2, context=121)
     assert dataset.dpt(batch_size=2, context=121, order="random")[0].context_actions.shape == (2, 121)
+    with pytest.raises(OptionError, match="the shortest history has 20 transitions"):
+        dataset.dpt(batch_size=1, context=21, episodes=(0, 1))
     with pytest.raises(UnknownNameError, match=r"unknown order 'sorted'; valid: contiguous, random"):
         dataset.dpt(batch_size=2, context=5, order="sorted")  # type: ignore[arg-type]
-
-
-def test_several_layouts_need_a_choice(lite):
-    with pytest.raises(OptionError, match=r"spans layouts coord_simple, demo_wide.*layout='coord_simple'"):
-        load_icrl4aht(lite[0]).ad(batch_size=2, length=5)
 
 
 def test_a_one_step_episode_release_samples(tmp_path):

@@ -1,0 +1,62 @@
+"""meta/info.json and meta/provenance.json: written as they were read, and checked once."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.info import ReleaseInfo, read_info
+from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.schema import INFO, PROVENANCE
+from icrl4aht_data.utils.files import write_json
+
+
+def test_the_bundled_release_is_written_as_it_was_read(tmp_path):
+    write_json(tmp_path / "info.json", read_info(MINI).to_json())
+    assert (tmp_path / "info.json").read_bytes() == (MINI / INFO).read_bytes()
+    found = read_provenance(MINI / PROVENANCE)
+    write_json(tmp_path / "provenance.json", {task_id: of_task.to_json() for task_id, of_task in found.items()})
+    assert (tmp_path / "provenance.json").read_bytes() == (MINI / PROVENANCE).read_bytes()
+
+
+def test_unknown_fields_of_a_provenance_are_kept():
+    note = {"seed": 3, "laboratory": {"place": "elsewhere"}, "other": [1]}
+    assert Provenance.from_json(note).to_json() == note
+
+
+@pytest.mark.parametrize(
+    ("note", "message"),
+    [
+        ({"seed": "3"}, r"Expected `int \| null`, got `str` - at `\$\.seed`"),
+        ({"ego": {"total_steps": 1}}, "missing required field `environments`"),
+        ({"streams_recorded": -1}, "Expected `int` >= 0"),
+        ({"filter": {"before": {}, "after": {}}}, "missing required field `streams`"),
+        ([], "an object of objects"),
+    ],
+)
+def test_a_malformed_provenance_is_named(tmp_path, note, message):
+    (tmp_path / "provenance.json").write_text(json.dumps({"task": note}))
+    with pytest.raises(
+        IndexFormatError, match=rf"provenance\.json: not as `generation` writes it: 'task': .*{message}"
+    ):
+        read_provenance(tmp_path / "provenance.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "heavy"}, "Invalid enum value 'heavy'"),
+        ({"histories": True}, r"Expected `int`, got `bool` - at `\$\.histories`"),
+        ({"environment": {"max_steps": 400, "kept_steps": 0}}, "Expected `int` >= 1"),
+        ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "max_steps and kept_steps only"),
+        ({"shards": {"a": -1}}, "Expected `int` >= 0"),
+        ({"data_version": "\x1b[2J"}, "data_version: expected at most 512 printable characters"),
+    ],
+)
+def test_a_malformed_info_says_what_is_wrong(change, message):
+    content = json.loads((MINI / INFO).read_text())
+    with pytest.raises(IndexFormatError, match=message):
+        ReleaseInfo.from_json(content | change)

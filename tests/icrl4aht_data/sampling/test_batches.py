@@ -1,0 +1,133 @@
+"""Batches made ahead: order, buffers, devices, errors, resuming."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import threading
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import OptionError
+from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.random_play import SHARD
+
+
+@pytest.fixture
+def sampler(lite):
+    return load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=3, length=9, seed=3)
+
+
+@pytest.mark.parametrize("prefetch", [0, 1, 3])
+@pytest.mark.parametrize("reuse", [False, True])
+def test_batches_in_order(sampler, prefetch, reuse):
+    numbers, buffers = iter(range(4, 24)), set()
+    with sampler.batches(4, 24, prefetch=prefetch, reuse=reuse) as batches:
+        for batch in batches:
+            assert_equal(batch, sampler[next(numbers)])
+            buffers.add(batch.obs.ctypes.data)
+    assert not reuse or len(buffers) <= prefetch + 1
+    assert (batches.served, batches.next) == (20, 24)
+    assert 0 < batches.waited < 60
+    assert next(numbers, None) is None
+    assert next(batches, None) is None
+
+
+def test_batches_are_kept_without_reuse(sampler):
+    for i, batch in enumerate(list(sampler.batches(stop=6))):
+        assert_equal(batch, sampler[i])
+
+
+def _aligned(array):
+    """An array of the same shape at an address that JAX would take over instead of copying from it."""
+    if array is None:
+        return None
+    memory = np.empty(array.nbytes + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    return memory[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
+
+
+def test_on_a_device(sampler, monkeypatch):
+    empty = sampler.empty
+    monkeypatch.setattr(sampler, "empty", lambda: type(empty())(*map(_aligned, empty())))
+    batches = list(sampler.batches(stop=5, device=jax.devices()[0]))
+    for i, batch in enumerate(batches):
+        assert isinstance(batch.obs, jax.Array)
+        assert batch.prev_teammate_actions is None
+        assert_equal(jax.tree.map(np.asarray, batch), sampler[i])
+
+
+def test_no_more_are_made_ahead(sampler, monkeypatch):
+    made, plain = [], sampler.batch
+    monkeypatch.setattr(sampler, "batch", lambda i, out=None: made.append(i) or plain(i, out))
+    with sampler.batches(prefetch=2) as batches:
+        next(batches)
+        time.sleep(0.3)
+        assert made == [0, 1, 2]
+
+
+@pytest.mark.parametrize("prefetch", [0, 2])
+def test_an_exception_reaches_the_consumer(damaged, prefetch):
+    (damaged / SHARD).write_bytes((damaged / SHARD).read_bytes()[:3000])
+    batches = load_icrl4aht(damaged, layout="coord_simple").ad(batch_size=8, length=9).batches(prefetch=prefetch)
+    with pytest.raises(Exception, match="truncated"):
+        next(batches)
+    assert next(batches, None) is None
+
+
+def test_closing_ends_the_thread(sampler):
+    def workers() -> int:
+        return sum(thread.name.startswith("icrl4aht-prefetch") for thread in threading.enumerate())
+
+    with sampler.batches(prefetch=1) as batches:
+        next(batches)
+        assert workers() == 1
+    assert workers() == 0
+    abandoned = sampler.batches(prefetch=1)
+    next(abandoned)
+    del abandoned
+    gc.collect()
+    deadline = time.monotonic() + 20
+    while workers() and time.monotonic() < deadline:  # submitted batches are still made
+        time.sleep(0.01)
+    assert workers() == 0
+
+
+def test_resuming_continues_exactly(lite, sampler):
+    batches = sampler.batches()
+    for _ in range(4):
+        next(batches)  # more are made ahead: what was not consumed is made again
+    state = json.loads(json.dumps(batches.state_dict()))
+    batches.close()
+    with sampler.batches() as resumed:
+        next(resumed)
+        resumed.load_state_dict(state)
+        assert_equal(next(resumed), sampler[4])
+    dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8")
+    with pytest.raises(OptionError, match="of other batches: it has seed = 3, not 4"):
+        dataset.ad(batch_size=3, length=9, seed=4).batches().load_state_dict(state)
+    with pytest.raises(OptionError, match="selection"):
+        dataset[1:].ad(batch_size=3, length=9, seed=3).batches().load_state_dict(state)
+
+
+@pytest.mark.parametrize("cache", CACHES)
+def test_memory_stays_flat(lite, cache):
+    def resident() -> int:
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    sampler = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8", cache=cache).ad(batch_size=16, length=100)
+    with sampler.batches(stop=600) as batches:
+        for _ in range(200):
+            next(batches)
+        early = resident()
+        for _ in batches:
+            pass
+    assert batches.served == 600
+    assert resident() - early < 16 * 2**20
