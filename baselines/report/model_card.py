@@ -9,7 +9,7 @@ from typing import Any
 
 from baselines.report.markdown import tables
 from baselines.report.results import Run
-from icrl4aht_data.utils.templates import fill
+from icrl4aht_data.utils.templates import fill_template
 
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
@@ -27,7 +27,7 @@ def model_card(run: Run, trained: Mapping[str, Any]) -> str:
         f"It is one run, of seed {config['train']['seed']}: how far another would differ is not known.",
         "What it is given at each step must be what the evaluator gives, see `docs/protocol.md` in the repository.",
     ]
-    return fill(
+    return fill_template(
         "baseline.md",
         method=run.agent,
         dataset=at_hub[1] if at_hub else "icrl4aht",

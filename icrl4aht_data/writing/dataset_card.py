@@ -28,7 +28,7 @@ from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.provenance import Provenance, TeammateSuite, read_provenance
 from icrl4aht_data.format.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.templates import card_file, fill, markdown_table
+from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.writing.field_descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 from icrl4aht_data.writing.statistics import layout_statistics, statistics_rows
 
@@ -96,7 +96,7 @@ def _card(release: _Release) -> str:
     statistics = info.statistics or layout_statistics(
         root, release.entries, release.tasks, provenance, info.environment.kept_steps
     )
-    return fill(
+    return fill_template(
         "dataset.md",
         size=size_category(info.transitions),
         configs=_configs(release),

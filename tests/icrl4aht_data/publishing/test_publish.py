@@ -28,7 +28,7 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
-from icrl4aht_data.utils.templates import card_file, fill
+from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.dataset_card import dataset_card, evaluated_on, size_category
 from icrl4aht_data.writing.field_descriptions import ARRAY_TEXTS, ENTRY_TEXTS
@@ -341,7 +341,7 @@ def test_observations_alone_are_published_too(release, tmp_path):
 
 def test_the_card_of_a_baseline_takes_what_it_names():
     names = set(re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text()))
-    card = fill("baseline.md", **{name: f"<{name}>" for name in names})
+    card = fill_template("baseline.md", **{name: f"<{name}>" for name in names})
     assert front_matter(card)["license"] == "mit"
     assert "| method | <method> |" in card
 
