@@ -9,7 +9,7 @@ from typing import Any
 
 from baselines.report.results import EvaluationRun
 from baselines.report.summary import track_tables
-from icrl4aht_data.utils.templates import fill
+from icrl4aht_data.utils.templates import fill_template
 
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
@@ -27,7 +27,7 @@ def model_card(run: EvaluationRun, trained: Mapping[str, Any]) -> str:
         f"It is one run, of seed {config['train']['seed']}: the variation between seeds is not known.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
     ]
-    return fill(
+    return fill_template(
         "baseline.md",
         method=run.agent,
         dataset=on_hub[1] if on_hub else "icrl4aht",

@@ -40,8 +40,8 @@ from icrl4aht_data.overcooked.state import Array, unpack
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
 
 # Every visible cell is packed into two 32-bit words, so that lookups move words and only the last operation writes C
-# channels. Bits of the cell's word: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, static 20..25, one bit per
-# piled type 26..28. Bits of the word of the agents on the cell: self 0..12 (position 1, facing 4, hand 8), other 13..25.
+# channels. Bits of the word of the cell: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, static 20..25, and one
+# per piled type 26..28. Bits of the word of the agents on it: self 0..12 (position 1, facing 4, hand 8), other 13..25.
 _TIMER, _RECIPE, _DELIVERY, _FIXED, _PILES = 8, 13, 19, 20, 26
 _AGENT_BITS = 13
 

@@ -24,7 +24,7 @@ from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import files_below
-from icrl4aht_data.utils.templates import card_file, fill
+from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.dataset_card import (
     CURVES_FIGURE,
     HEADROOM_FIGURE,
@@ -126,7 +126,7 @@ def teammate_card(folder: Path) -> str:
         facts = parse_json(read_text(path))
         if facts["algorithm"] not in ALGORITHMS:
             raise unknown("algorithm", facts["algorithm"], ALGORITHMS)
-        return fill(
+        return fill_template(
             "teammate.md",
             algorithm=facts["algorithm"],
             layout=get_layout(facts["layout"]).name,

@@ -30,7 +30,7 @@ def card_file(name: str, package: Path = _PACKAGE) -> Path:
     raise OptionError(f"{package / 'cards' / name}: missing; install icrl4aht-data again")
 
 
-def fill(template: str, **values: str) -> str:
+def fill_template(template: str, **values: str) -> str:
     """The text of a template in the folder `cards`, with every $name replaced.
 
     Raises:

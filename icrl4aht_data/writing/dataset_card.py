@@ -28,7 +28,7 @@ from icrl4aht_data.format.provenance import Provenance, TeammateSuite, read_prov
 from icrl4aht_data.format.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.paths import files_below
-from icrl4aht_data.utils.templates import card_file, fill, markdown_table
+from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.writing.card_texts import card_texts, sentence
 from icrl4aht_data.writing.statistics import layout_statistics, statistics_rows
 
@@ -114,7 +114,7 @@ def render_card(release: CardContent) -> str:
     )
     headroom = headroom_table(read_headroom(HEADROOM_PROTOCOL), evaluated_on(info.layouts))
     layouts_caption = "The layouts at the start of an episode, ego blue, teammate red"
-    return fill(
+    return fill_template(
         "dataset.md",
         size=size_category(info.transitions),
         configs=_viewer_configs(release) if parquet else "",

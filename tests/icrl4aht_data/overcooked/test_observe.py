@@ -11,6 +11,8 @@ Most scenes are in cramped_up:
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -89,41 +91,28 @@ def at(value: int, *cells: tuple[int, int]) -> Cells:
 # Layouts
 
 
-def test_layouts_are_those_of_the_specification():
-    assert list(LAYOUTS) == list(SPECIFIED)
-
-
 @each_layout
-def test_sizes_and_channels_are_those_of_the_specification(layout):
+def test_layouts_are_those_of_the_specification(layout):
+    assert list(LAYOUTS) == list(SPECIFIED)
     found = (layout.alias, layout.width, layout.height, layout.ingredient_types, layout.channels)
     assert found == SPECIFIED[layout.name]
+    assert get_layout(layout.name) is get_layout(layout.alias) is layout
     records = random_records(layout, 7, np.random.default_rng(0))
     for observed, shape in ((observe(layout, records, 1), (7,)), (observe_both(layout, records), (7, 2))):
         assert observed.shape == (*shape, 5, 5, SPECIFIED[layout.name][-1])
         assert observed.dtype == np.uint8
 
 
-@each_layout
-def test_layouts_are_found_by_name_and_by_alias(layout):
-    assert get_layout(layout.name) is layout
-    assert get_layout(SPECIFIED[layout.name][0]) is layout
-
-
 @pytest.mark.parametrize(
     ("wrong", "nearest"),
-    [("cramped_upp", "cramped_up"), ("test_time_wid", "test_time_wide"), ("coordring", "coord_ring")],
+    [("cramped_upp", "cramped_up"), ("test_time_wid", "test_time_wide"), ("coordring", "coord_ring"), ("7", None)],
 )
 def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
-    with pytest.raises(UnknownNameError, match=f"unknown layout '{wrong}'.*mean '{nearest}'") as error:
+    hint = f" Did you mean '{nearest}'?" if nearest else ""
+    with pytest.raises(UnknownNameError, match=rf"unknown layout '{wrong}'.*\.{re.escape(hint)}$") as error:
         get_layout(wrong)
     listed = str(error.value).split("valid: ")[1].split(".")[0].split(", ")
     assert set(listed) == {*SPECIFIED, *(alias for alias, *_ in SPECIFIED.values())}
-
-
-def test_an_unknown_layout_like_no_other_gets_no_hint():
-    with pytest.raises(UnknownNameError, match="unknown layout '7'") as error:
-        get_layout("7")
-    assert "mean" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -412,44 +401,42 @@ def test_possible_states_have_no_faults(layout):
     assert faults(layout, records) == []
 
 
-@pytest.mark.parametrize(
-    ("kind", "change"),
-    [
-        ("a position that is not reachable floor", {"positions": [0, 13]}),  # a wall
-        ("a position that is not reachable floor", {"positions": [11, 20]}),  # past the map's last cell
-        ("a position that is not reachable floor", {"positions": [255, 13]}),
-        ("two agents on one cell", {"positions": [11, 11]}),
-        ("an unknown facing", {"facings": [0, 4]}),
-        ("an impossible item in hand", {"hands": [2 * ZERO, 0]}),
-        ("an impossible item in hand", {"hands": [0, ZERO + ONE]}),
-        ("an impossible item in hand", {"hands": [0, PLATE + ZERO]}),
-        ("an impossible item in hand", {"hands": [COOKED + RECIPE_000, 0]}),
-        ("an impossible item in hand", {"hands": [PLATE + COOKED, 0]}),
-        ("an impossible item in hand", {"hands": [PLATE + COOKED + 2 * ZERO, 0]}),
-        ("an impossible item in hand", {"hands": [0, 64]}),  # a third type, which the layout does not have
-        ("an impossible item on a counter", {"counters": {(1, 0): 2 * ONE}}),
-        ("an impossible item on a counter", {"counters": {(2, 3): COOKED + RECIPE_111}}),
-        ("an impossible item in a pot", {"pot_items": [PLATE]}),
-        ("an impossible item in a pot", {"pot_items": [PLATE + COOKED + RECIPE_000]}),
-        ("an impossible item in a pot", {"pot_items": [3 * ZERO + ONE]}),
-        ("an impossible item in a pot", {"pot_items": [COOKED + ZERO]}),
-        ("an impossible recipe", {"recipe": 0}),
-        ("an impossible recipe", {"recipe": 2 * ZERO}),
-        ("an impossible recipe", {"recipe": COOKED + RECIPE_000}),
-        ("an impossible recipe", {"recipe": 64 * 3}),
-        ("a delivery flag that is not 0 or 1", {"delivered": 2}),
-        ("a pot timer above its limit", {"pot_items": [RECIPE_000], "pot_timers": [21]}),
-        ("a pot that does not cook exactly while it contains three raw ingredients", {"pot_items": [RECIPE_000]}),
-        (
-            "a pot that does not cook exactly while it contains three raw ingredients",
-            {"pot_items": [8], "pot_timers": [5]},
-        ),
-        (
-            "a pot that does not cook exactly while it contains three raw ingredients",
-            {"pot_items": [COOKED + RECIPE_000], "pot_timers": [5]},
-        ),
+IMPOSSIBLE = {
+    "a position that is not reachable floor": [
+        {"positions": [0, 13]},  # a wall
+        {"positions": [11, 20]},  # past the map's last cell
+        {"positions": [255, 13]},
     ],
-)
+    "two agents on one cell": [{"positions": [11, 11]}],
+    "an unknown facing": [{"facings": [0, 4]}],
+    "an impossible item in hand": [
+        {"hands": hands}
+        for hands in (
+            [2 * ZERO, 0],
+            [0, ZERO + ONE],
+            [0, PLATE + ZERO],
+            [COOKED + RECIPE_000, 0],
+            [PLATE + COOKED, 0],
+            [PLATE + COOKED + 2 * ZERO, 0],
+            [0, 64],  # a third type, which the layout does not have
+        )
+    ],
+    "an impossible item on a counter": [{"counters": {(1, 0): 2 * ONE}}, {"counters": {(2, 3): COOKED + RECIPE_111}}],
+    "an impossible item in a pot": [
+        {"pot_items": [item]} for item in (PLATE, PLATE + COOKED + RECIPE_000, 3 * ZERO + ONE, COOKED + ZERO)
+    ],
+    "an impossible recipe": [{"recipe": item} for item in (0, 2 * ZERO, COOKED + RECIPE_000, 64 * 3)],
+    "a delivery flag that is not 0 or 1": [{"delivered": 2}],
+    "a pot timer above its limit": [{"pot_items": [RECIPE_000], "pot_timers": [21]}],
+    "a pot that does not cook exactly while it contains three raw ingredients": [
+        {"pot_items": [RECIPE_000]},
+        {"pot_items": [8], "pot_timers": [5]},
+        {"pot_items": [COOKED + RECIPE_000], "pot_timers": [5]},
+    ],
+}
+
+
+@pytest.mark.parametrize(("kind", "change"), [(kind, change) for kind in IMPOSSIBLE for change in IMPOSSIBLE[kind]])
 def test_each_impossible_value_is_found(kind, change):
     record = scene(CRAMPED, (1, 1, "up"), (3, 2, "up"), **change)
     assert faults(CRAMPED, record) == [kind]

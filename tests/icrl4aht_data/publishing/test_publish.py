@@ -28,7 +28,7 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
-from icrl4aht_data.utils.templates import card_file, fill
+from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
@@ -330,7 +330,7 @@ def test_releases_of_observations_are_built(release, tmp_path):
 
 def test_the_baseline_card_uses_its_names():
     names = set(re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text()))
-    card = fill("baseline.md", **{name: f"<{name}>" for name in names})
+    card = fill_template("baseline.md", **{name: f"<{name}>" for name in names})
     assert front_matter(card)["license"] == "mit"
     assert "| method | <method> |" in card
 

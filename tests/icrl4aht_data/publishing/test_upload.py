@@ -19,7 +19,7 @@ from icrl4aht_data.errors import OptionError, ReleaseError, UploadError
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.utils.templates import fill
+from icrl4aht_data.utils.templates import fill_template
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
 from tests.helpers.random_play import random_release
@@ -242,10 +242,10 @@ def test_a_card_that_the_hub_refuses(hub, published, tmp_path):
 def test_cards_are_valid_to_the_hub(hub, published):
     DatasetCard.load(published / "README.md", ignore_metadata_errors=False).validate()
     names = "algorithm layout member checkpoint step sha256 seats own_return teammate_return seed widths code_version"
-    teammate = fill("teammate.md", **dict.fromkeys([*names.split(), "return_of"], "fcp"))
+    teammate = fill_template("teammate.md", **dict.fromkeys([*names.split(), "return_of"], "fcp"))
     ModelCard(teammate).validate()
     names = "method dataset data_version selection code_version settings protocol results limits"
-    ModelCard(fill("baseline.md", **dict.fromkeys(names.split(), "name"))).validate()
+    ModelCard(fill_template("baseline.md", **dict.fromkeys(names.split(), "name"))).validate()
     assert [request.path for request in hub.log] == ["/api/validate-yaml"] * 3
 
 
