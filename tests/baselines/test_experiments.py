@@ -231,10 +231,9 @@ def suite(tmp_path_factory) -> Path:
     layout = get_layout("cramped_up")
     network = ActorCritic(Widths((4,), (4,), 8, 8, 8))
     where = "cramped_up/fcp/m0/c0"
-    shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))  # zeros compile faster
-    save_policy(
-        root / where, network, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), {"seed": 0}
-    )
+    shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # without compiling the initialisation
+    save_policy(root / where, network, zeros, {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
     entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / WEIGHTS)}
     (root / "manifests").mkdir()

@@ -153,7 +153,7 @@ def query_mask(context: int) -> np.ndarray:
     return np.concatenate([to_context, to_queries], axis=1).astype(bool)
 
 
-def test_the_query_stands_behind_its_context():
+def test_the_query_follows_its_context():
     assert query_mask(2).astype(int).tolist() == [
         [1, 0, 0, 0, 0],
         [1, 1, 0, 0, 0],

@@ -1,4 +1,4 @@
-"""The report's tables beside the paper's numbers, and the page: self-contained, every part there."""
+"""Report: tables with the paper's numbers, and the page, which is complete and self-contained."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(agent: str, layouts=("demo_wide",), value=10.0, variant=None, families=H
 
 
 class Outside(HTMLParser):
-    """What a page would fetch or run, and its text."""
+    """Parser that collects everything a page would fetch or run."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -66,31 +66,31 @@ class Outside(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_whole_and_fetches_nothing(tmp_path):
+def test_the_page_is_complete_and_fetches_nothing(tmp_path):
     sweeps = [run("AD", value=k / 100, variant=("K", k)) for k in (250, 500)]
     sweeps.append(run("DPT", variant=("size", "small")))
     (tmp_path / "a.gif").write_bytes(GIF)
     path = tmp_path / "r" / "report.html"
     runs = [run("AD", TEST_LAYOUTS), run("random", TEST_LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
-    films = [
+    episodes = [
         EpisodeGif("H1", "H1 & an ego", tmp_path / "a.gif"),
         EpisodeGif("rl", "no picture: <its run> is gone", None),
     ]
-    write_page(runs, path, films, ["left out: <nothing>"])
+    write_page(runs, path, episodes, ["left out: <nothing>"])
     text = path.read_text()
     page = Outside(text)
     assert page.found == []
     assert page.open == []
     assert page.images.count("data:image/gif") == 1
     assert page.images.count("data:image/png") == 5, "two sweeps, curves of agents and of sweeps, gain"
-    for told in (
+    for text_part in (
         "Table 5. Offline Meta-RL Comparison",
         "left out: &lt;nothing&gt;",
         "H1 &amp; an ego",
         "<h3>Learned teammates</h3>\n<figure class=episode><figcaption>no picture: &lt;its run&gt; is gone",
         "paper 12.5 ± 11.3",
     ):
-        assert told in text
+        assert text_part in text
     for part in ("Context length", "Model scale", "Adaptation gain", "Headroom", "Settings and hashes", "runs/AD+TA"):
         assert part in text
     assert "url(" not in text
@@ -101,17 +101,17 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path):
         write_page([], path)
 
 
-def test_tables_hold_ours_beside_the_papers():
+def test_tables_hold_our_and_the_papers_numbers():
     runs = [run("AD", TEST_LAYOUTS), run("oracle", ("demo_wide",), 50.0)]
     one, two, three, four, five = (fill_table(table, runs, "seeded") for table in PAPER_TABLES)
     assert [row.agent for row in one[:4]] == ["AD", "DPT", "random", "oracle"]
     assert [row.agent for row in two[:4]] == ["AD", "DPT", "random", "AD"], "oracle did not play there"
-    place = PAPER_TABLES[0].columns.index("demo_wide")
-    cell = one[0].scores[place]
+    column = PAPER_TABLES[0].columns.index("demo_wide")
+    cell = one[0].scores[column]
     assert (cell.mean, cell.std, cell.published, cell.headroom) == (11.0, 0.0, (-3.2, 2.6), (1, 1))
-    told = read_headroom("seeded")["demo_wide", "H1"]
-    assert cell.normalised == pytest.approx((11 - told["stay"]) / (told["oracle"] - told["stay"]))
-    assert one[1].scores[place].mean is None
+    references = read_headroom("seeded")["demo_wide", "H1"]
+    assert cell.normalised == pytest.approx((11 - references["stay"]) / (references["oracle"] - references["stay"]))
+    assert one[1].scores[column].mean is None
     assert one[0].scores[0].headroom == (0, 1), "coord_simple with H1 is flat"
     assert one[0].scores[0].normalised is None
     assert next(row for row in three if (row.label, row.agent) == (AVERAGE, "DPT+TA")).scores[1].published == (9.4, 5.5)
@@ -124,7 +124,7 @@ def test_tables_hold_ours_beside_the_papers():
     assert five[0].scores[0].played == (24, 24)
 
 
-def test_a_part_of_a_place_is_said_to_be_one():
+def test_scores_count_the_cells_played():
     partial = score_cells([("demo_wide", family) for family in HEURISTICS], run("AD", families=("H1", "H2")), {})
     assert partial.played == (2, 4)
     assert (partial.mean, partial.normalised) == (11.0, None)
@@ -164,7 +164,7 @@ def test_sweeps_have_the_papers_points_where_it_states_them():
 
 
 def test_the_papers_averages_are_those_of_its_cells():
-    """A slip in copying a table would show; all are rounded to a tenth."""
+    """Finds errors in the copied numbers, which are rounded to a tenth."""
     for layouts in read_published()["methods"].values():
         for families in layouts.values():
             if "H1" in families:
@@ -199,7 +199,7 @@ def test_trained_models_have_cards(tmp_path):
 
 
 def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
-    """Where the family leaves headroom; every agent before any twice, reference egos last."""
+    """Tasks with headroom, every agent once before any twice, reference egos last."""
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "episode_gif", lambda path, *a, **k: path.write_bytes(GIF) + 1)
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
