@@ -68,7 +68,7 @@ def test_remote_commands(tmp_path, monkeypatch):
     """One after the other, from a hub of the test's own that has the bundled release."""
     monkeypatch.chdir(tmp_path)
     with hub_server(tmp_path / "hub") as hub:
-        hub.add_repo("you/icrl4aht", MINI, tag=f"v{read_info(MINI)['data_version']}")
+        hub.add_repo("you/icrl4aht", MINI, tag=f"v{read_info(MINI).data_version}")
         for arguments in (a for a in commands("icrl4aht-data") if of_a_remote(a) and not publishes(a)):
             result = CliRunner().invoke(cli, arguments)
             assert result.exit_code == 0, result.output
