@@ -1,38 +1,51 @@
-"""Egos: the protocol, those that need no training, trained models, and the adapter for agents outside JAX."""
+"""Egos of the evaluator: reference egos that need no training, and trained models."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from baselines.agents.oracle import oracle
 from baselines.methods.method import Method
-from baselines.methods.tokens import step_of
+from baselines.methods.tokens import percept_step
+from baselines.training.histories import TrainedModel, read_trained
 from generation.policy import Policy
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
 from icrl4aht_data.overcooked.layouts import Layout
 
-if TYPE_CHECKING:
-    from baselines.training.histories import Trained
-
 Acting = Literal["cached", "exact"]
 ACTING: tuple[Acting, ...] = ("cached", "exact")
-"""How a model remembers: what it computed of each step is kept, or everything is computed anew from the window. The
-same while the window is not full; from then on what is kept bears traces of steps that have left it."""
+"""How a trained model remembers: `cached` keeps what was computed for each step, `exact` computes everything from the
+window in every step. Both act alike until the window is full; from then on the cache also holds effects of steps that
+have left the window."""
+
+
+class NamedEgo(NamedTuple):
+    """An ego that was chosen by name.
+
+    Attributes:
+        name: as reports show it.
+        make: layout -> policy.
+        details: what results depend on in addition to the name; None for reference egos.
+    """
+
+    name: str
+    make: Callable[[Layout], Policy]
+    details: dict[str, Any] | None = None
 
 
 def stay(layout: Layout) -> Policy:
-    """Always stays: what a cell of the benchmark gives without an ego."""
+    """Returns an ego that always stays: what a cell of the benchmark yields without an ego."""
     return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(STAY), carry), "observation")
 
 
 def random(layout: Layout) -> Policy:
-    """Uniform over the six actions: the paper's `Rnd` column."""
+    """Returns an ego that acts uniformly at random over the six actions: the paper's `Rnd` column."""
 
     def act(params, carry, view, key):
         return jax.random.randint(key, (), 0, len(ACTIONS)), carry
@@ -41,20 +54,23 @@ def random(layout: Layout) -> Policy:
 
 
 def learned(method: Method, params: Any, context: int, acting: Acting = "cached", greedy: bool = True) -> Policy:
-    """The ego of a trained model; its memory lives through the task.
+    """Returns the ego of a trained model, whose memory lasts for the complete task.
 
     Args:
         method: as it was trained.
-        params: float32.
+        params: its parameters, float32.
         context: K, the steps or transitions that it remembers.
         acting: see `ACTING`.
-        greedy: the likeliest action, as published; otherwise one drawn from the policy.
+        greedy: whether it takes the likeliest action, as published, or draws one from the policy.
+
+    Raises:
+        UnknownNameError: if there is no such way of acting.
     """
     if acting not in ACTING:
         raise unknown("acting", acting, ACTING)
 
     def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
-        logits, memory = method.act(params, step_of(percept), percept.prev_done, memory)
+        logits, memory = method.act(params, percept_step(percept), percept.prev_done, memory)
         action = logits.argmax() if greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory
 
@@ -62,43 +78,30 @@ def learned(method: Method, params: Any, context: int, acting: Acting = "cached"
 
 
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
-"""Name -> maker of the ego for a layout."""
-
-
-class Agent(NamedTuple):
-    """An ego by name."""
-
-    name: str  # as tables show it
-    make: Callable[[Layout], Policy]
-    details: dict[str, Any] | None = None  # what results depend on beside the name
+"""Name of a reference ego -> its maker, layout -> policy."""
 
 
 def get_agent(name: str) -> Callable[[Layout], Policy]:
-    """The maker of that name.
+    """Returns the maker of a reference ego.
 
     Raises:
-        UnknownNameError: lists the valid names and the nearest.
+        UnknownNameError: if there is no such ego; lists the valid names and the nearest.
     """
     if name not in AGENTS:
         raise unknown("agent", name, AGENTS)
     return AGENTS[name]
 
 
-def find_agent(name: str, acting: Acting = "cached") -> Agent:
-    """The ego of that name, or of that run folder, which `python -m baselines train` made.
+def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
+    """Returns the reference ego of a name, or the trained model of a run folder that `python -m baselines train` made.
 
     Raises:
-        UnknownNameError: for what is neither.
-        OptionError: if the run is of another format or has no checkpoint; from `make`, if it does not fit the layout.
+        UnknownNameError: if the name is neither.
+        OptionError: if the run has another format or no checkpoint; from `make`, if the model does not fit the layout.
     """
-    if name not in AGENTS and Path(name).is_dir():
-        return _of_run(Path(name), acting)
-    return Agent(name, get_agent(name))
-
-
-def _of_run(folder: Path, acting: Acting) -> Agent:
-    from baselines.training.histories import read_trained
-
+    folder = Path(name)
+    if name in AGENTS or not folder.is_dir():
+        return NamedEgo(name, get_agent(name))
     run = read_trained(folder)
     policy = learned(run.method, run.params, run.context, acting)
 
@@ -106,11 +109,15 @@ def _of_run(folder: Path, acting: Acting) -> Agent:
         check_fits(run, layout, folder)
         return policy
 
-    return Agent(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})
+    return NamedEgo(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})
 
 
-def check_fits(run: Trained, layout: Layout, folder: Path) -> None:
-    """Raises OptionError: if a run's model cannot play on a layout; `folder` is named."""
+def check_fits(run: TrainedModel, layout: Layout, folder: Path) -> None:
+    """Check that a trained model can play on a layout.
+
+    Raises:
+        OptionError: if the layout's observations have another shape; names `folder`.
+    """
     if layout.obs_shape != run.obs_shape:
         raise OptionError(
             f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "

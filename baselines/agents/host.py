@@ -1,4 +1,4 @@
-"""TODO."""
+"""Adapter for egos outside JAX: NumPy, PyTorch, or anything else that maps a batch of percepts to actions."""
 
 from __future__ import annotations
 
@@ -15,21 +15,35 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 
 class Percept(NamedTuple):
-    """What an ego with memory is given (`sees = "percept"`): what it sees, and what its last step brought.
+    """Input of an ego with memory (`sees = "percept"`): its observation and the outcome of its last step.
 
-    As in training, the last step before an episode's first is the previous episode's last; nothing precedes a task's
-    first step, there all are zero.
+    As in training, the last step before an episode's first is the previous episode's last. Before a task's first step
+    all of `prev_*` is zero. Arrays have a leading axis (B,) for host agents.
+
+    Attributes:
+        obs: uint8 (5, 5, C), the ego's observation.
+        prev_action: int32 (), the ego's last action.
+        prev_reward: float32 (), the team's last reward.
+        prev_teammate_action: int32 (), the teammate's last action.
+        prev_done: bool (), whether the last step ended an episode.
     """
 
-    obs: Any  # uint8 (5, 5, C)
-    prev_action: Any  # int32
-    prev_reward: Any  # float32, the team's
-    prev_teammate_action: Any  # int32
-    prev_done: Any  # bool: the last step ended an episode
+    obs: Any
+    prev_action: Any
+    prev_reward: Any
+    prev_teammate_action: Any
+    prev_done: Any
 
 
 class HostPolicy(NamedTuple):
-    """A `Policy` whose functions take a whole batch: for agents that cannot be vmapped, see `from_host`."""
+    """A `generation.policy.Policy` whose functions take a complete batch, for agents that cannot be vmapped.
+
+    Attributes:
+        params: pytree of parameters.
+        init: (params, keys (B,)) -> carry of the batch.
+        act: (params, carry, views of the batch, keys (B,)) -> (int32 (B,) actions, carry).
+        sees: what `act` is given.
+    """
 
     params: Any
     init: Callable[[Any, Any], Any]
@@ -38,22 +52,24 @@ class HostPolicy(NamedTuple):
 
 
 class HostAgent(Protocol):
-    """An ego in NumPy, PyTorch or anything else. B tasks are played at once; the agent keeps its own memory."""
+    """An ego outside JAX. It plays B tasks at once and keeps its own memory."""
 
     def reset(self, batch: int) -> None:
-        """A new set of B tasks begins: forget everything."""
+        """Forget everything: a new set of `batch` tasks begins."""
         ...
 
     def act(self, percept: Percept) -> np.ndarray:
-        """Integers (B,) in 0..5 for a `Percept` of arrays with leading axis B: obs uint8 (B, 5, 5, C), ..."""
+        """Returns integers (B,) in 0..5 for a `Percept` of arrays with leading axis B: obs uint8 (B, 5, 5, C), ..."""
         ...
 
 
 def from_host(agent: HostAgent) -> Callable[[Layout], HostPolicy]:
-    """The evaluator's ego of a `HostAgent`; its `act` is called once a step, in order, with all tasks of a group.
+    """Returns the evaluator's ego of a `HostAgent`.
+
+    The agent's `act` is called once per step, in order, with all tasks of one layout and teammate family.
 
     Raises:
-        OptionError: during evaluation, if `act` returns other than B integers.
+        OptionError: during evaluation, if `act` does not return B integers.
     """
 
     def make(layout: Layout) -> HostPolicy:

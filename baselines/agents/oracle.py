@@ -1,13 +1,13 @@
-"""A scripted ego that sees the whole state: how much an ego can matter, beside `stay` and `random`.
+"""A scripted ego that sees the complete state: an estimate of how much an ego can matter, next to `stay` and `random`.
 
-It plays seat 0. It fills one pot at a time with what the recipe lacks, fetches the plate so that it arrives when the
-soup is done, and delivers only what the recipe asks for; any other soup goes onto a counter until it is asked for.
-With a second pot it cooks ahead. What to expect of the teammate it learns by watching: one that cooks and delivers is
-left to its work, one that does only half of that is forestalled. It hands nothing over, which no layout rewards, never
-presses a button, and stays where it cannot matter. No chance is involved.
+It is agent 0. It fills one pot at a time with the ingredients that the recipe still needs, fetches the plate so that it
+arrives when the soup is done, and delivers only soups of the current recipe; any other soup goes onto a counter until
+its recipe comes up. With a second pot it cooks ahead. It learns what to expect of the teammate by watching: it leaves
+the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
+layout rewards, never presses a button, and stays in layouts where it cannot matter. It is deterministic.
 
-P are the pots that the ego reaches, Q the recipes that it may cook: the current one, then the layout's. All times are
-in steps.
+Shapes: `P` pots that the ego reaches, `Q` recipes that it may cook (the current one, then the layout's), `O` obstacles,
+`S` bytes of a state record. All times are in steps.
 """
 
 from __future__ import annotations
@@ -25,37 +25,55 @@ from icrl4aht_data.overcooked.layouts import COOKED, FACING_OF, GOAL, PILE, PLAT
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
 
 FAR = 1000
-"""The time to what cannot be reached, or only when the teammate steps aside."""
+"""Time to a cell that cannot be reached, or only when the teammate steps aside."""
 
 NEVER = 10_000
-"""The cost of what cannot or should not be done."""
+"""Cost of what cannot or should not be done."""
 
-PATIENCE = 10
+WAIT_LIMIT = 10
 """Steps without a change in the pots after which the ego stops waiting for the teammate."""
 
 _DISH = np.uint8(PLATE | COOKED)
 
 
-class Kitchen(NamedTuple):
-    """What the ego knows of a layout before it starts. NumPy."""
+class LayoutFacts(NamedTuple):
+    """Knowledge of a layout, computed before the ego starts. NumPy.
+
+    Attributes:
+        paths: the layout's shortest paths.
+        mine: bool (cells,), cells that the ego can face.
+        shared: bool (cells,), cells that both agents can face.
+        serves: whether the ego can plate and deliver.
+        mate_serves: whether the teammate can plate and deliver the ego's soups.
+        pots: int (P,), numbers of the pots.
+        pot_cells: int (P,), their cells.
+        piles: bool (types, cells), piles of each ingredient that the ego can face.
+        passed: bool (P,), pots that the teammate, walking from its piles, leaves for a nearer one.
+        obstacles: int (O,), cells where a teammate can be in the way; the first is -1, nowhere, and the only one if
+            the agents' rooms are apart.
+        time: int32 (O, cells, 4, cells), steps until the ego, on a cell with a facing, faces another cell.
+        action: int32 (O, cells, 4, cells), first action of that way; INTERACT if it faces the cell already.
+        leg: int32 (cells, cells), steps from facing one cell to facing another, without a teammate in the way.
+        trip: int32 (P, types), steps to carry a piece from its pile to a pot and to return.
+    """
 
     paths: Paths
-    mine: np.ndarray  # bool (cells,), what the ego can face
-    shared: np.ndarray  # bool (cells,), what both can face
-    serves: bool  # the ego can plate and deliver
-    mate_serves: bool  # the teammate can plate and deliver the ego's soups
-    pots: np.ndarray  # int (P,), numbers of the pots
-    pot_cells: np.ndarray  # int (P,)
-    piles: np.ndarray  # bool (types, cells), the piles of each ingredient that the ego can face
-    passed: np.ndarray  # bool (P,), pots that the teammate, coming from its piles, leaves for a nearer one
-    obstacles: np.ndarray  # int (O,), where a teammate can be in the way; first -1, nowhere, alone if rooms are apart
-    time: np.ndarray  # int32 (O, cells, 4, cells), until the ego, on a cell and with a facing, faces a cell
-    action: np.ndarray  # int32 (O, cells, 4, cells), the first on that way; INTERACT if it faces the cell already
-    leg: np.ndarray  # int32 (cells, cells), time from facing one cell to facing another, in an empty room
-    trip: np.ndarray  # int32 (P, types), time to bring a piece from its pile to a pot and to come back
+    mine: np.ndarray
+    shared: np.ndarray
+    serves: bool
+    mate_serves: bool
+    pots: np.ndarray
+    pot_cells: np.ndarray
+    piles: np.ndarray
+    passed: np.ndarray
+    obstacles: np.ndarray
+    time: np.ndarray
+    action: np.ndarray
+    leg: np.ndarray
+    trip: np.ndarray
 
 
-def _study(layout: Layout) -> Kitchen:
+def _study_layout(layout: Layout) -> LayoutFacts:
     paths, kinds = Paths(layout), layout.kinds
     mine, theirs = (np.isin(np.arange(layout.cells), layout.ahead[room]) for room in layout.rooms)
     shared = mine & theirs
@@ -69,17 +87,17 @@ def _study(layout: Layout) -> Kitchen:
     passed = their_way > their_way.min(initial=NEVER)
 
     obstacles = np.array([-1, *(layout.rooms[EGO] if np.array_equal(*layout.rooms) else [])], int)
-    time, action = _ways(layout, obstacles)
+    time, action = _shortest_ways(layout, obstacles)
     leg = np.full((layout.cells, layout.cells), FAR, np.int32)
     np.minimum.at(leg, layout.ahead[layout.rooms[EGO]], time[0, layout.rooms[EGO]])
     trip = np.where(piles[:, :, None], leg + leg.T + 2, FAR).min(axis=1).T[pot_cells]
-    return Kitchen(
+    return LayoutFacts(
         paths, mine, shared, serves, mate_serves, pots, pot_cells, piles, passed, obstacles, time, action, leg, trip
     )
 
 
-def _ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`Kitchen.time` and `Kitchen.action`."""
+def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns `LayoutFacts.time` and `LayoutFacts.action`, by relaxing all ways until none becomes shorter."""
     count, cells, room = len(obstacles), layout.cells, layout.rooms[EGO]
     time = np.full((count, cells, 4, cells), FAR, np.int32)
     for facing in range(4):
@@ -95,56 +113,70 @@ def _ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _hindrance(paths: Paths) -> np.ndarray:
-    """int32 (3, cells, cells): how little the ego should wait on a cell when the teammate is on another one and carries
-    a dish, a plate or an ingredient, or nothing: 16 for the next cell of each way that the teammate may be going, 8
-    beside it, 4 where something other than a counter is used."""
+    """Returns how much the ego would hinder the teammate by waiting on a cell, int32 (3, teammate's cell, ego's cell).
+
+    The first axis is what the teammate carries: a dish, a plate or an ingredient, or nothing. The next cell of each way
+    that the teammate may be taking counts 16, cells next to that one 8, and cells from which something other than a
+    counter is used 4.
+    """
     layout = paths.layout
     used = np.isin(layout.kinds, [GOAL, POT, PILE, PLATES])[layout.ahead].any(axis=1) & layout.walkable
-    table = np.tile(4 * used, (3, layout.cells, 1)).astype(np.int32)
+    hindrance = np.tile(4 * used, (3, layout.cells, 1)).astype(np.int32)
     for carries, kinds in enumerate([[GOAL], [POT], [PILE, PLATES]]):
         ends = {int(cell) for cell in paths.access[np.isin(layout.kinds, kinds)].ravel() if cell >= 0}
         for mate in layout.rooms[TEAMMATE]:
             for end in ends - {int(mate)}:
                 ahead = layout.moves[mate, paths.first_step[mate, end]]
-                table[carries, mate] += 8 * np.maximum(2 - paths.distance[ahead], 0)
-    return table
+                hindrance[carries, mate] += 8 * np.maximum(2 - paths.distance[ahead], 0)
+    return hindrance
 
 
-class Memory(NamedTuple):
-    """What the ego remembers; it outlives episodes."""
+class OracleMemory(NamedTuple):
+    """Memory of the ego, which lasts over the ends of episodes.
 
-    record: UInt8[Array, " S"]  # of the last step
-    action: Int[Array, ""]  # of the last step
-    calm: Int[Array, ""]  # steps since the pots or the recipe changed
-    still: Int[Array, ""]  # steps since the teammate moved
-    bumps: Int[Array, ""]  # steps in a row that the ego failed to move
-    plates: Bool[Array, ""]  # the teammate has held a plate
-    cooks: Bool[Array, ""]  # the teammate has filled a pot
-    parks: Bool[Array, ""]  # the teammate has put a dish onto a counter
+    Attributes:
+        record: uint8 (S,), state record before the last step.
+        action: int32 (), the ego's last action.
+        calm: int32 (), steps since the pots or the recipe changed.
+        still: int32 (), steps since the teammate moved.
+        bumps: int32 (), consecutive steps in which the ego failed to move.
+        plates: bool (), whether the teammate has held a plate.
+        cooks: bool (), whether the teammate has filled a pot.
+        parks: bool (), whether the teammate has put a dish onto a counter.
+    """
+
+    record: UInt8[Array, " S"]
+    action: Int[Array, ""]
+    calm: Int[Array, ""]
+    still: Int[Array, ""]
+    bumps: Int[Array, ""]
+    plates: Bool[Array, ""]
+    cooks: Bool[Array, ""]
+    parks: Bool[Array, ""]
 
 
 def oracle(layout: Layout) -> Policy:
-    """The scripted ego of a layout, without parameters; `act` takes the state record uint8 (S,)."""
-    kitchen = _study(layout)
-    matters = kitchen.serves or bool(np.isin(layout.kinds[kitchen.shared], [POT, WALL]).any())
+    """Returns the scripted ego of a layout, without parameters; its `act` takes the state record uint8 (S,)."""
+    facts = _study_layout(layout)
+    matters = facts.serves or bool(np.isin(layout.kinds[facts.shared], [POT, WALL]).any())
 
-    def init(params, key: Key[Array, ""]) -> Memory:
+    def init(params, key: Key[Array, ""]) -> OracleMemory:
         zero, no = jnp.int32(0), jnp.asarray(False)
-        return Memory(jnp.zeros(record_size(layout), jnp.uint8), zero + STAY, zero, zero, zero, no, no, no)
+        return OracleMemory(jnp.zeros(record_size(layout), jnp.uint8), zero + STAY, zero, zero, zero, no, no, no)
 
-    def act(params, memory: Memory, record: UInt8[Array, " S"], key: Key[Array, ""]):
+    def act(params, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
         if not matters:
             return jnp.int32(STAY), memory
-        scene = Scene(kitchen.paths, record, EGO)
+        scene = Scene(facts.paths, record, EGO)
         memory = _remember(scene, memory)
-        action = _decide(_look(kitchen, scene, memory)).astype(jnp.int32)
+        action = _decide(_view_state(facts, scene, memory)).astype(jnp.int32)
         return action, memory._replace(action=action)
 
     return Policy((), init, act, "state")
 
 
-def _remember(scene: Scene, last: Memory) -> Memory:
-    """The memory after this state, but for the action."""
+def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
+    """Returns the memory with what this state shows; its `action` is still the last one."""
     layout, new = scene.paths.layout, scene.state
     old = unpack(layout, last.record)
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
@@ -154,7 +186,7 @@ def _remember(scene: Scene, last: Memory) -> Memory:
     put = (had >> 2 > 0) & (new.hands[TEAMMATE] == 0)
     onto_counter = jnp.any((new.counters > 0) & (old.counters == 0))
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
-    return Memory(
+    return OracleMemory(
         scene.record,
         last.action,
         jnp.where(same, last.calm + 1, 0),
@@ -166,252 +198,278 @@ def _remember(scene: Scene, last: Memory) -> Memory:
     )
 
 
-class View(NamedTuple):
-    """One state as the ego reads it. Traced."""
+class OracleView(NamedTuple):
+    """One state as the ego reads it; arrays are traced.
 
-    kitchen: Kitchen
+    Attributes:
+        facts: of the layout.
+        scene: the state, from the ego's side.
+        memory: the ego's.
+        origin: index into `LayoutFacts.time` and `action`: the obstacle, the ego's cell and facing.
+        time: int32 (cells,), steps until the ego faces a cell, around the teammate.
+        items: uint8 (cells,), items on counters.
+        sources: bool (types, cells), where each ingredient can be taken.
+        contents: uint8 (P,), contents of the pots, without the cooked flag.
+        timers: int32 (P,), steps until a pot's soup is done.
+        full: bool (P,), whether a pot has three ingredients.
+        right: bool (P,), full pots with the current recipe, done or not.
+        recipes: uint8 (Q,), the recipes.
+        stock: int32 (Q,), soups of each recipe that need no more ingredients.
+        missing: int32 (P, Q, types), ingredients that each pot still needs for each recipe; negative for surplus.
+        risky: bool (), the teammate is likely to take any soup out of the ego's pots, also a wrong one.
+        careful: bool (), the teammate also fills them, and a wrong soup keeps it from cooking the right one.
+        mate_delivers: bool (), the teammate is about to change the recipe.
+    """
+
+    facts: LayoutFacts
     scene: Scene
-    memory: Memory
-    origin: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]  # the obstacle, the ego's cell and facing
-    time: Int[Array, " cells"]  # until the ego faces a cell, around the teammate
-    items: UInt8[Array, " cells"]  # what lies on each counter
-    sources: Bool[Array, "types cells"]  # where each ingredient can be taken
-    contents: UInt8[Array, " P"]  # of the pots, without the cooked flag
+    memory: OracleMemory
+    origin: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+    time: Int[Array, " cells"]
+    items: UInt8[Array, " cells"]
+    sources: Bool[Array, "types cells"]
+    contents: UInt8[Array, " P"]
     timers: Int[Array, " P"]
     full: Bool[Array, " P"]
-    right: Bool[Array, " P"]  # pots with the soup that the recipe asks for, done or not
+    right: Bool[Array, " P"]
     recipes: UInt8[Array, " Q"]
-    stock: Int[Array, " Q"]  # soups of each recipe that need no more ingredients
-    lacking: Int[Array, "P Q types"]  # what each pot lacks of each recipe; negative where it has too much
-    risky: Bool[Array, ""]  # the teammate is likely to take any soup out of the ego's pots, also a wrong one
-    careful: Bool[Array, ""]  # it also fills them, and a wrong soup keeps it from cooking the right one
-    mate_delivers: Bool[Array, ""]  # the teammate is about to change the recipe
+    stock: Int[Array, " Q"]
+    missing: Int[Array, "P Q types"]
+    risky: Bool[Array, ""]
+    careful: Bool[Array, ""]
+    mate_delivers: Bool[Array, ""]
 
     @property
     def dish(self) -> UInt8[Array, ""]:
-        """The one that the recipe asks for."""
+        """The current recipe's soup on a plate."""
         return self.recipes[0] | _DISH
 
     def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
-        """Time to the cells of a mask and from there on; NEVER elsewhere."""
-        return jnp.where(mask & self.kitchen.mine, self.time + then, NEVER)
+        """Returns the time to the cells of a mask plus the time that follows; NEVER for other cells."""
+        return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
     def at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
-        """Time to some of the pots and from there on; NEVER elsewhere."""
-        cells = self.kitchen.pot_cells
+        """Returns the time to some of the pots plus the time that follows; NEVER for other cells."""
+        cells = self.facts.pot_cells
         there = jnp.where(which, self.time[cells] + then, NEVER)
         return jnp.full(self.time.shape, NEVER).at[cells].set(there)
 
     @property
     def parking(self) -> Int[Array, " cells"]:
-        """Costs of putting something down: out of the teammate's reach, or near a pot if the ego only fills pots."""
-        kitchen = self.kitchen
-        near = 2 * kitchen.leg[:, kitchen.pot_cells].min(axis=1, initial=FAR)
-        return self.cost(self.scene.empty_counters, jnp.asarray(3 * kitchen.shared if kitchen.serves else near))
+        """Cost of putting an item down: out of the teammate's reach, or near a pot if the ego only fills pots."""
+        facts = self.facts
+        near = 2 * facts.leg[:, facts.pot_cells].min(axis=1, initial=FAR)
+        return self.cost(self.scene.empty_counters, jnp.asarray(3 * facts.shared if facts.serves else near))
 
     @property
     def plates(self) -> Bool[Array, " cells"]:
-        return (self.scene.plate_piles | (self.items == PLATE)) & self.kitchen.mine
+        """Cells where the ego can take a plate."""
+        return (self.scene.plate_piles | (self.items == PLATE)) & self.facts.mine
 
     @property
     def plans(self) -> Int[Array, "P Q"]:
-        """Costs of cooking a recipe in a pot: first what is least in stock, then the least work."""
-        trip = self.kitchen.trip[:, None]
-        enough = jnp.all((self.lacking >= 0) & ((self.lacking == 0) | (trip < FAR)), axis=-1)
+        """Cost of cooking each recipe in each pot: the recipe least in stock first, then the least work."""
+        trip = self.facts.trip[:, None]
+        enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
         possible = enough & ~self.full[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
-        # Beside a cooking teammate: nothing ahead in a pot that it uses, unless nothing else is left.
-        wanted = jnp.where(short, current, self.kitchen.passed[:, None]) | (short & ~jnp.any(possible[:, 0]))
-        work = jnp.sum(self.lacking * np.minimum(trip, FAR // 10), axis=-1)
+        # With a cooking teammate: cook nothing ahead in a pot that it uses, unless nothing else is left to do.
+        wanted = jnp.where(short, current, self.facts.passed[:, None]) | (short & ~jnp.any(possible[:, 0]))
+        work = jnp.sum(self.missing * np.minimum(trip, FAR // 10), axis=-1)
         return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
 
     @property
     def spoiled(self) -> Bool[Array, " P"]:
-        """Pots with a beginning that leads nowhere, to be filled up with anything and cleared if nothing else helps."""
+        """Pots whose contents fit no recipe, to be filled up with anything and cleared if nothing else helps."""
         nowhere = ~self.full & (self.contents > 0) & (jnp.min(self.plans, axis=1) == NEVER)
-        return nowhere & (self.stock[0] == 0) & self.kitchen.serves
+        return nowhere & (self.stock[0] == 0) & self.facts.serves
 
     @property
     def clears(self) -> Bool[Array, ""]:
-        """Whether a soup that nobody asks for has to leave its pot."""
+        """Whether soups of no current recipe have to leave their pots."""
         return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plans[:, 0]) == NEVER))
 
     @property
     def mate_takes(self) -> Bool[Array, " P"]:
-        """The soup that is the teammate's to serve: the first right one, if it cooks, too, and does not dawdle."""
+        """Soup left to the teammate to serve: the first right one, if it also cooks and does not idle."""
         first = jnp.arange(len(self.timers)) == jnp.argmin(jnp.where(self.right, self.timers, NEVER))
         elsewhere = (self.scene.partner_hand & COOKED > 0) | (
             self.scene.holds_plate & (self.scene.partner_hand != PLATE)
         )
-        dawdles = (self.memory.calm >= PATIENCE) & (self.timers == 0)
-        return self.right & first & self.careful & ~self.memory.parks & ~elsewhere & ~dawdles
+        idles = (self.memory.calm >= WAIT_LIMIT) & (self.timers == 0)
+        return self.right & first & self.careful & ~self.memory.parks & ~elsewhere & ~idles
 
     @property
     def too_early(self) -> Bool[Array, " P"]:
-        """Pots to wait at."""
+        """Pots in front of which the ego waits instead of interacting."""
         hand, mixed = self.scene.hand, self.contents + self.scene.hand
         completes = self.careful & (ingredient_count(mixed) == 3)
-        # A wrong soup, or a second one, may be done only soon after one that the teammate waits for.
+        # A wrong soup, or a second one, should finish soon after one that the teammate waits for.
         ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
-        spoils = ahead & ~jnp.any(self.right & (self.timers >= PATIENCE))
-        leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < PATIENCE)
+        spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
+        leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)
         unknown = self.mate_delivers & (self.careful | (len(self.timers) == 1))
         adds = self.full | (completes & (spoils | leaves_it)) | unknown
         return (self.timers > 0) | (self.scene.holds_ingredient & adds)
 
 
-def _look(kitchen: Kitchen, scene: Scene, memory: Memory) -> View:
+def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
     state, layout = scene.state, scene.paths.layout
-    obstacle = jnp.argmax(jnp.asarray(kitchen.obstacles) == scene.partner)
+    obstacle = jnp.argmax(jnp.asarray(facts.obstacles) == scene.partner)
     origin = (obstacle, scene.me, state.facings[EGO].astype(jnp.int32))
     items = jnp.zeros(layout.cells, jnp.uint8).at[np.array(layout.counters, int)].set(state.counters)
-    lying = items == (4 << 2 * np.arange(len(kitchen.piles)))[:, None]
-    contents = state.pot_items[kitchen.pots] & np.uint8(0xFF - COOKED)
+    lying = items == (4 << 2 * np.arange(len(facts.piles)))[:, None]
+    contents = state.pot_items[facts.pots] & np.uint8(0xFF - COOKED)
     full = ingredient_count(contents) == 3
     recipes = jnp.concatenate([state.recipe[None], jnp.asarray(layout.recipe_items)])
     cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
-    plated = ((items[:, None] == recipes | _DISH) & kitchen.mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
-    risky = memory.plates & kitchen.mate_serves
-    return View(
-        kitchen,
+    plated = ((items[:, None] == recipes | _DISH) & facts.mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
+    risky = memory.plates & facts.mate_serves
+    return OracleView(
+        facts,
         scene,
         memory,
         origin,
-        time=jnp.asarray(kitchen.time)[origin],
+        time=jnp.asarray(facts.time)[origin],
         items=items,
-        sources=(jnp.asarray(kitchen.piles) | lying) & kitchen.mine,
+        sources=(jnp.asarray(facts.piles) | lying) & facts.mine,
         contents=contents,
-        timers=state.pot_timers[kitchen.pots].astype(jnp.int32),
+        timers=state.pot_timers[facts.pots].astype(jnp.int32),
         full=full,
         right=full & (contents == state.recipe),
         recipes=recipes,
         stock=cooked + plated + ((scene.partner_hand == recipes | _DISH) & ~memory.parks),
-        lacking=scene.counts(recipes) - scene.counts(contents)[:, None],
+        missing=scene.counts(recipes) - scene.counts(contents)[:, None],
         risky=risky,
         careful=risky & memory.cooks,
         mate_delivers=(scene.partner_hand == state.recipe | _DISH) & ~memory.parks,
     )
 
 
-class Option(NamedTuple):
-    """Something to do: go to the cheapest cell and interact."""
+class Subgoal(NamedTuple):
+    """One thing to do: go to the cheapest cell and interact.
+
+    Attributes:
+        when: bool (), whether it applies.
+        cost: int32 (cells,).
+    """
 
     when: Bool[Array, ""]
     cost: Int[Array, " cells"]
 
 
-def _decide(view: View) -> Int[Array, ""]:
-    """The action: the first option that holds and is possible."""
-    kitchen, options = view.kitchen, _with_dish(view)
-    if len(kitchen.pots):
+def _decide(view: OracleView) -> Int[Array, ""]:
+    """Returns the action of the first option that applies and is possible."""
+    facts, options = view.facts, _with_dish(view)
+    if len(facts.pots):
         options += _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
     possible = jnp.stack([option.when & (jnp.min(option.cost) < NEVER) for option in options])
     target = jnp.argmin(jnp.stack([option.cost for option in options])[jnp.argmax(possible)])
-    action = jnp.asarray(kitchen.action)[view.origin][target]
-    waits = jnp.any((kitchen.pot_cells == target) & view.too_early) & (action == INTERACT)
+    action = jnp.asarray(facts.action)[view.origin][target]
+    waits = jnp.any((facts.pot_cells == target) & view.too_early) & (action == INTERACT)
     action = jnp.where(waits, STAY, action)
-    if len(kitchen.obstacles) > 1:
-        return _beside_teammate(view, jnp.any(possible), target, action)
+    if len(facts.obstacles) > 1:
+        return _act_in_shared_room(view, jnp.any(possible), target, action)
     return jnp.where(jnp.any(possible), action, STAY)
 
 
-def _with_dish(view: View) -> list[Option]:
-    scene, kitchen = view.scene, view.kitchen
-    wanted = (view.items == view.dish) & kitchen.mine & bool((scene.paths.static(GOAL) & kitchen.mine).any())
+def _with_dish(view: OracleView) -> list[Subgoal]:
+    scene, facts = view.scene, view.facts
+    wanted = (view.items == view.dish) & facts.mine & bool((scene.paths.static(GOAL) & facts.mine).any())
     options = [
-        Option(scene.hand == view.dish, view.cost(scene.goals)),
-        Option(scene.holds_dish, view.parking),
-        Option(scene.holds_nothing, view.cost(wanted)),
-        Option(jnp.any(wanted), view.parking),
+        Subgoal(scene.hand == view.dish, view.cost(scene.goals)),
+        Subgoal(scene.holds_dish, view.parking),
+        Subgoal(scene.holds_nothing, view.cost(wanted)),
+        Subgoal(jnp.any(wanted), view.parking),
     ]
-    if not len(kitchen.pots):  # wait where the teammate may put down what only the ego will deliver
+    if not len(facts.pots):  # wait where the teammate may put down a dish that only the ego will deliver
         near = view.cost(
-            scene.empty_counters & kitchen.shared, jnp.asarray(scene.paths.manhattan)[scene.partner] - view.time
+            scene.empty_counters & facts.shared, jnp.asarray(scene.paths.manhattan)[scene.partner] - view.time
         )
-        options.append(Option(scene.holds_nothing & (scene.partner_hand == view.dish), near))
+        options.append(Subgoal(scene.holds_nothing & (scene.partner_hand == view.dish), near))
     return options
 
 
-def _with_plate(view: View) -> list[Option]:
+def _with_plate(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plans) < NEVER
     right = view.right & ~view.mate_takes
-    soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= PATIENCE
-    rest = jnp.maximum(view.timers - view.time[view.kitchen.pot_cells], 0)
+    soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
+    rest = jnp.maximum(view.timers - view.time[view.facts.pot_cells], 0)
     return [
-        Option(holds & (soon | ~building), view.at_pots(right, rest)),
-        Option(holds & (view.clears | ~building), view.at_pots(view.full & ~view.right, rest)),
-        Option(holds, view.parking),
+        Subgoal(holds & (soon | ~building), view.at_pots(right, rest)),
+        Subgoal(holds & (view.clears | ~building), view.at_pots(view.full & ~view.right, rest)),
+        Subgoal(holds, view.parking),
     ]
 
 
-def _with_ingredient(view: View) -> list[Option]:
+def _with_ingredient(view: OracleView) -> list[Subgoal]:
     holds, kind = view.scene.holds_ingredient, view.scene.counts(view.scene.hand) > 0
-    takes = jnp.any((view.lacking > 0) & kind, axis=-1)
-    # What is for later goes into a pot only if another one is left for the current recipe.
+    takes = jnp.any((view.missing > 0) & kind, axis=-1)
+    # An ingredient for a later recipe goes into a pot only if another pot is left for the current recipe.
     fits = view.plans[:, 0] < NEVER
     spare = (view.recipes == view.recipes[0]) | (view.stock[0] > 0) | (jnp.sum(fits) > fits)[:, None]
     plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plans, NEVER), axis=1)
     return [
-        Option(holds, view.at_pots(plans < NEVER, plans)),
-        Option(holds & ~jnp.any(fits), view.at_pots(view.spoiled)),
-        Option(holds & (not view.kitchen.serves), view.at_pots(view.full | view.mate_delivers)),
-        Option(holds, view.parking),
+        Subgoal(holds, view.at_pots(plans < NEVER, plans)),
+        Subgoal(holds & ~jnp.any(fits), view.at_pots(view.spoiled)),
+        Subgoal(holds & (not view.facts.serves), view.at_pots(view.full | view.mate_delivers)),
+        Subgoal(holds, view.parking),
     ]
 
 
-def _with_nothing(view: View) -> list[Option]:
-    kitchen, scene, plans = view.kitchen, view.scene, view.plans
+def _with_nothing(view: OracleView) -> list[Subgoal]:
+    facts, scene, plans = view.facts, view.scene, view.plans
     empty = scene.holds_nothing
-    to_pot = jnp.asarray(kitchen.leg)[:, kitchen.pot_cells]
+    to_pot = jnp.asarray(facts.leg)[:, facts.pot_cells]
 
     def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
         return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
 
-    def plate_for(which: Bool[Array, " P"]) -> Option:
-        return Option(empty & jnp.any(which), view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1)))
+    def plate_for(which: Bool[Array, " P"]) -> Subgoal:
+        return Subgoal(empty & jnp.any(which), view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1)))
 
     pot, recipe = jnp.unravel_index(jnp.argmin(plans), plans.shape)
     builds = empty & (jnp.min(plans) < NEVER)
-    lacking = view.lacking[pot, recipe]
-    brings = (scene.partner_hand & PLATE == 0) & (view.memory.calm < PATIENCE)
-    coming = scene.counts(scene.partner_hand) * brings
-    ingredients = fetch(lacking > coming, to_pot[:, pot])
-    quick = jnp.sum(lacking * jnp.asarray(kitchen.trip)[pot]) <= PATIENCE - 4
+    missing = view.missing[pot, recipe]
+    delivering = (scene.partner_hand & PLATE == 0) & (view.memory.calm < WAIT_LIMIT)
+    coming = scene.counts(scene.partner_hand) * delivering
+    ingredients = fetch(missing > coming, to_pot[:, pot])
+    quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
     arrival = jnp.min(jnp.where(view.plates[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
     due = view.timers <= arrival + 2
-    right = view.right & ~view.mate_takes & kitchen.serves
-    wrong = view.full & ~view.right & view.clears & kitchen.serves
+    right = view.right & ~view.mate_takes & facts.serves
+    wrong = view.full & ~view.right & view.clears & facts.serves
     used = jnp.any(scene.counts(view.recipes) > 0, axis=0)
     return [
-        Option(builds & quick & ~view.risky, ingredients),
+        Subgoal(builds & quick & ~view.risky, ingredients),
         plate_for(right & due),
         plate_for(wrong & due & view.risky),
-        Option(builds, ingredients),
+        Subgoal(builds, ingredients),
         plate_for(right),
         plate_for(wrong),
-        Option(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, 0])),
-        # Who only fills pots has a piece ready for the next soup.
-        Option(empty & jnp.any(view.full | view.mate_delivers) & (not kitchen.serves), fetch(used, to_pot[:, 0])),
+        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, 0])),
+        # An ego that only fills pots holds a piece ready for the next soup.
+        Subgoal(empty & jnp.any(view.full | view.mate_delivers) & (not facts.serves), fetch(used, to_pot[:, 0])),
     ]
 
 
-def _beside_teammate(view: View, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
-    """The action in a room that both share: wait out of the teammate's way, and do not bump into it for ever."""
-    scene, kitchen, still = view.scene, view.kitchen, view.memory.still
+def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
+    """Returns the action in a room that both agents share: wait out of the teammate's way, without blocking forever."""
+    scene, facts, still = view.scene, view.facts, view.memory.still
     layout, origin = scene.paths.layout, view.origin[1:]
     ahead = jnp.asarray(layout.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
     pushed = (ahead == scene.me) & (still > 0)
     reachable = found & (view.time[target] < FAR)
-    # Who stands where the ego has to go may leave in this very step; who does not may be waiting for the ego.
+    # A teammate on the ego's way may leave it in this very step; one that does not may be waiting for the ego.
     follows = found & ~reachable & ~pushed & (still < 3)
-    through = jnp.asarray(kitchen.action)[0, *origin, target]
+    through = jnp.asarray(facts.action)[0, *origin, target]
 
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
     ends = jnp.asarray(layout.moves[:, : STAY + 1].astype(np.int32))[scene.me]
     stays = jnp.arange(STAY + 1) == STAY
     taken = (ends == scene.partner) | ((ends == scene.me) & ~stays) | (stays & pushed)
-    away = jnp.where(found, jnp.asarray(kitchen.time[0].min(axis=1))[ends, target], 0)
+    away = jnp.where(found, jnp.asarray(facts.time[0].min(axis=1))[ends, target], 0)
     hindrance = jnp.asarray(_hindrance(scene.paths))[carries, scene.partner, ends]
     aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
 

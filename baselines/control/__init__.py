@@ -1,1 +1,1 @@
-"""The positive control: worlds in which the models must adapt in context."""
+"""Positive control: small worlds in which the methods must adapt in context."""

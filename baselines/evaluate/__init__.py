@@ -1,4 +1,4 @@
-"""The evaluation protocols and the evaluator."""
+"""Evaluation of egos on the benchmark's tasks, under named protocols."""
 
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS, Protocol, get_protocol

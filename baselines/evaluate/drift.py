@@ -1,4 +1,4 @@
-"""How far `cached` acting drifts from `exact` (see `agents.ACTING`), measured on episodes that the cached ego plays."""
+"""Difference between `cached` and `exact` acting (see `agents.egos.ACTING`), on episodes that the cached ego plays."""
 
 from __future__ import annotations
 
@@ -13,53 +13,63 @@ from jaxtyping import Bool, Float, Int
 from baselines.evaluate.evaluator import prepare_rollout
 from baselines.evaluate.protocols import Protocol
 from baselines.methods.method import Method
-from baselines.methods.tokens import step_of
+from baselines.methods.tokens import percept_step
 from generation.policy import Policy
 from icrl4aht_data.benchmark.tasks import Task
 
 
 class Drift(NamedTuple):
-    """One episode of T steps of B tasks."""
+    """Comparison of both policies in one episode of T steps of B tasks.
 
-    distance: Float[np.ndarray, "B T"]  # total variation between the two policies, 0..1
-    same: Bool[np.ndarray, "B T"]  # whether both would take the same action
+    Attributes:
+        distance: float32 (B, T), total variation between the policies, 0..1.
+        same: bool (B, T), whether both would take the same action.
+    """
+
+    distance: Float[np.ndarray, "B T"]
+    same: Bool[np.ndarray, "B T"]
 
 
-class _Both(NamedTuple):
-    """What the ego remembers either way, and the running episode's comparison."""
+class _BothMemories(NamedTuple):
+    """Memories of both ways of acting, and the running episode's comparison, (T,)."""
 
-    kept: Any
-    anew: Any
+    cached: Any
+    exact: Any
     steps: Int[jax.Array, ""]
     distance: Float[jax.Array, " T"]
     same: Bool[jax.Array, " T"]
 
 
-def measure(method: Method, params: Any, context: int, tasks: Sequence[Task], protocol: Protocol) -> Iterator[Drift]:
-    """Episode after episode of tasks that share a layout and a teammate family.
+def measure_drift(
+    method: Method, params: Any, context: int, tasks: Sequence[Task], protocol: Protocol
+) -> Iterator[Drift]:
+    """Compare both ways of acting on tasks that share a layout and a teammate family.
 
     Args:
-        method, params, context: the model, see `agents.learned`.
+        method, params, context: the model, see `agents.egos.learned`.
         tasks: B of them.
-        protocol: says how many episodes.
+        protocol: also sets the number of episodes.
+
+    Yields:
+        One `Drift` per episode.
     """
     length = protocol.steps
 
-    def init(params: Any, key: Any) -> _Both:
-        kept, anew = (method.start(context, cached) for cached in (True, False))
-        return _Both(kept, anew, jnp.int32(0), jnp.zeros(length), jnp.zeros(length, bool))
+    def init(params: Any, key: Any) -> _BothMemories:
+        cached, exact = (method.start(context, way) for way in (True, False))
+        return _BothMemories(cached, exact, jnp.int32(0), jnp.zeros(length), jnp.zeros(length, bool))
 
-    def act(params: Any, both: _Both, percept: Any, key: Any) -> tuple[Any, _Both]:
-        (one, kept), (two, anew) = (
-            method.act(params, step_of(percept), percept.prev_done, memory) for memory in (both.kept, both.anew)
+    def act(params: Any, both: _BothMemories, percept: Any, key: Any) -> tuple[Any, _BothMemories]:
+        (one, cached), (two, exact) = (
+            method.act(params, percept_step(percept), percept.prev_done, memory) for memory in (both.cached, both.exact)
         )
         distance, same = jnp.abs(jax.nn.softmax(one) - jax.nn.softmax(two)).sum() / 2, one.argmax() == two.argmax()
-        at = both.steps % length
-        after = _Both(kept, anew, both.steps + 1, both.distance.at[at].set(distance), both.same.at[at].set(same))
-        return one.argmax().astype(jnp.int32), after
+        t = both.steps % length
+        compared = both.distance.at[t].set(distance), both.same.at[t].set(same)
+        return one.argmax().astype(jnp.int32), _BothMemories(cached, exact, both.steps + 1, *compared)
 
     ego = Policy(params, init, act, "percept")
-    rollout, tables, episode = prepare_rollout(lambda layout: ego, tasks, protocol)
+    rollout, state, episode = prepare_rollout(lambda layout: ego, tasks, protocol)
     for _ in range(protocol.episodes):
-        tables, _ = episode(params, rollout.teammate_params, tables)
-        yield Drift(np.asarray(tables.ego.distance), np.asarray(tables.ego.same))
+        state, _ = episode(params, rollout.teammate_params, state)
+        yield Drift(np.asarray(state.ego.distance), np.asarray(state.ego.same))

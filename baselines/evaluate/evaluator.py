@@ -1,8 +1,8 @@
-"""The one evaluator: any ego on any tasks, under a named protocol (paper, Sec. 4.3).
+"""The evaluator: any ego on any tasks, under a named protocol (paper, Sec. 4.3).
 
-A task is 100 episodes of 100 steps in sequence; the ego's memory lives through the task, the teammate's through an
-episode. The key of an episode is a function of (seed, task_id, episode) alone, so a task's result is the same whatever
-ran beside it.
+A task is 100 episodes of 100 steps in sequence. The ego's memory lasts for the task, the teammate's for an episode. An
+episode's key is a function of (seed, task_id, episode) alone, so a task's result does not depend on what else is
+evaluated in the same batch or process.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from baselines.agents.host import HostPolicy
 from baselines.evaluate.protocols import Protocol
-from baselines.evaluate.results import Result, _store, _stored
+from baselines.evaluate.results import Result, find_result, write_result
 from baselines.evaluate.rollout import Episode, EvaluationRollout, RolloutState, task_key
 from generation.policy import Policy
 from generation.teammates.registry import build, check_theta
@@ -32,10 +32,13 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.threads import usable_cores
 
+MakeEgo = Callable[[Layout], Policy | HostPolicy]
+"""Layout -> ego."""
+
 
 def evaluate(
     agent: str,
-    make_ego: Callable[[Layout], Policy | HostPolicy],
+    make_ego: MakeEgo,
     tasks: Sequence[Task],
     protocol: Protocol,
     *,
@@ -50,20 +53,20 @@ def evaluate(
     Args:
         agent: its name, part of the settings.
         make_ego: the ego for a layout.
-        tasks: any tasks; those of one layout and family run together.
+        tasks: any tasks; those of one layout and teammate family run together.
         protocol: see `PROTOCOLS`.
         seeds: each plays every task once, all in one batch.
-        suite: the folder that learned teammates' checkpoints are in.
-        out: a folder for one JSON per task; results of the same settings found there are taken instead of run again.
-        details: what else the ego's results depend on, part of the settings.
-        done: called with the number of tasks finished, for progress.
+        suite: folder of learned teammates' checkpoints.
+        out: folder for one JSON file per task; results of the same settings found there are not computed again.
+        details: further settings that the ego's results depend on.
+        done: called with the number of tasks just finished, for progress.
 
     Returns:
         One result per task, in the order of `tasks`.
 
     Raises:
         OptionError: if `out` holds results of other settings, or the ego's action is not one integer.
-        TaskFormatError: for a teammate whose parameters are not possible; names the task.
+        TaskFormatError: if a teammate's parameters are impossible; names the task.
     """
     for task in tasks:
         _check_teammate(task, suite)
@@ -73,7 +76,8 @@ def evaluate(
         "protocol": asdict(protocol),
         "code_version": version("icrl4aht-data"),
     } | ({"details": details} if details else {})
-    results = {task.task_id: found for task in tasks if (found := _stored(out, task, settings))}
+    stored = {task.task_id: find_result(out, task.task_id, settings) for task in tasks} if out else {}
+    results = {task_id: result for task_id, result in stored.items() if result}
     done(len(results))
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
     for task in tasks:
@@ -82,51 +86,46 @@ def evaluate(
 
     layouts = {group[0].layout.name: group[0].layout for group in groups.values()}
     egos = {name: make_ego(layout) for name, layout in layouts.items()}
-    outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
 
     def run(group: list[Task], stopped: Event) -> list[Result]:
-        game = prepare_rollout(lambda layout: egos[layout.name], group, protocol, seeds, suite)
-        return _run_group(group, game, len(seeds), settings, stopped)
+        prepared = prepare_rollout(lambda layout: egos[layout.name], group, protocol, seeds, suite)
+        return _evaluate_group(group, prepared, len(seeds), settings, stopped)
 
-    for found in _side_by_side(run, list(groups.values()), threads=1 if outside else min(4, usable_cores())):
-        for result in found:
-            results[result.task_id] = result
-            _store(out, result)
-        done(len(found))
+    # Groups run side by side: one compiles while another plays, and one alone does not use all cores. An ego outside
+    # JAX gets a single thread, since its `reset` must come right before its episodes.
+    outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
+    stopped = Event()
+    with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
+        try:
+            for future in as_completed([pool.submit(run, group, stopped) for group in groups.values()]):
+                for result in future.result():
+                    results[result.task_id] = result
+                    if out:
+                        write_result(out, result)
+                done(len(future.result()))
+        finally:
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
     return [results[task.task_id] for task in tasks]
 
 
 def _check_teammate(task: Task, suite: Path | None) -> None:
-    """Before any long work."""
     try:
         if task.teammate["kind"] == "heuristic":
             check_theta(task.teammate)
         else:
             build(task.layout, task.teammate, suite=suite)
     except Icrl4ahtError as error:
-        raise type(error)(f"task {task.task_id}: {error}") from error
+        error.args = (f"task {task.task_id}: {error}",)
+        raise
 
 
-def _side_by_side(
-    run: Callable[[list[Task], Event], list[Result]], groups: Sequence[list[Task]], threads: int
-) -> Iterator[list[Result]]:
-    """The groups' results as they come: one compiles while another plays, and a game alone does not fill a machine.
-
-    An ego outside JAX gets one thread: its `reset` must come right before its game.
-    """
-    stopped = Event()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for future in as_completed([pool.submit(run, group, stopped) for group in groups]):
-                yield future.result()
-        finally:
-            stopped.set()
-            pool.shutdown(cancel_futures=True)
-
-
-def _run_group(tasks: list[Task], game: Game, seeds: int, settings: dict[str, Any], stopped: Event) -> list[Result]:
+def _evaluate_group(
+    tasks: list[Task], prepared: PreparedRollout, seeds: int, settings: dict[str, Any], stopped: Event
+) -> list[Result]:
+    """Returns the results of tasks of one layout and teammate family; none if it was stopped."""
     returns = []
-    for played in play(game, game.rollout.protocol.episodes):
+    for played in play_episodes(prepared, prepared.rollout.protocol.episodes):
         if stopped.is_set():
             return []
         ego = played.actions[..., EGO]
@@ -138,68 +137,87 @@ def _run_group(tasks: list[Task], game: Game, seeds: int, settings: dict[str, An
     return [Result(task.task_id, settings, rows.tolist()) for task, rows in zip(tasks, per_task, strict=True)]
 
 
-class Game(NamedTuple):
-    """Tasks of one layout and family, ready to play."""
+class PreparedRollout(NamedTuple):
+    """Tasks of one layout and teammate family, ready to play.
+
+    Attributes:
+        rollout: the tasks' rollout.
+        state: before the first episode.
+        episode: compiled `EvaluationRollout.episode`.
+    """
 
     rollout: EvaluationRollout
-    tables: RolloutState  # before the first episode
-    episode: Callable[..., tuple[RolloutState, Episode]]  # compiled
+    state: RolloutState
+    episode: Callable[..., tuple[RolloutState, Episode]]
 
 
 def prepare_rollout(
-    make_ego: Callable[[Layout], Policy | HostPolicy],
+    make_ego: MakeEgo,
     tasks: Sequence[Task],
     protocol: Protocol,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
-) -> Game:
-    """Compile the game of tasks that share a layout and a teammate family."""
+) -> PreparedRollout:
+    """Compile the episodes of tasks that share a layout and a teammate family.
+
+    Raises:
+        OptionError: if the ego's action is not one integer for each observation.
+    """
     layout = tasks[0].layout
     mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks]
     rollout = EvaluationRollout(layout, make_ego(layout), [mate for mate in mates for _ in seeds], protocol)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)
-    tables = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
-    _check_ego(rollout, tables)
+    state = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
+    _check_actions(rollout, state)
     episode = jax.jit(rollout.episode)
     if outside:
-        return Game(rollout, tables, episode)
-    return Game(rollout, tables, episode.lower(rollout.ego.params, rollout.teammate_params, tables).compile())
+        return PreparedRollout(rollout, state, episode)
+    compiled = episode.lower(rollout.ego.params, rollout.teammate_params, state).compile()
+    return PreparedRollout(rollout, state, compiled)
 
 
-def play_tasks(
-    make_ego: Callable[[Layout], Policy | HostPolicy],
-    tasks: Sequence[Task],
-    protocol: Protocol,
-    seeds: Sequence[int] = (0,),
-    suite: Path | None = None,
-) -> Iterator[Episode]:
-    """Episode after episode of tasks that share a layout and a teammate family.
-
-    Yields:
-        `Episode` with B = tasks x seeds, seeds varying fastest.
-    """
-    yield from play(prepare_rollout(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
-
-
-def play(game: Game, episodes: int) -> Iterator[Episode]:
-    """Episode after episode."""
-    rollout, tables, episode = game
-    params = rollout.teammate_params
-    for _ in range(episodes):
-        try:
-            tables, played = jax.block_until_ready(episode(rollout.ego.params, params, tables))
-        except jax.errors.JaxRuntimeError as error:  # what an agent outside JAX raised comes wrapped
-            raise OptionError(f"the ego failed on {rollout.layout.name}: {error}") from error
-        yield played
-
-
-def _check_ego(rollout: EvaluationRollout, tables: RolloutState) -> None:
-    """One traced step says whether the egos' actions have the right shape and type."""
-    keys = tables.env.key
-    actions, _ = jax.eval_shape(rollout._ego.act, rollout.ego.params, tables.ego, rollout.ego_view(tables), keys)
+def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
+    """Traces one step of the egos, which yields shape and dtype of their actions without computing any."""
+    keys = state.env.key
+    ego = rollout.batched_ego
+    actions, _ = jax.eval_shape(ego.act, ego.params, state.ego, rollout.ego_view(state), keys)
     if actions.shape != keys.shape or not jnp.issubdtype(actions.dtype, jnp.integer):
         raise OptionError(
             f"the ego's actions are {actions.dtype} of shape {actions.shape} for {keys.shape[0]} observations, "
             f"expected one integer 0..5 for each"
         )
+
+
+def play_tasks(
+    make_ego: MakeEgo,
+    tasks: Sequence[Task],
+    protocol: Protocol,
+    seeds: Sequence[int] = (0,),
+    suite: Path | None = None,
+) -> Iterator[Episode]:
+    """Play tasks that share a layout and a teammate family.
+
+    Yields:
+        One `Episode` after another with B = tasks x seeds; seeds vary fastest.
+    """
+    yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
+
+
+def play_episodes(prepared: PreparedRollout, episodes: int) -> Iterator[Episode]:
+    """Play episodes of prepared tasks.
+
+    Yields:
+        One `Episode` after another.
+
+    Raises:
+        OptionError: if an ego outside JAX fails.
+    """
+    rollout, state, episode = prepared
+    params = rollout.teammate_params
+    for _ in range(episodes):
+        try:
+            state, played = jax.block_until_ready(episode(rollout.ego.params, params, state))
+        except jax.errors.JaxRuntimeError as error:  # an exception of an agent outside JAX arrives wrapped
+            raise OptionError(f"the ego failed on {rollout.layout.name}: {error}") from error
+        yield played

@@ -1,21 +1,27 @@
-"""TODO."""
+"""Evaluation protocols, and smaller versions of the benchmark: fewer tasks, fewer episodes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from generation.policy import Noise
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import OptionError, unknown
 
 
 @dataclass(frozen=True)
 class Protocol:
     """How tasks are evaluated.
 
-    Args:
-        noise: of heuristic teammates, see `generation.policy.Noise`.
-        four_recipes: whether Track 2 draws from four recipes, as the published numbers do, or from its layouts' two.
+    Attributes:
+        name: as in `PROTOCOLS`.
+        noise: randomness of heuristic teammates, see `generation.policy.Noise`.
+        four_recipes: whether Track 2 draws from four recipes, as for the published numbers, or from its layouts' two.
+        episodes: of each task.
+        steps: of each episode.
     """
 
     name: str
@@ -32,12 +38,37 @@ PROTOCOLS = {
 """`published` compares with the paper's numbers; `seeded`, the default, is what to report."""
 
 
-def get_protocol(name: str) -> Protocol:
-    """The protocol of that name.
+def get_protocol(name: str, episodes: int | None = None) -> Protocol:
+    """Returns the protocol of a name, with another number of episodes per task if one is given.
 
     Raises:
-        UnknownNameError: lists the valid names and the nearest.
+        UnknownNameError: if there is no such protocol; lists the valid names and the nearest.
+        OptionError: if the number of episodes is not positive.
     """
     if name not in PROTOCOLS:
         raise unknown("protocol", name, PROTOCOLS)
-    return PROTOCOLS[name]
+    if episodes is None:
+        return PROTOCOLS[name]
+    if episodes < 1:
+        raise OptionError(f"episodes = {episodes}: expected at least 1")
+    return replace(PROTOCOLS[name], episodes=episodes)
+
+
+def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
+    """Returns the first `count` tasks of each layout and teammate kind, in order; all tasks for None.
+
+    Raises:
+        OptionError: if `count` is not positive.
+    """
+    if count is None:
+        return list(tasks)
+    if count < 1:
+        raise OptionError(f"tasks = {count}: expected at least 1 of each family and layout")
+    taken: dict[tuple[str, str], int] = defaultdict(int)
+    chosen = []
+    for task in tasks:
+        group = task.layout.name, task.teammate_kind
+        if taken[group] < count:
+            chosen.append(task)
+        taken[group] += 1
+    return chosen

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Results of evaluation: one JSON file per task, with the settings that it was made under."""
 
 from __future__ import annotations
 
@@ -7,41 +7,53 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash
 
 
 @dataclass(frozen=True)
 class Result:
-    """One task's outcome."""
+    """Outcome of one task.
+
+    Attributes:
+        task_id: of the task.
+        settings: agent, seeds, protocol, version and details that the outcome depends on.
+        returns: team return of each episode, one list per seed.
+    """
 
     task_id: str
     settings: dict[str, Any]
-    returns: list[list[float]]  # team return of each episode, by seed
+    returns: list[list[float]]
 
     def to_json(self) -> dict[str, Any]:
+        """Returns the content of the result's file."""
         return {"settings_hash": json_hash(self.settings), **asdict(self)}
 
 
-def _path(out: Path, task_id: str) -> Path:
+def result_path(out: Path, task_id: str) -> Path:
+    """Returns the path of a task's result in a folder of results."""
     return out / "tasks" / f"{task_id}.json"
 
 
-def _stored(out: Path | None, task: Task, settings: dict[str, Any]) -> Result | None:
-    if out is None or not _path(out, task.task_id).exists():
+def find_result(out: Path, task_id: str, settings: dict[str, Any]) -> Result | None:
+    """Returns a task's result from a folder of results, or None if there is none yet.
+
+    Raises:
+        OptionError: if the result was made under other settings, or its file is damaged.
+    """
+    path = result_path(out, task_id)
+    if not path.exists():
         return None
-    path = _path(out, task.task_id)
     result = read_result(path)
     if result.settings != settings:
         raise OptionError(
-            f"{path}: holds a result of other settings ({result.settings}), asked for {settings}; give another --out"
+            f"{path}: holds a result of other settings ({result.settings}), expected {settings}; give another --out"
         )
     return result
 
 
 def read_result(path: Path) -> Result:
-    """One task's result.
+    """Returns the result in a file.
 
     Raises:
         OptionError: if the file is not a result, or its settings do not match their hash.
@@ -57,10 +69,9 @@ def read_result(path: Path) -> Result:
     return result
 
 
-def _store(out: Path | None, result: Result) -> None:
-    if out is None:
-        return
-    path = _path(out, result.task_id)
+def write_result(out: Path, result: Result) -> None:
+    """Write a task's result into a folder of results."""
+    path = result_path(out, result.task_id)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")

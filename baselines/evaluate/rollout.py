@@ -1,4 +1,7 @@
-"""TODO."""
+"""Evaluation episodes of an ego and teammates, as pure JAX functions.
+
+Shapes: `B` tasks (times seeds) of one layout and teammate family, `T` steps of an episode, `S` bytes of a state record.
+"""
 
 from __future__ import annotations
 
@@ -22,27 +25,47 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
 _FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
+_EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # streams of keys within an episode, next to those of the agents' slots
 
 
 class RolloutState(NamedTuple):
-    """What a step carries into the next. B tasks of one layout and family."""
+    """State between two steps of B tasks.
+
+    Attributes:
+        env: the environments.
+        ego: the egos' memories, batched.
+        before: outcome of the last step, without its `obs`.
+    """
 
     env: EnvState
-    ego: Any  # memories, batched
-    before: Percept  # what preceded the coming step, but for `obs`
+    ego: Any
+    before: Percept
 
 
 class Episode(NamedTuple):
-    """One episode of T steps of B tasks."""
+    """One episode of B tasks.
 
-    record: UInt8[Array, "B T S"]  # before each step
+    Attributes:
+        record: uint8 (B, T, S), state record before each step.
+        actions: int32 (B, T, 2), of both agent slots.
+        reward: float32 (B, T), the team's.
+    """
+
+    record: UInt8[Array, "B T S"]
     actions: Int[Array, "B T 2"]
-    reward: Float[Array, "B T"]  # the team's
+    reward: Float[Array, "B T"]
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRollout:
-    """Episodes of B tasks that share a layout and a teammate family, compiled once."""
+    """Episodes of B tasks that share a layout and a teammate family.
+
+    Attributes:
+        layout: of all tasks.
+        ego: plays all tasks.
+        teammates: B policies of one family.
+        protocol: see `Protocol`.
+    """
 
     layout: Layout
     ego: Policy | HostPolicy
@@ -51,63 +74,65 @@ class EvaluationRollout:
 
     @cached_property
     def env(self) -> Environment:
+        """The environment of the layout under the protocol."""
         four = self.protocol.four_recipes and track_of(self.layout.name) == "layout"
         recipes = np.array([self.layout.recipe_item(r) for r in _FOUR_RECIPES], np.uint8) if four else None
         return Environment(self.layout, self.protocol.steps, recipes)
 
     @property
     def teammate_params(self) -> Any:
-        """Of all tasks, stacked on a leading axis."""
+        """Parameters of all teammates, with a leading axis (B,)."""
         return stacked(mate.params for mate in self.teammates)
 
-    def start(self, keys: jax.Array) -> RolloutState:
-        """Task keys (B,) -> tables before the first episode; nothing precedes a task's first step."""
-        batch = keys.shape[0]
-        egos = self._ego.init(self.ego.params, _fold_all(keys, EGO))
-        zero = jnp.zeros(batch, jnp.int32)
-        nothing = Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
-        return RolloutState(self.env.init(keys), egos, nothing)
-
     @cached_property
-    def _ego(self) -> HostPolicy:
-        """The ego as batched functions."""
+    def batched_ego(self) -> HostPolicy:
+        """The ego as functions of a batch."""
         if isinstance(self.ego, HostPolicy):
             return self.ego
         init, act = jax.vmap(self.ego.init, in_axes=(None, 0)), jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))
         return HostPolicy(self.ego.params, init, act, self.ego.sees)
 
-    def episode(self, ego_params: Any, mate_params: Any, tables: RolloutState) -> tuple[RolloutState, Episode]:
-        """One episode of every task. Jit it once."""
-        mate = self.teammates[0]
-        keys = self.env.episode_key(tables.env)
-        memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
-        ego_keys, mate_keys = _fold_all(keys, 2), _fold_all(keys, 3)
+    def start(self, keys: jax.Array) -> RolloutState:
+        """Returns the state before the first episode from task keys (B,)."""
+        batch = keys.shape[0]
+        egos = self.batched_ego.init(self.ego.params, _fold_all(keys, EGO))
+        zero = jnp.zeros(batch, jnp.int32)
+        nothing = Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
+        return RolloutState(self.env.init(keys), egos, nothing)
 
-        def step(carry, t):
-            tables, memories = carry
-            now = tables.env
-            mine, egos = self._ego.act(ego_params, tables.ego, self.ego_view(tables), _fold_all(ego_keys, t))
+    def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, Episode]:
+        """Returns the state after one episode of every task, and the episode. To be jitted by the caller."""
+        mate = self.teammates[0]
+        # Teammates start each episode afresh from its key; egos keep their memory, and only their keys are new.
+        keys = self.env.episode_key(state.env)
+        memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
+        ego_keys, mate_keys = _fold_all(keys, _EGO_STEPS), _fold_all(keys, _TEAMMATE_STEPS)
+
+        def step(carry: Any, t: Array) -> tuple[Any, Episode]:
+            state, memories = carry
+            now = state.env
+            mine, egos = self.batched_ego.act(ego_params, state.ego, self.ego_view(state), _fold_all(ego_keys, t))
             theirs, memories = jax.vmap(mate.act)(
                 mate_params, memories, self._view(mate.sees, now, TEAMMATE), _fold_all(mate_keys, t)
             )
             after = self.env.step(now, jnp.stack([mine, theirs], axis=-1))
-            before = tables.before._replace(
+            before = state.before._replace(
                 prev_action=mine, prev_reward=after.reward, prev_teammate_action=theirs, prev_done=after.done
             )
             played = Episode(now.record, jnp.stack([mine, theirs], axis=-1), after.reward)
             return (RolloutState(after.state, egos, before), memories), played
 
-        (tables, _), played = jax.lax.scan(step, (tables, memories), jnp.arange(self.protocol.steps))
-        return tables, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), played)
+        (state, _), played = jax.lax.scan(step, (state, memories), jnp.arange(self.protocol.steps))
+        return state, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), played)
 
-    def ego_view(self, tables: RolloutState) -> Any:
-        """What the egos are given now, batched."""
+    def ego_view(self, state: RolloutState) -> Any:
+        """Returns what the egos see now, batched."""
         if self.ego.sees == "percept":
-            return tables.before._replace(obs=self._view("observation", tables.env, EGO))
-        return self._view(self.ego.sees, tables.env, EGO)
+            return state.before._replace(obs=self._view("observation", state.env, EGO))
+        return self._view(self.ego.sees, state.env, EGO)
 
-    def _view(self, sees: str, state: EnvState, seat: int) -> jax.Array:
-        return state.record if sees == "state" else self.env.observe_one(state, seat)
+    def _view(self, sees: str, state: EnvState, slot: int) -> jax.Array:
+        return state.record if sees == "state" else self.env.observe_one(state, slot)
 
 
 def _fold_all(keys: jax.Array, data: Any) -> jax.Array:
@@ -115,6 +140,6 @@ def _fold_all(keys: jax.Array, data: Any) -> jax.Array:
 
 
 def task_key(seed: int, task_id: str) -> jax.Array:
-    """The key that all of a task's episodes come from."""
+    """Returns the key from which all randomness of a task's episodes is derived."""
     digest = hashlib.sha256(task_id.encode()).digest()
     return jax.random.fold_in(jax.random.key(seed), int.from_bytes(digest[:4], "big"))

@@ -1,1 +1,1 @@
-"""The in-context learners: one transformer, one file a method."""
+"""In-context learners: one transformer, one file per method."""

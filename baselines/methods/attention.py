@@ -1,7 +1,8 @@
-"""Attention in training: what a token sees is always the first so many tokens, and for a query itself.
+"""Attention in training, for sequences of a context and of queries about it.
 
-`B` denotes the batch size, `N` tokens, `K` those of a context, `H` heads, `D` a head's width. Of long sequences `ROWS`
-tokens are computed at a time, and again in the backward pass, so that memory grows with ROWS x N instead of N x N.
+Shapes: `B` batch size, `N` tokens, `K` tokens of a context, `H` heads, `Dh` width of a head. Sequences longer than
+`ROWS` tokens are computed `ROWS` query rows at a time, and again in the backward pass, so that memory grows with
+ROWS x N instead of N x N.
 """
 
 from __future__ import annotations
@@ -14,61 +15,67 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 ROWS = 512
-"""The paper's usual context of 500 is whole."""
+"""Query rows computed at once; the paper's usual context of 500 fits."""
 
 
-def causal(
-    q: Float[Array, "B N H D"],
-    k: Float[Array, "B N H D"],
-    v: Float[Array, "B N H D"],
-    lengths: Int[Array, " B"] | None = None,
-) -> Float[Array, "B N H D"]:
-    """Each token sees those up to itself; tokens from `lengths` on are padding."""
+def causal_attention(
+    q_BxNxHxDh: Float[Array, "B N H Dh"],
+    k_BxNxHxDh: Float[Array, "B N H Dh"],
+    v_BxNxHxDh: Float[Array, "B N H Dh"],
+    lengths_B: Int[Array, " B"] | None = None,
+) -> Float[Array, "B N H Dh"]:
+    """Returns attention in which each token sees those up to itself; tokens from `lengths_B` on are padding."""
 
-    def some(first: Int[Array, ""], q: Array) -> Array:
-        mask = _first(first + 1, q, k)[None, None]
-        return jax.nn.dot_product_attention(q, k, v, mask=mask, key_value_seq_lengths=lengths)
+    def attend(first: Int[Array, ""], q_BxRxHxDh: Array) -> Array:
+        mask_1x1xRxN = _visible_keys(first + 1, q_BxRxHxDh, k_BxNxHxDh)[None, None]
+        return jax.nn.dot_product_attention(
+            q_BxRxHxDh, k_BxNxHxDh, v_BxNxHxDh, mask=mask_1x1xRxN, key_value_seq_lengths=lengths_B
+        )
 
-    return _in_parts(some, q)
+    return _map_row_blocks(attend, q_BxNxHxDh)
 
 
 def query_attention(
-    q: Float[Array, "B K+1 H D"],
-    own_k: Float[Array, "B K+1 H D"],
-    own_v: Float[Array, "B K+1 H D"],
-    k: Float[Array, "B K H D"],
-    v: Float[Array, "B K H D"],
-) -> Float[Array, "B K+1 H D"]:
-    """Query j sees the first j tokens of a context, and itself.
+    q_BxQxHxDh: Float[Array, "B K+1 H Dh"],
+    own_k_BxQxHxDh: Float[Array, "B K+1 H Dh"],
+    own_v_BxQxHxDh: Float[Array, "B K+1 H Dh"],
+    k_BxKxHxDh: Float[Array, "B K H Dh"],
+    v_BxKxHxDh: Float[Array, "B K H Dh"],
+) -> Float[Array, "B K+1 H Dh"]:
+    """Returns attention in which query j sees the first j tokens of a context, and itself.
 
-    `jax.nn.dot_product_attention` would need all queries among the keys, for each to see one of them.
+    `jax.nn.dot_product_attention` would need all queries among the keys, although each sees only one of them.
     """
-    narrow = q.dtype == jnp.bfloat16  # as there: products in bfloat16, summed in float32
+    narrow = q_BxQxHxDh.dtype == jnp.bfloat16  # as in JAX's attention: bfloat16 products, summed in float32
     precision = jax.lax.DotAlgorithmPreset.BF16_BF16_F32 if narrow else None
     product = partial(jnp.einsum, precision=precision, preferred_element_type=jnp.float32)
 
-    def some(first: Int[Array, ""], q: Array, own_k: Array, own_v: Array) -> Array:
-        seen = jnp.where(_first(first, q, k), product("bqhd,bkhd->bhqk", q, k), -jnp.inf)
-        own = product("bqhd,bqhd->bhq", q, own_k)[..., None]
-        weights = jax.nn.softmax(jnp.concatenate([seen, own], axis=-1) / q.shape[-1] ** 0.5).astype(v.dtype)
-        of_context = jnp.einsum("bhqk,bkhd->bqhd", weights[..., :-1], v)
-        return of_context + jnp.einsum("bhq,bqhd->bqhd", weights[..., -1], own_v)
+    def attend(first: Int[Array, ""], q: Array, own_k: Array, own_v: Array) -> Array:
+        visible_RxK = _visible_keys(first, q, k_BxKxHxDh)
+        scores_BxHxRxK = jnp.where(visible_RxK, product("bqhd,bkhd->bhqk", q, k_BxKxHxDh), -jnp.inf)
+        own_scores_BxHxRx1 = product("bqhd,bqhd->bhq", q, own_k)[..., None]
+        # One softmax over the context and the query itself, which is the last column.
+        scores = jnp.concatenate([scores_BxHxRxK, own_scores_BxHxRx1], axis=-1) / q.shape[-1] ** 0.5
+        weights = jax.nn.softmax(scores).astype(own_v.dtype)
+        context_part = jnp.einsum("bhqk,bkhd->bqhd", weights[..., :-1], v_BxKxHxDh)
+        return context_part + jnp.einsum("bhq,bqhd->bqhd", weights[..., -1], own_v)
 
-    return _in_parts(some, q, own_k, own_v)
+    return _map_row_blocks(attend, q_BxQxHxDh, own_k_BxQxHxDh, own_v_BxQxHxDh)
 
 
-def _first(count: Int[Array, ""], q: Array, k: Array) -> Bool[Array, "rows keys"]:
-    """The first row sees `count` keys, the next one more, and so on."""
+def _visible_keys(count: Int[Array, ""], q: Array, k: Array) -> Bool[Array, "R N"]:
+    """Returns a mask whose first row shows `count` keys, the next one more, and so on."""
     return jnp.arange(k.shape[1]) < count + jnp.arange(q.shape[1])[:, None]
 
 
-def _in_parts(some: Callable[..., Array], *rows: Float[Array, "B N H D"]) -> Float[Array, "B N H D"]:
-    """`some` of the rows at a time: it is given the first one's number, and the rows."""
-    batch, length, *rest = rows[0].shape
+def _map_row_blocks(attend: Callable[..., Array], *rows_BxNxHxDh: Float[Array, "B N H Dh"]) -> Float[Array, "B N H Dh"]:
+    """Applies `attend(first, *rows)` to `ROWS` rows at a time; `first` is the number of the first row."""
+    batch, length, *rest = rows_BxNxHxDh[0].shape
     if length <= ROWS:
-        return some(jnp.int32(0), *rows)
-    parts = -(-length // ROWS)
-    padding = ((0, 0), (0, parts * ROWS - length), (0, 0), (0, 0))
-    split = [jnp.pad(x, padding).reshape(batch, parts, ROWS, *rest).swapaxes(0, 1) for x in rows]
-    found = jax.lax.map(lambda part: jax.checkpoint(some)(*part), (ROWS * jnp.arange(parts), *split))
-    return found.swapaxes(0, 1).reshape(batch, parts * ROWS, *rest)[:, :length]
+        return attend(jnp.int32(0), *rows_BxNxHxDh)
+    blocks = -(-length // ROWS)
+    padding = ((0, 0), (0, blocks * ROWS - length), (0, 0), (0, 0))
+    split = [jnp.pad(x, padding).reshape(batch, blocks, ROWS, *rest).swapaxes(0, 1) for x in rows_BxNxHxDh]
+    # The checkpoint keeps a block's weights, ROWS x N, out of what the backward pass stores.
+    found = jax.lax.map(lambda block: jax.checkpoint(attend)(*block), (ROWS * jnp.arange(blocks), *split))
+    return found.swapaxes(0, 1).reshape(batch, blocks * ROWS, *rest)[:, :length]

@@ -1,8 +1,10 @@
 """Decision-Pretrained Transformer (paper, App. E.3): the expert's action at a query, from a context of transitions.
 
-The query stands behind its context, [c_1 .. c_K, q], so that the answer, read at the last position, has seen all of it,
-and so that an ego's context need not be computed anew for every query. The loss with prior asks the query behind every
-part of the context, c_1 .. c_j for j = 0..K: K + 1 copies of the query, each of which sees its part and itself.
+The query follows its context, [c_1 .. c_K, q], so that the answer, read at the last position, has seen all of it, and
+so that an ego's context need not be recomputed for every query. The loss with prior poses the query after every part of
+the context, c_1 .. c_j for j = 0..K: K + 1 copies of the query, each of which sees its part and itself.
+
+Shapes: `B` batch size, `K` transitions of a context, `D` width, `A` actions, `N` entries of an observation.
 """
 
 from __future__ import annotations
@@ -13,44 +15,66 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from baselines.methods.method import Method, ModelOptions, World, cross_entropy, next_obs_head, run_model, squared_error
+from baselines.methods.method import (
+    Method,
+    World,
+    cross_entropy,
+    make_next_obs_head,
+    make_tokens,
+    make_transformer,
+    run_model,
+    squared_error,
+)
+from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import (
     RingBuffer,
-    Step,
+    StepInput,
     Transition,
     TransitionTokens,
-    empty_log,
-    transitions_of,
+    batch_transitions,
     visible_slots,
 )
-from baselines.methods.transformer import Cache, Transformer
+from baselines.methods.transformer import AttentionCache, Transformer
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.sampling.dpt import DPTBatch
 
 
 class DPTOutput(NamedTuple):
-    """What the model gives."""
+    """Output of `DPT`.
 
-    logits: Float[Array, "B K+1 A"]  # having seen the first j transitions, j = 0..K
-    next_obs: Float[Array, "B K-1 N"] | None  # with +next_obs: of transitions 2..K, from those before each
+    Attributes:
+        logits: float (B, K + 1, A), the policy after the first j transitions, j = 0..K.
+        next_obs: float (B, K - 1, N), predictions for transitions 2..K from those before each; None without +next_obs.
+    """
+
+    logits: Float[Array, "B K+1 A"]
+    next_obs: Float[Array, "B K-1 N"] | None
 
 
-class Memory(NamedTuple):
-    """An acting ego's transitions, as a ring; those of the running episode are held, but not seen before it ends."""
+class DPTMemory(NamedTuple):
+    """Memory of an acting ego: its transitions, as a ring of K + KEPT_STEPS slots.
 
-    held: (
-        RingBuffer | tuple[Cache, ...]
-    )  # tokens, or what the transformer keeps of them and one slot more, for the query
-    written: Int[Array, ""]  # transitions so far
-    complete: Int[Array, ""]  # of finished episodes
-    last_obs: Array  # float32, before the step just taken
-    started: Bool[Array, ""]  # some step was taken
+    The transitions of the running episode are stored, but not visible before the episode ends.
+
+    Attributes:
+        stored: tokens, or the transformer's caches, which have one slot more, for the query.
+        written: int32 (), transitions so far.
+        complete: int32 (), transitions of finished episodes.
+        last_obs: float32, observation before the last action.
+        started: bool (), whether a step was taken.
+    """
+
+    stored: RingBuffer | tuple[AttentionCache, ...]
+    written: Int[Array, ""]
+    complete: Int[Array, ""]
+    last_obs: Array
+    started: Bool[Array, ""]
 
 
 class DPT(nn.Module):
-    """Transitions and queries -> policies.
+    """Transitions and queries to policies.
 
-    `whole_episodes` is whether an acting ego's context grows by whole episodes, as in the paper, or by steps.
+    `finished_episodes_only`: an acting ego's context grows by complete episodes, as in the paper; otherwise by steps.
     """
 
     tokens: TransitionTokens
@@ -58,69 +82,77 @@ class DPT(nn.Module):
     head: nn.Module
     obs_shape: tuple[int, ...]
     next_obs: nn.Module | None = None
-    whole_episodes: bool = True
+    finished_episodes_only: bool = True
 
     def __call__(self, context: Transition, query: Num[Array, "B ..."], deterministic: bool = True) -> DPTOutput:
-        """A context (B, K) and a query (B,), answered after every part of the context."""
-        tokens, asked = self.tokens.context(context, deterministic), self.tokens.query(query, deterministic)
-        length = tokens.shape[1]
-        queries = jnp.broadcast_to(asked[:, None], (len(tokens), length + 1, tokens.shape[-1]))
-        sequence = jnp.concatenate([tokens, queries], axis=1)
+        """Returns the answers to a query (B, ..) after every part of a context (B, K)."""
+        tokens_BxKxD = self.tokens.context(context, deterministic)
+        query_BxD = self.tokens.query(query, deterministic)
+        batch, length, width = tokens_BxKxD.shape
+        queries = jnp.broadcast_to(query_BxD[:, None], (batch, length + 1, width))
+        sequence = jnp.concatenate([tokens_BxKxD, queries], axis=1)
         features = self.trunk(sequence, context=length, deterministic=deterministic)
         features, answers = features[:, :length], features[:, length:]
         predicted = None
         if self.next_obs is not None:
-            coming = self.tokens.encoder(context.obs[:, 1:])  # type: ignore[operator]
-            known = jnp.concatenate([features[:, :-1], coming], axis=-1)
+            # A transition's token holds its outcome, so the prediction reads the features before it and encodes its
+            # first observation again.
+            obs_features = self.tokens.encoder(context.obs[:, 1:])  # type: ignore[operator]
+            known = jnp.concatenate([features[:, :-1], obs_features], axis=-1)
             predicted = self.next_obs(known, context.action[:, 1:])
         return DPTOutput(self.head(answers), predicted)
 
-    def start(self, context: int, cached: bool) -> Memory:
-        """The memory of an ego before its first step: K transitions, and room for a running episode."""
+    def start(self, context: int, cached: bool) -> DPTMemory:
+        """Returns the memory of an ego before its first step: room for K transitions and a running episode."""
         slots = context + KEPT_STEPS
-        held = self.trunk.empty(slots + 1) if cached else empty_log(slots, self.tokens.width)
-        return Memory(held, jnp.int32(0), jnp.int32(0), jnp.zeros(self.obs_shape), jnp.bool_(False))
+        stored = self.trunk.empty_caches(slots + 1) if cached else RingBuffer.empty(slots, self.tokens.width)
+        return DPTMemory(stored, jnp.int32(0), jnp.int32(0), jnp.zeros(self.obs_shape), jnp.bool_(False))
 
-    def act(self, step: Step, done: Bool[Array, ""], memory: Memory) -> tuple[Float[Array, " A"], Memory]:
-        """One step of an ego: the policy, the memory with what the step before it brought.
+    def act(self, step: StepInput, done: Bool[Array, ""], memory: DPTMemory) -> tuple[Float[Array, " A"], DPTMemory]:
+        """Returns the policy for one step of an ego, and the memory with the outcome of the step before.
 
-        An episode's last transition is left out: what followed it in that episode is never shown, and the first
+        An episode's last transition is left out: its successor in that episode is never shown, and the first
         observation of the next episode is not its successor.
         """
         obs = step.obs.astype(jnp.float32)
         transition = Transition(memory.last_obs, step.prev_action, step.prev_reward, obs, step.prev_teammate_action)
         token, query = self.tokens.context(transition), self.tokens.query(obs)
         written = memory.written + (memory.started & ~done)
-        complete = jnp.where(done, written, memory.complete) if self.whole_episodes else written
-        recall = self._recompute if isinstance(memory.held, RingBuffer) else self._recall
-        feature, held = recall(token, query, memory, written, complete)
-        return self.head(feature), Memory(held, written, complete, obs, jnp.bool_(True))
+        complete = jnp.where(done, written, memory.complete) if self.finished_episodes_only else written
+        answer = self._answer_from_tokens if isinstance(memory.stored, RingBuffer) else self._answer_from_caches
+        feature, stored = answer(token, query, memory, written, complete)
+        return self.head(feature), DPTMemory(stored, written, complete, obs, jnp.bool_(True))
 
-    def _recompute(self, token: Array, query: Array, memory: Memory, written: Array, complete: Array) -> tuple:
-        """The answer from all tokens of the context, anew."""
-        log = RingBuffer(memory.held.add(token).tokens, written)  # type: ignore[union-attr]
-        window, seen = log.last(len(log.tokens) - KEPT_STEPS, complete)
-        sequence = jnp.append(window, query[None], axis=0).at[seen].set(query)  # what is behind it does not count
-        return self.trunk(sequence[None])[0, seen], log
+    def _answer_from_tokens(
+        self, token: Array, query: Array, memory: DPTMemory, written: Array, complete: Array
+    ) -> tuple:
+        """Computes the answer from the tokens of the complete context."""
+        # Without a new transition `written` stays, and the next step overwrites the token added here.
+        buffer = RingBuffer(memory.stored.add(token).tokens, written)  # type: ignore[union-attr]
+        window, valid = buffer.last(len(buffer.tokens) - KEPT_STEPS, complete)
+        sequence = jnp.append(window, query[None], axis=0).at[valid].set(query)  # tokens behind it are not seen
+        return self.trunk(sequence[None])[0, valid], buffer
 
-    def _recall(self, token: Array, query: Array, memory: Memory, written: Array, complete: Array) -> tuple:
-        """The answer from what was kept of the context."""
-        slots = memory.held[0].slots - 1  # type: ignore[union-attr]
-        context, now = slots - KEPT_STEPS, memory.written
-        own = jnp.append(visible_slots(slots, now + 1, context, now + 1), False)
-        _, held = self.trunk.step(token, memory.held, now % slots, now, own)  # type: ignore[arg-type]
-        sees = jnp.append(visible_slots(slots, written, context, complete), True)
-        return self.trunk.step(query, held, jnp.int32(slots), complete, sees)
+    def _answer_from_caches(
+        self, token: Array, query: Array, memory: DPTMemory, written: Array, complete: Array
+    ) -> tuple:
+        """Computes the answer from the cached keys and values of the context."""
+        slots = memory.stored[0].slots - 1  # type: ignore[union-attr]
+        context, position = slots - KEPT_STEPS, memory.written
+        visible_to_token = jnp.append(visible_slots(slots, position + 1, context, position + 1), False)
+        _, stored = self.trunk.step(token, memory.stored, position % slots, position, visible_to_token)  # type: ignore[arg-type]
+        visible_to_query = jnp.append(visible_slots(slots, written, context, complete), True)
+        return self.trunk.step(query, stored, jnp.int32(slots), complete, visible_to_query)
 
 
-def dpt(options: ModelOptions, world: World, whole_episodes: bool = True) -> Method:
-    """3,285,022 parameters at C = 40."""
-    tokens = options.tokens(TransitionTokens, world)
-    head, next_obs = nn.Dense(world.actions), next_obs_head(options, world)
-    model = DPT(tokens, options.transformer(), head, world.obs_shape, next_obs, whole_episodes)
+def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
+    """Returns the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
+    tokens = make_tokens(TransitionTokens, options, world)
+    head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
+    model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)
 
     def loss(params: Any, slow: Any, batch: DPTBatch, key: Any) -> tuple[Array, dict[str, Array]]:
-        context, query = transitions_of(batch, world.view)
+        context, query = batch_transitions(batch, world.view)
         output: DPTOutput = run_model(model, options, params, key, context, query)
         target = jnp.broadcast_to(jnp.asarray(batch.query_target)[:, None], output.logits.shape[:2])
         total = cross_entropy(output.logits, target, options.label_smoothing).mean()

@@ -1,6 +1,7 @@
-"""What the methods share: their options, what they need of a world, and what trainer and egos need of them.
+"""Parts that all methods share: the world a model acts in, what trainer and egos need of a method, and losses.
 
-`B` denotes the batch size, `L` the length of a window, `K` the context's, `A` the number of actions.
+Shapes: `B` batch size, `L` length of a window, `K` length of a context, `A` number of actions, `N` entries of an
+observation, `F` features.
 """
 
 from __future__ import annotations
@@ -16,144 +17,135 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from baselines.methods.tokens import Step, Tokens, View
-from baselines.methods.transformer import POSITIONS, Positions, Transformer
-from icrl4aht_data.errors import OptionError, unknown
+from baselines.methods.options import ModelOptions
+from baselines.methods.tokens import BatchView, StepInput, Tokens
+from baselines.methods.transformer import Transformer
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
-"""(parameters, slow parameters or None, batch, dropout key or None) -> what to minimise, and what to log."""
+"""(parameters, slow parameters or None, batch, dropout key or None) -> what to minimise, and numbers to log."""
 
-SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 768, 100_000)}
-"""Name -> layers, width, training steps (paper, Sec. 4.4, "Model Scale and Training Budget")."""
-
-
-T = TypeVar("T", bound=Tokens)
-
-
-@dataclass(frozen=True)
-class ModelOptions:
-    """How a model is built; the defaults are the paper's (App. E.5)."""
-
-    layers: int = 4
-    width: int = 256
-    heads: int = 4
-    recurrent_layers: int = 2  # of Hybrid-AD, in place of the transformer
-    dropout: float = 0.1
-    positions: Positions = "none"
-    teammate_actions: bool = False  # +TA: the teammate's previous action as input
-    next_obs: bool = False  # +next_obs: an auxiliary loss, the squared error of the predicted next observation
-    label_smoothing: float = 0.0
-    discounts: tuple[float, ...] = (0.9, 0.95, 0.99, 0.995)  # of AMAGO-Offline, which acts by the last
-    bfloat16: bool = False  # compute in bfloat16; parameters stay float32
-    remat: bool = False  # keep less for the backward pass, compute it again
-
-    def __post_init__(self) -> None:
-        for name in ("layers", "width", "heads", "recurrent_layers"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: expected at least 1")
-        if self.width % (2 * self.heads):
-            raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")
-        for name in ("dropout", "label_smoothing"):
-            if not 0 <= getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: expected 0 or more, and below 1")
-        if self.positions not in POSITIONS:
-            raise unknown("positions", self.positions, POSITIONS)
-        if not self.discounts or not all(0 <= discount < 1 for discount in self.discounts):
-            raise OptionError(f"discounts = {self.discounts}: expected numbers from 0 to below 1")
-
-    @property
-    def dtype(self) -> Any:
-        """Of activations."""
-        return jnp.bfloat16 if self.bfloat16 else jnp.float32
-
-    def transformer(self) -> Transformer:
-        """The transformer of this size."""
-        return Transformer(self.layers, self.width, self.heads, self.dropout, self.positions, self.remat)
-
-    def tokens(self, kind: type[T], world: World) -> T:
-        """What makes tokens of that kind."""
-        encoder = world.encoder(self.dtype)
-        return kind(encoder, self.width, world.actions, self.teammate_actions, self.dropout, self.dtype)
+TokensType = TypeVar("TokensType", bound=Tokens)
 
 
 class World(NamedTuple):
-    """What a model needs to know of where it acts."""
+    """Description of the world that a model acts in.
 
-    encoder: Callable[[Any], nn.Module]  # dtype -> encoder
+    Attributes:
+        encoder: dtype -> module from observations to features.
+        obs_shape: shape of one observation.
+        view: how observations are read from batches.
+        actions: number of actions.
+    """
+
+    encoder: Callable[[Any], nn.Module]
     obs_shape: tuple[int, ...]
-    view: View
+    view: BatchView
     actions: int = len(ACTIONS)
 
 
 @dataclass(frozen=True)
 class Method:
-    """One way to learn from histories; made by a function of (options, world)."""
+    """One way to learn from histories, made by a function of (ModelOptions, World).
+
+    Attributes:
+        name: as in `registry.METHODS`.
+        label: as shown in reports.
+        data: sampler whose batches it takes.
+        model: module with the methods `start` and `act`.
+        example: arguments that the model's parameters are made for.
+        loss: see `Loss`.
+        logits: the policy's logits (*B, A) in the model's output.
+        slow: share of the parameters that enters the slow copy each step; 0 for a method without a slow copy.
+    """
 
     name: str
-    label: str  # in tables
-    data: Literal["ad", "dpt"]  # which sampler's batches it takes
+    label: str
+    data: Literal["ad", "dpt"]
     model: nn.Module
-    example: tuple  # arguments that the model's parameters are made for
+    example: tuple
     loss: Loss
-    logits: Callable[[Any], Float[Array, "*B A"]]  # the policy in the model's output
-    slow: float = 0.0  # share of the parameters that goes into the slow copy each step; 0 for a method without one
+    logits: Callable[[Any], Float[Array, "*B A"]]
+    slow: float = 0.0
 
     def init(self, key: Array) -> Any:
-        """Fresh parameters, float32."""
+        """Returns initial parameters, float32."""
         return jax.jit(self.model.init)(key, *self.example)["params"]
 
     def start(self, context: int, cached: bool) -> Any:
-        """The memory of an ego of K = `context` before its first step.
+        """Returns the memory of an ego before its first step.
 
-        `cached` keeps what the trunk computed of each step, O(1) a step; otherwise the window is computed anew.
+        Args:
+            context: K, the steps or transitions that it remembers.
+            cached: whether the memory keeps what was computed for each step, which makes a step O(1); otherwise it
+                keeps tokens, and each step computes the complete window.
         """
         return self.model.apply({}, context, cached, method="start")
 
-    def act(self, params: Any, step: Step, done: Bool[Array, ""], memory: Any) -> tuple[Float[Array, " A"], Any]:
-        """One step of an ego, after one that ended an episode if `done`: policy logits, memory."""
+    def act(self, params: Any, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Float[Array, " A"], Any]:
+        """Returns policy logits, float32, and the memory after one step; `done`: the step before ended an episode."""
         output, memory = self.model.apply({"params": params}, step, done, memory, method="act")  # type: ignore[misc]
         return self.logits(output).astype(jnp.float32), memory
 
 
-class NextObs(nn.Module):
-    """What is known and the action taken -> the next observation, flat (+next_obs; paper, App. F, "Auxiliary Loss")."""
+def compute_dtype(options: ModelOptions) -> Any:
+    """Returns the dtype of activations."""
+    return jnp.bfloat16 if options.bfloat16 else jnp.float32
+
+
+def make_transformer(options: ModelOptions) -> Transformer:
+    """Returns the transformer of these options."""
+    return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
+
+
+def make_tokens(kind: type[TokensType], options: ModelOptions, world: World) -> TokensType:
+    """Returns a tokenizer of the given class for a world."""
+    dtype = compute_dtype(options)
+    return kind(world.encoder(dtype), options.width, world.actions, options.teammate_actions, options.dropout, dtype)
+
+
+class NextObsHead(nn.Module):
+    """Prediction of the next observation, flat, from features and the action (paper, App. F, "Auxiliary Loss")."""
 
     width: int
     actions: int
     size: int
 
     @nn.compact
-    def __call__(self, known: Float[Array, "*B F"], action: Int[Array, "*B"]) -> Float[Array, "*B N"]:
-        action = jax.nn.one_hot(action, self.actions, dtype=known.dtype)
-        hidden = nn.gelu(nn.Dense(self.width)(jnp.concatenate([known, action], axis=-1)))
+    def __call__(self, features: Float[Array, "*B F"], action: Int[Array, "*B"]) -> Float[Array, "*B N"]:
+        action = jax.nn.one_hot(action, self.actions, dtype=features.dtype)
+        hidden = nn.gelu(nn.Dense(self.width)(jnp.concatenate([features, action], axis=-1)))
         return nn.Dense(self.size)(hidden)
 
 
-def next_obs_head(options: ModelOptions, world: World) -> NextObs | None:
-    """The head of that loss, if it is asked for."""
-    return NextObs(options.width, world.actions, int(np.prod(world.obs_shape))) if options.next_obs else None
+def make_next_obs_head(options: ModelOptions, world: World) -> NextObsHead | None:
+    """Returns the head of the auxiliary loss, or None without +next_obs."""
+    return NextObsHead(options.width, world.actions, int(np.prod(world.obs_shape))) if options.next_obs else None
 
 
 def squared_error(predicted: Float[Array, "*B N"], obs: Num[Array, "*B ..."]) -> Float[Array, "*B"]:
-    """Mean over an observation's entries."""
+    """Returns the squared error of predicted observations, mean over an observation's entries."""
     target = obs.astype(jnp.float32).reshape(predicted.shape)
     return jnp.square(predicted.astype(jnp.float32) - target).mean(axis=-1)
 
 
 def cross_entropy(logits: Float[Array, "*B A"], action: Int[Array, "*B"], smoothing: float) -> Float[Array, "*B"]:
-    """Of the action that was taken, against the policy."""
+    """Returns the cross-entropy of actions against a policy, with label smoothing."""
     target = optax.smooth_labels(jax.nn.one_hot(action, logits.shape[-1]), smoothing)
     return optax.softmax_cross_entropy(logits.astype(jnp.float32), target)
 
 
 def mean_of_rows(values: Float[Array, "B L"], mask: Bool[Array, "B L"]) -> Float[Array, ""]:
-    """The mean over each row's valid positions (the paper's 1/|M|), then over rows, so that parts of a batch add up."""
+    """Returns the mean over rows of the mean over each row's valid positions (the paper's 1/|M|).
+
+    Rows weigh the same whatever their padding, so the loss of a batch is the mean of the losses of its parts.
+    """
     return (jnp.where(mask, values, 0.0).sum(axis=1) / jnp.maximum(mask.sum(axis=1), 1)).mean()
 
 
-def run_model(method_model: nn.Module, options: ModelOptions, params: Any, key: Any, *inputs: Any, **named: Any) -> Any:
-    """The model's output in the options' dtype; with dropout if there is a key."""
-    params = jax.tree.map(lambda leaf: leaf.astype(options.dtype), params)
+def run_model(model: nn.Module, options: ModelOptions, params: Any, key: Any, *inputs: Any, **named: Any) -> Any:
+    """Returns the model's output, computed in the dtype of the options; with dropout if there is a key."""
+    dtype = compute_dtype(options)
+    params = jax.tree.map(lambda leaf: leaf.astype(dtype), params)
     rngs = {} if key is None else {"dropout": key}
-    return method_model.apply({"params": params}, *inputs, **named, deterministic=key is None, rngs=rngs)
+    return model.apply({"params": params}, *inputs, **named, deterministic=key is None, rngs=rngs)

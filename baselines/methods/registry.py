@@ -1,4 +1,4 @@
-"""The methods by name, and the benchmark as their world."""
+"""Methods by name, and OvercookedV2 as the world they act in."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from baselines.methods.amago_offline import amago_offline
 from baselines.methods.dpt import dpt
 from baselines.methods.encoder import GridEncoder
 from baselines.methods.hybrid_ad import hybrid_ad
-from baselines.methods.method import Method, ModelOptions, World
-from baselines.methods.tokens import View, state_view
+from baselines.methods.method import Method, World
+from baselines.methods.options import ModelOptions
+from baselines.methods.tokens import BatchView, state_view
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import Layout
 
@@ -20,20 +21,25 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "hybrid_ad": hybrid_ad,
     "amago_offline": amago_offline,
 }
-"""Name -> maker."""
+"""Method name -> maker."""
 
 
 def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
-    """The maker of that name.
+    """Returns the maker of a method.
 
     Raises:
-        UnknownNameError: lists the valid names and the nearest.
+        UnknownNameError: if there is no such method; lists the valid names and the nearest.
     """
     if name not in METHODS:
         raise unknown("method", name, METHODS)
     return METHODS[name]
 
 
-def overcooked_world(layouts: Sequence[Layout], view: View | None = None) -> World:
-    """OvercookedV2 in layouts with observations of one shape, from batches of state records unless a view is given."""
+def overcooked_world(layouts: Sequence[Layout], view: BatchView | None = None) -> World:
+    """Returns OvercookedV2 in layouts with observations of one shape.
+
+    Args:
+        layouts: those that batches hold.
+        view: how observations are read from batches; rendered from state records by default.
+    """
     return World(lambda dtype: GridEncoder(dtype=dtype), layouts[0].obs_shape, view or state_view(layouts))

@@ -1,7 +1,7 @@
-"""Histories as tokens, in training and when acting alike (paper, App. E.2 and E.3).
+"""Histories as tokens, for training and acting alike (paper, App. E.2 and E.3).
 
-A `Step` is what an ego knows when it acts; AD's tokens are made of steps. A `Transition` is a step with its outcome;
-DPT's context is made of transitions. `*B` denotes any leading axes: batch and time in training, none when acting.
+AD's tokens are made of `StepInput`s, DPT's context of `Transition`s. Shapes: `*B` any leading axes (batch and time in
+training, none when acting), `D` width of a token, `K` length of a context, `S` slots of a ring buffer.
 """
 
 from __future__ import annotations
@@ -22,42 +22,58 @@ from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 
-View = Callable[[Array, Array | None], Array]
-"""(what a batch holds of each step, its `layouts`) -> observations."""
+BatchView = Callable[[Array, Array | None], Array]
+"""(what a batch holds of each step, its `layouts` or None) -> observations."""
 
 
-class Step(NamedTuple):
-    """Before an action. What precedes a history's first step is all zero (paper, App. E.2)."""
+class StepInput(NamedTuple):
+    """Input of an ego before an action. Before a history's first step all of `prev_*` is zero (paper, App. E.2).
+
+    Attributes:
+        obs: (*B, ..), the ego's observation, uint8 or float.
+        prev_action: int32 (*B,), the ego's last action.
+        prev_reward: float32 (*B,), the team's last reward, unscaled.
+        prev_teammate_action: int32 (*B,), or None without +TA.
+    """
 
     obs: Num[Array, "*B ..."]
     prev_action: Int[Array, "*B"]
-    prev_reward: Float[Array, "*B"]  # the team's, raw
+    prev_reward: Float[Array, "*B"]
     prev_teammate_action: Int[Array, "*B"] | None
 
 
 class Transition(NamedTuple):
-    """An action and its outcome, all within one episode."""
+    """An action and its outcome, within one episode.
+
+    Attributes:
+        obs: (*B, ..), the ego's observation before the action.
+        action: int32 (*B,), the ego's.
+        reward: float32 (*B,), the team's, unscaled.
+        next_obs: (*B, ..), the ego's observation after the action.
+        teammate_action: int32 (*B,), or None without +TA.
+    """
 
     obs: Num[Array, "*B ..."]
     action: Int[Array, "*B"]
-    reward: Float[Array, "*B"]  # the team's, raw
+    reward: Float[Array, "*B"]
     next_obs: Num[Array, "*B ..."]
     teammate_action: Int[Array, "*B"] | None
 
 
 def plain_view(obs: Array, layouts: Array | None) -> Array:
-    """The view of batches that hold observations."""
+    """Returns the observations of batches that hold observations."""
     return obs
 
 
-def state_view(layouts: Sequence[Layout]) -> View:
-    """The view of batches that hold state records uint8 (B, .., S): the ego's observations uint8 (B, .., 5, 5, C).
+def state_view(layouts: Sequence[Layout]) -> BatchView:
+    """Returns the view of batches that hold state records: uint8 (B, .., S) -> the ego's observations (B, .., 5, 5, C).
 
     Args:
-        layouts: those that a batch's `layouts` (B,) points into; all with observations of one shape.
+        layouts: those that a batch's `layouts` (B,) index; their observations have one shape.
     """
 
     def view(records: Array, which: Array | None) -> Array:
+        # Every layout is rendered for all rows: under jit a row's layout is not known, and batches mostly have one.
         seen = [observe(layout, records[..., : record_size(layout)], EGO) for layout in layouts]
         if which is None:
             return seen[0]
@@ -70,19 +86,19 @@ def state_view(layouts: Sequence[Layout]) -> View:
     return view
 
 
-def steps_of(batch: ADBatch, view: View) -> Step:
-    """The steps (B, L) of an AD batch."""
+def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
+    """Returns the steps (B, L) of an AD batch."""
     obs = view(batch.obs, batch.layouts)  # type: ignore[arg-type]
-    return Step(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
+    return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
 
 
-def step_of(percept: Any) -> Step:
-    """The step of an `agents.Percept`."""
-    return Step(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
+def percept_step(percept: Any) -> StepInput:
+    """Returns the step that an acting ego is given as an `agents.Percept`."""
+    return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
 
 
-def transitions_of(batch: DPTBatch, view: View) -> tuple[Transition, Array]:
-    """The context's transitions (B, K) and the query's observations (B,) of a DPT batch."""
+def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Array]:
+    """Returns the context's transitions (B, K) and the query's observations (B, ..) of a DPT batch."""
     obs, following, query = (
         view(part, batch.layouts)  # type: ignore[arg-type]
         for part in (batch.context_obs, batch.context_next_obs, batch.query_obs)
@@ -92,14 +108,14 @@ def transitions_of(batch: DPTBatch, view: View) -> tuple[Transition, Array]:
 
 
 class Tokens(nn.Module):
-    """What makes tokens has.
+    """Base class of tokenizers.
 
     Args:
-        encoder: of observations.
-        width: of a token.
-        actions: how many there are.
-        teammate_actions: +TA.
-        dropout: rate, in training.
+        encoder: module from observations to features.
+        width: width of a token.
+        actions: number of actions.
+        teammate_actions: whether tokens hold the teammate's actions (+TA).
+        dropout: rate in training.
         dtype: of the tokens.
     """
 
@@ -112,10 +128,11 @@ class Tokens(nn.Module):
 
 
 class StepTokens(Tokens):
-    """Steps -> tokens: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2)."""
+    """Tokens of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2)."""
 
     @nn.compact
-    def __call__(self, step: Step, deterministic: bool = True) -> Float[Array, "*B D"]:
+    def __call__(self, step: StepInput, deterministic: bool = True) -> Float[Array, "*B D"]:
+        """Returns one token per step."""
         parts = [nn.Embed(self.actions, FEATURES, name="action")(step.prev_action)]
         if self.teammate_actions:
             parts.append(nn.Embed(self.actions, FEATURES, name="teammate_action")(step.prev_teammate_action))
@@ -125,14 +142,16 @@ class StepTokens(Tokens):
 
 
 class TransitionTokens(Tokens):
-    """Transitions -> tokens: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected; a query is
-    [Enc(o); zeros] through the same projection (paper, App. E.3)."""
+    """Tokens of transitions: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected.
+
+    A query is [Enc(o); zeros] through the same projection (paper, App. E.3).
+    """
 
     def setup(self) -> None:
         self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)
 
     def context(self, transition: Transition, deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Tokens of transitions."""
+        """Returns one token per transition."""
         seen = self.encoder(jnp.stack([transition.obs, transition.next_obs]))
         parts = [seen[0], jax.nn.one_hot(transition.action, self.actions)]
         if self.teammate_actions:
@@ -140,7 +159,7 @@ class TransitionTokens(Tokens):
         return self._token([*parts, seen[1], transition.reward[..., None]], deterministic)
 
     def query(self, obs: Num[Array, "*B ..."], deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Tokens of observations whose action is asked for."""
+        """Returns one token per observation for which an action is predicted."""
         seen = self.encoder(obs)
         rest = self.actions * (1 + self.teammate_actions) + seen.shape[-1] + 1
         return self._token([seen, jnp.zeros((*seen.shape[:-1], rest))], deterministic)
@@ -150,27 +169,33 @@ class TransitionTokens(Tokens):
 
 
 class RingBuffer(NamedTuple):
-    """What an ego remembers when it acts, as a ring: entry i stands in slot i % slots."""
+    """Tokens that an acting ego keeps, as a ring: entry i is in slot i % S.
 
-    tokens: Float[Array, "slots D"]
-    written: Int[Array, ""]  # entries so far
+    Attributes:
+        tokens: float32 (S, D).
+        written: int32 (), entries so far.
+    """
+
+    tokens: Float[Array, "S D"]
+    written: Int[Array, ""]
+
+    @classmethod
+    def empty(cls, slots: int, width: int) -> RingBuffer:
+        """Returns a buffer without entries."""
+        return cls(jnp.zeros((slots, width)), jnp.int32(0))
 
     def add(self, token: Float[Array, " D"]) -> RingBuffer:
-        """With one more entry, in place of the oldest."""
+        """Returns the buffer with one more entry, which replaces the oldest of a full buffer."""
         return RingBuffer(self.tokens.at[self.written % len(self.tokens)].set(token), self.written + 1)
 
     def last(self, context: int, stop: Int[Array, ""]) -> tuple[Float[Array, "K D"], Int[Array, ""]]:
-        """The entries stop - K .. stop - 1 in order, from the front, and how many there are."""
+        """Returns the entries stop - K .. stop - 1 in order, at the front of the array, and their number."""
         first = jnp.maximum(stop - context, 0)
         return self.tokens[(first + jnp.arange(context)) % len(self.tokens)], stop - first
 
 
-def empty_log(slots: int, width: int) -> RingBuffer:
-    """A log without entries."""
-    return RingBuffer(jnp.zeros((slots, width)), jnp.int32(0))
-
-
-def visible_slots(slots: int, written: Int[Array, ""], context: int, stop: Int[Array, ""]) -> Bool[Array, " slots"]:
-    """The slots of a ring of `written` entries that hold the entries stop - K .. stop - 1."""
+def visible_slots(slots: int, written: Int[Array, ""], context: int, stop: Int[Array, ""]) -> Bool[Array, " S"]:
+    """Returns which slots of a ring of `written` entries hold the entries stop - K .. stop - 1."""
+    # The newest entry of each slot: the largest number up to written - 1 that is congruent to the slot.
     entry = written - 1 - (written - 1 - jnp.arange(slots)) % slots
     return (entry >= jnp.maximum(stop - context, 0)) & (entry < stop)

@@ -1,48 +1,56 @@
-"""The one transformer (paper, App. E.1): decoder-only, pre-norm; whole sequences in training, one token when acting.
+"""Decoder-only, pre-norm transformer (paper, App. E.1): complete sequences in training, one token when acting.
 
-`B` denotes the batch size, `N` tokens of a sequence, `D` the width, `H` heads, `S` slots of a cache.
+Shapes: `B` batch size, `N` tokens of a sequence, `D` width, `H` heads, `Dh` width of a head (D / H), `S` slots of a
+cache.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from baselines.methods.attention import causal, query_attention
-
-Positions = Literal["none", "rope"]
-POSITIONS: tuple[Positions, ...] = ("none", "rope")
-"""Where a token stands: not said, as published, or by rotary embedding (Su et al. 2021)."""
+from baselines.methods.attention import causal_attention, query_attention
+from baselines.methods.options import Positions
 
 
-class Cache(NamedTuple):
-    """One layer's keys and values of earlier tokens, one slot each; a head's stand together."""
+class AttentionCache(NamedTuple):
+    """Keys and values of earlier tokens in one layer, one slot per token.
 
-    keys: Float[Array, "H S D/H"]
-    values: Float[Array, "H S D/H"]
+    Attributes:
+        keys: float32 (H, S, Dh); one head's slots are contiguous, which a matrix product per head reads fastest.
+        values: float32 (H, S, Dh).
+    """
+
+    keys: Float[Array, "H S Dh"]
+    values: Float[Array, "H S Dh"]
 
     @property
     def slots(self) -> int:
-        """How many tokens it holds."""
+        """Number of tokens that fit."""
         return self.keys.shape[1]
 
 
-class Memory(NamedTuple):
-    """Every layer's cache, used as a ring, and how many tokens have gone into it."""
+class TransformerMemory(NamedTuple):
+    """Memory of an acting ego: the last S tokens, as a ring.
 
-    caches: tuple[Cache, ...]
+    Attributes:
+        caches: one cache per layer.
+        written: int32 (), tokens written so far; token i is in slot i % S.
+    """
+
+    caches: tuple[AttentionCache, ...]
     written: Int[Array, ""]
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Attention, then a feed-forward layer of width 4 D with GELU, each behind a layer norm and added to its input.
 
-    Dropout where the paper has it, but for the attention's: `jax.nn.dot_product_attention` offers none on its weights,
-    here it falls on the heads' outputs.
+    Dropout is where the paper has it, with one exception: `jax.nn.dot_product_attention` offers none on its weights, so
+    it is applied to the outputs of the heads.
     """
 
     width: int
@@ -59,69 +67,73 @@ class Block(nn.Module):
     def __call__(
         self,
         x_BxNxD: Float[Array, "B N D"],
-        positions: Int[Array, " N"],
+        positions_N: Int[Array, " N"],
         context: int,
-        lengths: Int[Array, " B"] | None,
+        lengths_B: Int[Array, " B"] | None,
         deterministic: bool,
     ) -> Float[Array, "B N D"]:
-        """See `Transformer.__call__`."""
-        (q, asked_q), (k, asked_k), (v, asked_v) = (
-            (x[:, :context], x[:, context:]) for x in self._qkv(x_BxNxD, positions)
-        )
-        attended = causal(q, k, v, lengths)
+        """Returns features of complete sequences; see `Transformer.__call__` for the arguments."""
+        q, k, v = self._project(x_BxNxD, positions_N)  # each (B, N, H, Dh)
+        attended = causal_attention(q[:, :context], k[:, :context], v[:, :context], lengths_B)
         if context < x_BxNxD.shape[1]:
-            attended = jnp.concatenate([attended, query_attention(asked_q, asked_k, asked_v, k, v)], axis=1)
-        return self._join(x_BxNxD, attended, deterministic)
+            answers = query_attention(q[:, context:], k[:, context:], v[:, context:], k[:, :context], v[:, :context])
+            attended = jnp.concatenate([attended, answers], axis=1)
+        return self._add_residuals(x_BxNxD, attended, deterministic)
 
     def step(
         self,
         x_D: Float[Array, " D"],
         position: Int[Array, ""],
-        cache: Cache,
+        cache: AttentionCache,
         slot: Int[Array, ""],
-        visible: Bool[Array, " S"],
-    ) -> tuple[Float[Array, " D"], Cache]:
-        """One token, whose key and value are written into a slot of the cache before it attends."""
-        q, k, v = self._qkv(x_D[None, None], position[None])
-        cache = Cache(cache.keys.at[:, slot].set(k[0, 0]), cache.values.at[:, slot].set(v[0, 0]))
-        return self._join(x_D[None, None], _look_up(q[0, 0], cache, visible)[None, None], True)[0, 0], cache
+        visible_S: Bool[Array, " S"],
+    ) -> tuple[Float[Array, " D"], AttentionCache]:
+        """Returns the features of one token, whose key and value are written into a slot before it attends."""
+        x_1x1xD = x_D[None, None]
+        q, k, v = (projected[0, 0] for projected in self._project(x_1x1xD, position[None]))  # each (H, Dh)
+        cache = AttentionCache(cache.keys.at[:, slot].set(k), cache.values.at[:, slot].set(v))
+        attended = _attend_to_cache(q, cache, visible_S)[None, None]
+        return self._add_residuals(x_1x1xD, attended, True)[0, 0], cache
 
-    def _qkv(self, x: Float[Array, "B N D"], positions: Int[Array, " N"]) -> list[Float[Array, "B N H D/H"]]:
-        qkv = self.qkv(self.attention_norm(x)).reshape(*x.shape[:2], 3, self.heads, -1)
-        q, k, v = (qkv[:, :, i] for i in range(3))
-        return [_rotated(q, positions), _rotated(k, positions), v] if self.rope else [q, k, v]
+    def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
+        """Returns queries, keys and values."""
+        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
+        q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
+        return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
 
-    def _join(self, x: Array, attended: Float[Array, "B N H D/H"], deterministic: bool) -> Array:
+    def _add_residuals(self, x_BxNxD: Array, attended: Float[Array, "B N H Dh"], deterministic: bool) -> Array:
         def drop(y: Array) -> Array:
             return self.drop(y, deterministic=deterministic)
 
-        x = x + drop(self.out(drop(attended.reshape(x.shape))))
-        return x + drop(self.down(nn.gelu(self.up(self.feed_norm(x)))))
+        x_BxNxD = x_BxNxD + drop(self.out(drop(attended.reshape(x_BxNxD.shape))))
+        return x_BxNxD + drop(self.down(nn.gelu(self.up(self.feed_norm(x_BxNxD)))))
 
 
-def _look_up(q: Float[Array, "H D/H"], cache: Cache, visible: Bool[Array, " S"]) -> Float[Array, "H D/H"]:
-    """One token's attention: `jax.nn.dot_product_attention` takes ten times as long for it on a CPU."""
-    scores = jnp.einsum("hd,hsd->hs", q, cache.keys) / q.shape[-1] ** 0.5
-    return jnp.einsum("hs,hsd->hd", jax.nn.softmax(scores, where=visible), cache.values)
+def _attend_to_cache(
+    q_HxDh: Float[Array, "H Dh"], cache: AttentionCache, visible_S: Bool[Array, " S"]
+) -> Float[Array, "H Dh"]:
+    """Returns one token's attention. `jax.nn.dot_product_attention` takes ten times as long for it on a CPU."""
+    scores_HxS = jnp.einsum("hd,hsd->hs", q_HxDh, cache.keys) / q_HxDh.shape[-1] ** 0.5
+    return jnp.einsum("hs,hsd->hd", jax.nn.softmax(scores_HxS, where=visible_S), cache.values)
 
 
-def _rotated(x: Float[Array, "B N H D"], positions: Int[Array, " N"]) -> Float[Array, "B N H D"]:
-    """Each pair of features turned by an angle in proportion to the position."""
-    half = x.shape[-1] // 2
-    angle = positions[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
-    cos, sin = (f(angle)[:, None, :].astype(x.dtype) for f in (jnp.cos, jnp.sin))
-    one, two = x[..., :half], x[..., half:]
+def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"]) -> Float[Array, "B N H Dh"]:
+    """Rotates each pair of features by an angle in proportion to the position (Su et al. 2021)."""
+    half = x_BxNxHxDh.shape[-1] // 2
+    angle_NxF = positions_N[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
+    cos, sin = (f(angle_NxF)[:, None, :].astype(x_BxNxHxDh.dtype) for f in (jnp.cos, jnp.sin))
+    one, two = x_BxNxHxDh[..., :half], x_BxNxHxDh[..., half:]
     return jnp.concatenate([one * cos - two * sin, two * cos + one * sin], axis=-1)
 
 
 class Transformer(nn.Module):
-    """Tokens -> features, with a last layer norm.
+    """Blocks and a last layer norm: tokens to features.
 
     Args:
-        layers, width, heads: its size.
-        dropout: rate, in training.
-        positions: see `POSITIONS`.
-        remat: compute a block's inside again in the backward pass instead of keeping it.
+        layers, width, heads: size of the model.
+        dropout: rate in training.
+        positions: see `options.Positions`.
+        remat: recompute the inside of a block in the backward pass instead of storing it.
     """
 
     layers: int = 4
@@ -132,7 +144,9 @@ class Transformer(nn.Module):
     remat: bool = False
 
     def setup(self) -> None:
-        block: Any = nn.remat(Block, static_argnums=(3, 5), methods=["__call__"]) if self.remat else Block
+        block: Any = TransformerBlock
+        if self.remat:
+            block = nn.remat(TransformerBlock, static_argnums=(3, 5), methods=["__call__"])
         rope = self.positions == "rope"
         self.blocks = [block(self.width, self.heads, self.dropout, rope) for _ in range(self.layers)]
         self.norm = nn.LayerNorm()
@@ -145,49 +159,51 @@ class Transformer(nn.Module):
         context: int | None = None,
         deterministic: bool = True,
     ) -> Float[Array, "B N D"]:
-        """Whole sequences: every token sees those up to itself.
+        """Returns features of complete sequences, in which every token sees those up to itself.
 
         Args:
             x: tokens.
-            lengths: of each sequence; what is behind is padding.
-            context: so many are a context, and behind it stand context + 1 queries: of these, number j sees the first j
-                tokens and itself, as if it stood behind them.
+            lengths: valid tokens of each sequence; the others are padding.
+            context: if given, the first `context` tokens are a context and the `context + 1` tokens behind it are
+                queries: query j sees the first j tokens and itself, as if it followed them directly.
             deterministic: False for dropout, under the rng `dropout`.
         """
         length = x.shape[1]
         context = length if context is None else context
-        positions = jnp.concatenate([jnp.arange(context), jnp.arange(length - context)])
+        positions_N = jnp.concatenate([jnp.arange(context), jnp.arange(length - context)])
         for block in self.blocks:
-            x = block(x, positions, context, lengths, deterministic)
+            x = block(x, positions_N, context, lengths, deterministic)
         return self.norm(x)
 
     def step(
         self,
-        x: Float[Array, " D"],
-        caches: tuple[Cache, ...],
+        x_D: Float[Array, " D"],
+        caches: tuple[AttentionCache, ...],
         slot: Int[Array, ""],
         position: Int[Array, ""],
-        visible: Bool[Array, " S"],
-    ) -> tuple[Float[Array, " D"], tuple[Cache, ...]]:
-        """One token: it is written into `slot` and sees the `visible` slots, its own among them."""
-        after = []
+        visible_S: Bool[Array, " S"],
+    ) -> tuple[Float[Array, " D"], tuple[AttentionCache, ...]]:
+        """Returns the features of one token, written into `slot`; it sees the visible slots, its own among them."""
+        updated = []
         for block, cache in zip(self.blocks, caches, strict=True):
-            x, cache = block.step(x, position, cache, slot, visible)
-            after.append(cache)
-        return self.norm(x), tuple(after)
+            x_D, cache = block.step(x_D, position, cache, slot, visible_S)
+            updated.append(cache)
+        return self.norm(x_D), tuple(updated)
 
-    def empty(self, slots: int) -> tuple[Cache, ...]:
-        """Caches of so many slots."""
+    def empty_caches(self, slots: int) -> tuple[AttentionCache, ...]:
+        """Returns zero caches of `slots` slots, one per layer."""
         zeros = jnp.zeros((self.heads, slots, self.width // self.heads))
-        return (Cache(zeros, zeros),) * self.layers
+        return (AttentionCache(zeros, zeros),) * self.layers
 
-    def start(self, context: int) -> Memory:
-        """The memory of the last `context` tokens."""
-        return Memory(self.empty(context), jnp.int32(0))
+    def start(self, context: int) -> TransformerMemory:
+        """Returns an empty memory for the last `context` tokens."""
+        return TransformerMemory(self.empty_caches(context), jnp.int32(0))
 
-    def advance(self, x: Float[Array, " D"], memory: Memory) -> tuple[Float[Array, " D"], Memory]:
-        """One more token, in place of the oldest where the memory is full."""
+    def advance(
+        self, x_D: Float[Array, " D"], memory: TransformerMemory
+    ) -> tuple[Float[Array, " D"], TransformerMemory]:
+        """Returns the features of one more token, which replaces the oldest in a full memory."""
         slots = memory.caches[0].slots
-        visible = jnp.arange(slots) <= memory.written
-        feature, caches = self.step(x, memory.caches, memory.written % slots, memory.written, visible)
-        return feature, Memory(caches, memory.written + 1)
+        visible_S = jnp.arange(slots) <= memory.written
+        feature_D, caches = self.step(x_D, memory.caches, memory.written % slots, memory.written, visible_S)
+        return feature_D, TransformerMemory(caches, memory.written + 1)

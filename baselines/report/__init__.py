@@ -1,7 +1,6 @@
-"""Reports of evaluation results: tables, figures, pages."""
+"""Reports of evaluation results: Markdown, CSV, figures, a page."""
 
-from baselines.report.markdown import markdown, rows
 from baselines.report.results import as_run, merge, read_run
-from baselines.report.write import write_report
+from baselines.report.summary import markdown, rows, write_report
 
 __all__ = ["as_run", "markdown", "merge", "read_run", "rows", "write_report"]

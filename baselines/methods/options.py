@@ -1,0 +1,47 @@
+"""Hyper-parameters of the models, without JAX, so that the command line can show them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.option_fields import check_fields, option_field
+
+Positions = Literal["none", "rope"]
+"""How a token's position enters the transformer: not at all, as published, or by rotary embedding (Su et al. 2021)."""
+
+SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 768, 100_000)}
+"""Size name -> layers, width, training steps (paper, Sec. 4.4, "Model Scale and Training Budget")."""
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Architecture of a model; the defaults are the paper's (App. E.5).
+
+    Raises:
+        OptionError: if a value is out of bounds, or the width is not a multiple of twice the heads.
+    """
+
+    layers: int = option_field(4, "Layers of the transformer.", at_least=1)
+    width: int = option_field(256, "Width of tokens and features.", at_least=1)
+    heads: int = option_field(4, "Attention heads.", at_least=1)
+    recurrent_layers: int = option_field(2, "GRU layers of Hybrid-AD, in place of the transformer.", at_least=1)
+    dropout: float = option_field(0.1, "Dropout rate in training.", at_least=0, below=1)
+    positions: Positions = option_field("none", "Position embedding: none, as published, or rope.")
+    teammate_actions: bool = option_field(False, "+TA: input the teammate's previous action, too.", flags=["--ta"])
+    next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")
+    label_smoothing: float = option_field(0.0, "Label smoothing of the action loss.", at_least=0, below=1)
+    discounts: tuple[float, ...] = option_field(
+        (0.9, 0.95, 0.99, 0.995),
+        "Discount factor of AMAGO-Offline, which acts by the last one; repeat for several.",
+        at_least=0,
+        below=1,
+    )
+    bfloat16: bool = option_field(False, "Compute in bfloat16; parameters stay float32.")
+    remat: bool = option_field(False, "Recompute activations in the backward pass: less memory, more time.")
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.width % (2 * self.heads):
+            raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")

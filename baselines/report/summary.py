@@ -1,0 +1,171 @@
+"""Results as text: Markdown tables with the published numbers, CSV, and the short report of both with curves."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.plotting import plot_return_curves
+from baselines.report.results import (
+    TEST_LAYOUTS,
+    EvaluationRun,
+    families_of,
+    normalized_return,
+    published_cells,
+)
+from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, headroom_table, read_headroom
+from icrl4aht_data.utils.templates import markdown_table
+
+_RESAMPLES = 10_000
+_PAPER_AGENTS = ("random", "AD", "DPT")
+
+HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Layout -> family -> reference ego -> mean return."""
+
+
+def bootstrap_interval(means: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
+    """Returns the bootstrap 95 % interval of the mean over instances (n,)."""
+    resampled = rng.choice(means, (_RESAMPLES, len(means))).mean(axis=1)
+    low, high = np.percentile(resampled, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def rows(run: EvaluationRun) -> list[dict[str, Any]]:
+    """Returns one row per cell: return, interval, the same agent's published numbers, gain and normalized return."""
+    published: dict[str, Any] = {} if run.variant else published_cells(run.agent)
+    headroom = read_headroom(run.protocol)
+    rng = np.random.default_rng(0)
+    found = []
+    for cell in run.cells:
+        layout, family = cell
+        means = run.means(cell)
+        low, high = bootstrap_interval(means, rng)
+        published_mean, published_std = published.get(layout, {}).get(family, (None, None))
+        found.append(
+            {
+                "agent": run.agent,
+                "protocol": run.protocol,
+                "layout": layout,
+                "family": family,
+                "instances": len(means),
+                "episodes": run.cells[cell].shape[1],
+                "mean": float(means.mean()),
+                "std": float(means.std()),
+                "low": low,
+                "high": high,
+                "published_mean": published_mean,
+                "published_std": published_std,
+                "gain": run.gain(cell),
+                "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
+                "normalised": normalized_return(float(means.mean()), headroom.get(cell)),
+                "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
+            }
+        )
+    return found
+
+
+def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
+    """Write report.md, report.csv and curves.png into a folder. Returns their paths."""
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / "report.md", out / "report.csv", out / "curves.png"]
+    paths[0].write_text(markdown(runs), encoding="utf-8")
+    paths[1].write_text(csv_text(runs), encoding="utf-8")
+    plot_return_curves([(run.name, run.cells) for run in runs], paths[2])
+    return paths
+
+
+def markdown(runs: list[EvaluationRun]) -> str:
+    """Returns a Markdown report with one block per run and track."""
+    lines = [
+        "# Returns per layout and teammate family",
+        "",
+        "Mean ± std over the instances' means; below it the published number of the same agent, if there is one.",
+    ]
+    for run in runs:
+        for track, table in track_tables(run):
+            lines += ["", f"## {run.name}, track {track}", "", table]
+    return "\n".join(lines) + "\n"
+
+
+def track_tables(run: EvaluationRun) -> Iterator[tuple[str, str]]:
+    """Yields each track that was played, and its Markdown table with a column per layout and a row per family."""
+    cells = {(row["layout"], row["family"]): row for row in rows(run)}
+    for track, splits in TRACKS.items():
+        of_track = dict.fromkeys((*splits["test"], *splits["train"]))
+        layouts = [layout for layout in of_track if any((layout, family) in cells for family in FAMILIES)]
+        if layouts:
+            body = [
+                [family, *(_cell_text(cells.get((layout, family))) for layout in layouts)]
+                for family in families_of(cells)
+            ]
+            yield track, markdown_table(["family", *layouts], body)
+
+
+def _cell_text(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    text = f"{row['mean']:.1f} ± {row['std']:.1f}"
+    if row["published_mean"] is not None:
+        text += f"<br>published {row['published_mean']:.1f} ± {row['published_std']:.1f}"
+    text += f"<br>gain {row['gain']:+.1f}"
+    if row["headroom"] is False:
+        text += "<br>no headroom"
+    if row["normalised"] is not None:
+        text += f"<br>normalised {row['normalised']:.2f}"
+    return text
+
+
+def csv_text(runs: list[EvaluationRun]) -> str:
+    """Returns the rows of all runs as CSV with a header."""
+    body = [row for run in runs for row in rows(run)]
+    stream = StringIO()
+    writer = csv.DictWriter(stream, fieldnames=list(body[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(body)
+    return stream.getvalue()
+
+
+def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
+    """Returns the headroom card: protocol -> cells, as Markdown."""
+    lines = [
+        "# Headroom: what an ego can change",
+        "",
+        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the",
+        "published test instances. **bold**: the oracle gets more than staying does; elsewhere no reference ego can",
+        "raise the return, so a method's score there says nothing about adaptation.",
+    ]
+    for protocol, layouts in protocols.items():
+        names = [layout for layout in TEST_LAYOUTS if layout in layouts]
+        cells: dict[Cell, Any] = {
+            (layout, family): cell for layout in names for family, cell in layouts[layout].items()
+        }
+        lines += ["", f"## Protocol `{protocol}`", "", headroom_table(cells, names)]
+    if "published" in protocols:
+        lines += ["", "## The paper's methods and the reference egos", "", published_table(protocols["published"])]
+    return "\n".join(lines) + "\n"
+
+
+def published_table(layouts: HeadroomCells) -> str:
+    """Returns a Markdown table of reference egos and the paper's methods: a row per layout, means over families.
+
+    Args:
+        layouts: measured under the protocol `published`.
+    """
+    body = []
+    for layout in (name for name in TEST_LAYOUTS if name in layouts):
+        cells = layouts[layout]
+        ours = {agent: np.mean([cell[agent] for cell in cells.values()]) for agent in REFERENCES}
+        paper = {
+            name: np.mean([published_cells(name)[layout][family][0] for family in cells]) for name in _PAPER_AGENTS
+        }
+        open_cells = sum(map(has_headroom, cells.values()))
+        numbers = [ours["stay"], ours["random"], *paper.values(), ours["oracle"]]
+        body.append([layout, *(f"{number:z.1f}" for number in numbers), f"{open_cells} of {len(cells)}"])
+    names = ["stay", "random", *(f"{name} (paper)" for name in _PAPER_AGENTS), "oracle", "cells with headroom"]
+    return markdown_table(["layout", *names], body)

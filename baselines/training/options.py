@@ -1,0 +1,62 @@
+"""Hyper-parameters of training and the choice of histories, without JAX, so that the command line can show them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from icrl4aht_data.reading.history import Obs
+from icrl4aht_data.sampling.dpt import ContextOrder
+from icrl4aht_data.utils.option_fields import check_fields, option_field
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Settings of a training run; the defaults are the paper's (App. E.5).
+
+    Raises:
+        OptionError: if a value is out of bounds.
+    """
+
+    steps: int = option_field(20_000, "Training steps.", at_least=1)
+    batch_size: int = option_field(1024, "Windows or contexts per batch, over all devices and processes.", at_least=1)
+    context: int = option_field(500, "K: steps of a window, or transitions of a context.", at_least=1)
+    learning_rate: float = option_field(1e-3, "Highest learning rate.", above=0)
+    warmup: float = option_field(0.05, "Share of the steps in which the learning rate rises.", at_least=0, at_most=1)
+    weight_decay: float = option_field(0.0, "Weight decay of AdamW.", at_least=0)
+    clip: float = option_field(1.0, "Largest global norm of the gradient.", above=0)
+    accumulate: int = option_field(1, "Parts that a batch is computed in, one after the other.", at_least=1)
+    seed: int = option_field(0, "Seed of parameters, batches and dropout.", at_least=0, below=2**32)
+    log_every: int = option_field(50, "Steps between lines of the log.", at_least=1)
+    validate_every: int = option_field(1000, "Steps between validations.", at_least=1)
+    validation_batches: int = option_field(2, "Batches of each held-out part in a validation.", at_least=0)
+    save_every: int = option_field(1000, "Steps between checkpoints.", at_least=1)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class HistoryOptions:
+    """Choice of the histories that a run is trained on.
+
+    Attributes:
+        layouts: names of training layouts, with observations of one shape.
+        root: folder or address of a release; None for the bundled mini release.
+        split: split of the release.
+    """
+
+    layouts: tuple[str, ...]
+    root: str | None = None
+    split: str = "train"
+    order: ContextOrder = option_field("contiguous", "Order of the transitions in DPT's contexts.")
+    held_out: float = option_field(
+        0.1, "Share of the tasks, and of the other tasks' histories, held out for validation.", above=0, below=1
+    )
+    obs: Obs | None = option_field(
+        None,
+        "Representation of observations in batches.",
+        default_text="state, or uint8 if there are no state records",
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
