@@ -25,7 +25,7 @@ from benchmarks.peers import jaxmarl_environment
 from generation.env import Environment
 from generation.learners.population.fcp import FCP
 from generation.learners.population.population import Population
-from generation.learners.ppo import PPOConfig
+from generation.learners.config import PPOConfig
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _UPDATES = 2

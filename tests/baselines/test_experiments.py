@@ -20,8 +20,9 @@ from baselines.methods.method import ModelOptions
 from baselines.report.episode_gifs import film_families
 from baselines.report.results import TEST_LAYOUTS, read_run
 from baselines.training.run_folder import Checkpoints
-from generation.learners.checkpoint import WEIGHTS, save_policy
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -202,7 +203,7 @@ def suite(tmp_path_factory) -> Path:
     where = "cramped_up/fcp/m0/c0"
     save_policy(root / where, network, network.untrained(jax.random.key(0), layout.channels), {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
-    entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / WEIGHTS)}
+    entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / POLICY_WEIGHTS)}
     (root / "manifests").mkdir()
     write_tasks(root / "manifests" / "layout_heldout.jsonl", [make_task("layout", "heldout", "cramped_up", entry, 1)])
     return root

@@ -273,12 +273,12 @@ from tests.helpers.random_play import random_release
 from baselines.agents import stay
 from baselines.evaluate import evaluate, get_protocol
 from baselines.report import as_run, markdown, rows
-from generation.teammates.registry import heuristic_teammate, sample
+from generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_data import __file__, verify_release
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 assert __file__.startswith(sys.argv[1])
 made = make_task("layout", "train", "open_kitchen", heuristic_teammate("waiter", "lazy", 0), 0)
-write_tasks(Path("mine.jsonl"), [made, make_task("layout", "train", "open_kitchen", sample("waiter", 1, "test"), 1)])
+write_tasks(Path("mine.jsonl"), [made, make_task("layout", "train", "open_kitchen", sample_teammate("waiter", 1, "test"), 1)])
 tasks = read_tasks(Path("mine.jsonl"))
 short = dataclasses.replace(get_protocol("seeded"), episodes=1, steps=10)
 run = as_run(evaluate("stay", stay, tasks[:1], short), tasks=tasks)
@@ -308,7 +308,7 @@ def apply(path: Path, lines: list[str]) -> None:
 class TestScale:
     def test_the_plan_of_the_paper_is_the_printed_one(self, monkeypatch):
         """But for what is measured."""
-        monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.Speed(1000.0, 1.0))
+        monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.LearnerSpeed(1000.0, 1.0))
         monkeypatch.setattr(plan, "bytes_per_transition", lambda kind: 1.0)
         (arguments,) = (a for a in commands("python -m generation", PAGES["scale"]) if a[0] == "plan")
         result = CliRunner().invoke(generation_cli, arguments)

@@ -13,7 +13,7 @@ import pytest
 from baselines.commands.cli import cli as baselines_cli
 from generation.cli import cli as generation_cli
 from generation.collection import ray_executor as on_ray
-from generation.collection.options import Options
+from generation.collection.options import CollectOptions
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run
@@ -222,14 +222,14 @@ def test_a_bug_is_no_misuse(monkeypatch):
 def test_a_ray_that_is_not_there_is_missed_at_once():
     with (
         pytest.raises(OptionError, match=r"Ray at 127\.0\.0\.1:1 cannot be reached: .*; check the address"),
-        on_ray._connected(Options("ray", "127.0.0.1:1")),
+        on_ray._connected(CollectOptions("ray", "127.0.0.1:1")),
     ):
         pass
 
 
 def test_a_data_version_in_a_profile(tmp_path: Path, say):
     profile = tmp_path / "mine.toml"
-    smoke = (Path(on_ray.__file__).parent / "profiles" / "smoke.toml").read_text(encoding="utf-8")
+    smoke = (Path(on_ray.__file__).parents[1] / "profiles" / "smoke.toml").read_text(encoding="utf-8")
     profile.write_text(smoke.replace('data_version = "0.0.1"', 'data_version = "new"'), encoding="utf-8")
     code, said = say("generation", "plan", "--profile", str(profile))
     assert (code, "mine.toml: data version 'new': expected one such as 1.0.0" in said) == (1, True)
