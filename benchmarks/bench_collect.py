@@ -35,6 +35,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.writing.published import PUBLISHED_CHUNK
@@ -135,7 +136,12 @@ def sizes(streams: int) -> dict[str, Any]:
     tasks = read_tasks(dataset.root / TASKS)
     chosen = {task.task_id: dataset.filter(task_id=task.task_id)[:streams] for task in tasks}
     new = [
-        NewTask(task, {}, len(chosen[task.task_id]), lambda part=chosen[task.task_id]: map(NewHistory.copied, part))
+        NewTask(
+            task,
+            Provenance(),
+            len(chosen[task.task_id]),
+            lambda part=chosen[task.task_id]: map(NewHistory.copied, part),
+        )
         for task in tasks
     ]
     transitions = sum(history.entry.T for part in chosen.values() for history in part)

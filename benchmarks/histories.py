@@ -11,6 +11,7 @@ import numpy as np
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import TASKS, held_fields
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
@@ -20,14 +21,14 @@ def write_many(folder: Path, layouts: Sequence[str], histories: int) -> Path:
     source = load_icrl4aht()
     first = {task.layout.name: task for task in reversed(read_tasks(source.root / TASKS))}
     tasks = [
-        NewTask(first[name], {}, histories, partial(_shifted, source.filter(layout=name), histories))
+        NewTask(first[name], Provenance(), histories, partial(_shifted, source.filter(layout=name), histories))
         for name in layouts
     ]
     return write_release(folder, "lite", tasks, data_version="0.0.0", card="# benchmark\n")
 
 
 def _shifted(source: Dataset, histories: int) -> Iterator[NewHistory]:
-    kept = source.info["environment"]["kept_steps"]
+    kept = source.info.environment.kept_steps
     for number in range(histories):
         history, episodes = source[number % len(source)], number // len(source)
         arrays = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -14,7 +15,8 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index, read_index
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.info import ReleaseInfo
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import OBS, History, Obs
@@ -78,13 +80,12 @@ def load_icrl4aht(
     if cache not in CACHE_MODES:
         raise unknown("cache", cache, CACHE_MODES)
     options = ReadOptions(obs, cache, usable_cores() if threads is None else check_int("threads", threads, 1))
-    index = read_index(open_root(MINI if root is None else root))
-    if obs == "state" and index.info["kind"] not in KINDS:
-        raise OptionError(
-            f'obs = "state": {index.origin} has observations only, no state records; take float32 or uint8'
-        )
+    origin = open_root(MINI if root is None else root)
+    index = read_index(origin.folder)
+    if obs == "state" and index.info.kind not in KINDS:
+        raise OptionError(f'obs = "state": {origin} has observations only, no state records; take float32 or uint8')
     everything = np.arange(len(index.entries))
-    dataset = Dataset(index, everything, options, Shards(index))
+    dataset = Dataset(index, everything, options, Shards(origin, index))
     return dataset.filter(
         split=split,
         layout=layout,
@@ -135,7 +136,7 @@ class Dataset:
     @property
     def origin(self) -> ReleaseLocation:
         """Where the release is: its name, and the way to its files."""
-        return self.index.origin
+        return self._shards.origin
 
     @property
     def traffic(self) -> Traffic:
@@ -144,14 +145,14 @@ class Dataset:
         return Traffic() if remote is None else remote.store.traffic
 
     @property
-    def info(self) -> dict[str, Any]:
-        """meta/info.json: versions, kind, environment, totals."""
+    def info(self) -> ReleaseInfo:
+        """The release's versions, kind, environment and totals, as meta/info.json has them."""
         return self.index.info
 
     @property
     def has_states(self) -> bool:
         """Whether the release has state records: a release of observations has none."""
-        return self.info["kind"] in KINDS
+        return self.info.kind in KINDS
 
     @property
     def knows_tasks(self) -> bool:
@@ -181,7 +182,7 @@ class Dataset:
         return (
             f"Dataset({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
-            f"{self.info['kind']} release {self.info['data_version']} at {self.origin})"
+            f"{self.info.kind} release {self.info.data_version} at {self.origin})"
         )
 
     def column(self, name: str) -> np.ndarray:
@@ -209,7 +210,7 @@ class Dataset:
         size = 0
         for layout, rows in self._by_layout():
             steps, episodes = (int(self.column(name)[rows].sum()) for name in ("T", "episodes"))
-            size += decoded_size(layout, self.info["kind"], steps, len(rows), episodes)
+            size += decoded_size(layout, self.info.kind, steps, len(rows), episodes)
         return choose(self.options.cache, size)
 
     @cached_property
@@ -280,7 +281,7 @@ class Dataset:
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
     @cached_property
-    def _provenance(self) -> dict[str, Any]:
+    def _provenance(self) -> dict[str, Provenance]:
         return read_provenance(self.origin.file(PROVENANCE))
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
@@ -292,7 +293,7 @@ class Dataset:
             "environment_name": layout.alias,
             "map": list(layout.rows),
             "recipes": [list(recipe) for recipe in layout.recipes],
-            **self.info["environment"],
+            **asdict(self.info.environment),
         }
 
     def recover_teammate(self, history_id: int) -> dict[str, Any]:
@@ -312,7 +313,8 @@ class Dataset:
             )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        return self._tasks[entry.task_id].teammate | self._provenance.get(entry.task_id, {}).get("teammate", {})
+        provenance = self._provenance.get(entry.task_id, Provenance())
+        return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
         """Algorithm Distillation windows; see `sampling.ADSampler` for the options."""

@@ -72,7 +72,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "layouts": [layout.name for layout in dataset.layouts],
             "obs": dataset.obs,
             "obs_shape": list(dataset.layouts[0].obs_shape),
-            "data_version": dataset.info["data_version"],
+            "data_version": dataset.info.data_version,
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
         },

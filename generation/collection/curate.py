@@ -12,6 +12,7 @@ import numpy as np
 
 from generation.learners.network import ActorCritic
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.format.provenance import StreamFilter, StreamReturns
 from icrl4aht_data.format.schema import curve_ends, stream_score
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import Layout
@@ -37,18 +38,14 @@ def best_streams(rewards: np.ndarray, keep: int) -> np.ndarray:
     return np.argsort(-stream_score(stream_returns(rewards)), kind="stable")[:keep]
 
 
-def filter_report(rewards: np.ndarray, streams: np.ndarray) -> dict[str, dict[str, float]]:
+def filter_report(rewards: np.ndarray, streams: np.ndarray) -> StreamFilter:
     """Mean returns at the start and at the end of learning, before the filter and after it."""
     returns = stream_returns(rewards)
-    report = {}
-    for name, part in (("before", returns), ("after", returns[streams])):
-        start, end = curve_ends(part)
-        report[name] = {
-            "streams": len(part),
-            "return_start": round(float(start.mean()), 3),
-            "return_end": round(float(end.mean()), 3),
-        }
-    return report
+    sides = []
+    for part in (returns, returns[streams]):
+        start, end = (round(float(values.mean()), 3) for values in curve_ends(part))
+        sides.append(StreamReturns(len(part), start, end))
+    return StreamFilter(before=sides[0], after=sides[1])
 
 
 def plot_filter(path: Path, title: str, rewards: np.ndarray, streams: np.ndarray) -> None:

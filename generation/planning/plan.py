@@ -27,6 +27,7 @@ from generation.teammates.registry import build
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS, TASKS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.threads import usable_cores
@@ -182,7 +183,9 @@ def bytes_per_transition(kind: Kind) -> float:
     """Of the bundled release's data, one history of each of its tasks, if packed so."""
     dataset = load_icrl4aht()
     with tempfile.TemporaryDirectory() as folder:
-        new = [NewTask(task, {}, 1, partial(_first_history, task)) for task in read_tasks(dataset.root / TASKS)]
+        new = [
+            NewTask(task, Provenance(), 1, partial(_first_history, task)) for task in read_tasks(dataset.root / TASKS)
+        ]
         root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
         shards = sum(path.stat().st_size for path in (root / "data").rglob("*.h5"))
         return shards / sum(entry.T for entry in load_icrl4aht(root).entries)

@@ -20,11 +20,11 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder
-from icrl4aht_data.writing.statistics import STREAMS_RECORDED
 
 
 def package(
@@ -53,29 +53,29 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")
     streams = best_streams(rewards, profile.keep)
     plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
-    provenance = {
-        "profile": metadata["profile"],
-        "profile_hash": profile.hash,
-        "ego": metadata["ego"],
-        "ego_hash": metadata["ego_hash"],
-        "code_version": metadata["code_version"],
-        "jax_version": metadata["jax_version"],
-        "platform": metadata["platform"],
-        "seed": task.seed,
-        "teammate": {"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
-        STREAMS_RECORDED: metadata["ego"]["environments"],
-        "streams_kept": profile.keep,
-        "filter": filter_report(rewards, streams),
-        "expert": {"policy_sha256": metadata["files"]["policy.safetensors"], "action": "greedy, recurrent"},
-    }
-    if task.teammate_family == "rl":
-        provenance["suite"] = {
-            "algorithms": {layout: list(names) for layout, names in profile.algorithms.items()},
-            "members": profile.teammates.members,
-            "train": profile.teammates.train,
-            "total_steps": profile.teammates.ppo.total_steps,
-            "threshold": THRESHOLD,
-        }
+    populations = TeammateSuite(
+        algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
+        members=profile.teammates.members,
+        train=profile.teammates.train,
+        total_steps=profile.teammates.ppo.total_steps,
+        threshold=THRESHOLD,
+    )
+    provenance = Provenance(
+        profile=metadata["profile"],
+        profile_hash=profile.hash,
+        ego=metadata["ego"],
+        ego_hash=metadata["ego_hash"],
+        code_version=metadata["code_version"],
+        jax_version=metadata["jax_version"],
+        platform=metadata["platform"],
+        seed=task.seed,
+        teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
+        streams_recorded=metadata["ego"]["environments"],
+        streams_kept=profile.keep,
+        filter=filter_report(rewards, streams),
+        expert=ExpertLabels(metadata["files"]["policy.safetensors"], "greedy, recurrent"),
+        suite=populations if task.teammate_family == "rl" else None,
+    )
     files = checkpoint_files(suite, task)
     return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams), files)
 

@@ -32,12 +32,12 @@ _COPIES = 4  # of a history that checking it takes
 
 
 def _check_history(history: History, index: Index, seen: dict[tuple[str, bytes], int], report: Report) -> None:
-    entry, kind = history.entry, index.info["kind"]
+    entry, kind = history.entry, index.info.kind
     layout = get_layout(entry.layout)
     bytes_a_step = sum(part.element(layout, kind).itemsize for part in entry.stored_fields(kind))
     if (size := _COPIES * entry.T * bytes_a_step) > free_memory():
         raise OptionError(f"takes {size / 1e9:.3g} GB of memory, more than is free")
-    for problem in _history_problems(history, index.info["environment"]["kept_steps"], report.deep):
+    for problem in _history_problems(history, index.info.environment.kept_steps, report.deep):
         report.add(entry.shard, f"history {entry.history_id}: {problem}")
     seen_and_done = (record_field(kind).name, "actions")
     content = hashlib.sha256(b"".join(history.read(part).tobytes() for part in seen_and_done)).digest()

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index, read_index
-from icrl4aht_data.format.info import describe, shard_sizes
+from icrl4aht_data.format.info import LayoutStatistics, describe, shard_sizes
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import (
@@ -39,6 +39,7 @@ from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.remote.download import ORIGIN, chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
+from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
 from icrl4aht_data.writing.statistics import layout_statistics
@@ -115,9 +116,9 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if unreadable is not None:
         report.add("meta", str(unreadable))
         return
-    index = read_index(origin)
+    index = read_index(origin.folder)
     tasks = read_tasks(resolve_inside(origin.folder, TASKS))
-    report.replayed = report.deep and index.info["kind"] in KINDS
+    report.replayed = report.deep and index.info.kind in KINDS
     if report.deep and not report.replayed:
         report.notes.append(
             "nothing was replayed: without state records it cannot be said whether steps obey the rules"
@@ -128,7 +129,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if left:
         report.notes.append(f"{left} of {left + len(shards)} shards were not asked for")
     if report.quick:
-        _check_sizes(index, shards, report)
+        _check_sizes(origin, index, shards, report)
     else:
         _check_teammates(origin.folder, tasks, report)
         _check_shards(index, shards, report, advance)
@@ -146,7 +147,7 @@ def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgr
 def _check_index(index: Index, tasks: list[Task], chosen: set[str], report: Report) -> None:
     """Index, tasks, totals and shard names against each other."""
     by_id = {task.task_id: task for task in tasks}
-    given = bool(tasks) or index.info["kind"] in KINDS
+    given = bool(tasks) or index.info.kind in KINDS
     streams: set[tuple[str, int]] = set()
     for entry in index.entries:
         task = by_id.get(entry.task_id)
@@ -171,17 +172,19 @@ def _check_index(index: Index, tasks: list[Task], chosen: set[str], report: Repo
     if not index.entries:
         report.add(HISTORIES, "no histories")
     info = index.info
-    kept_steps = info["environment"]["kept_steps"]
-    expected = describe(info["kind"], info["data_version"], kept_steps, list(index.entries))
+    described = describe(info.kind, info.data_version, info.environment.kept_steps, list(index.entries))
     here = all(name in chosen and (index.root / name).is_file() for name in index.values("shard"))
     if report.ok and here and not report.quick:
-        expected["shards"] = shard_sizes(index.root, index.entries)  # else what they are made of is at fault, or away
-        expected["statistics"] = _statistics(index, tasks)
-    elif info["shards"].keys() != set(index.values("shard")):
-        report.add(INFO, f"shards: expected {sorted(index.values('shard'))}, found {sorted(info['shards'])}")
+        # else what they are made of is at fault, or away
+        sizes = shard_sizes(index.root, index.entries)
+        described = replace(described, shards=sizes, statistics=_statistics(index, tasks, report))
+    elif info.shards.keys() != set(index.values("shard")):
+        report.add(INFO, f"shards: expected {sorted(index.values('shard'))}, found {sorted(info.shards)}")
+    expected = described.to_json()
+    found = parse_json(read_text(resolve_inside(index.root, INFO)))  # also what `ReleaseInfo` does not have
     for name in expected:
-        if info.get(name) != expected[name]:
-            report.add(INFO, f"{name}: expected {expected[name]!r}, found {info.get(name)!r}")
+        if found.get(name) != expected[name]:
+            report.add(INFO, f"{name}: expected {expected[name]!r}, found {found.get(name)!r}")
     shards = {entry.shard for entry in index.entries}
     for shard in shards:
         stem, count = shard.removesuffix(".h5").split("-")[0], int(shard.removesuffix(".h5").split("-")[-1])
@@ -201,11 +204,11 @@ def _check_apart(tasks: list[Task], report: Report) -> None:
             report.add(TASKS, f"task {task.task_id!r} ({task.split}) has the teammate of {seen[who]!r} (train)")
 
 
-def _check_sizes(index: Index, shards: list[str], report: Report) -> None:
+def _check_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:
     """Whether every shard is as long as the release says, where it is."""
     for name in shards:
-        expected, found = index.info["shards"].get(name), None
-        remote, path = index.origin.remote, resolve_inside(index.root, name)
+        expected, found = index.info.shards.get(name), None
+        remote, path = origin.remote, resolve_inside(index.root, name)
         if path.exists():
             found = path.stat().st_size
         elif remote is not None:
@@ -237,13 +240,14 @@ def _check_teammates(root: Path, tasks: list[Task], report: Report) -> None:
         report.notes.append(f"{without} tasks have learned teammates whose checkpoints this release does not have")
 
 
-def _statistics(index: Index, tasks: list[Task]) -> Any:
+def _statistics(index: Index, tasks: list[Task], report: Report) -> dict[str, LayoutStatistics]:
     try:
         provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
-        kept_steps = index.info["environment"]["kept_steps"]
+        kept_steps = index.info.environment.kept_steps
         return layout_statistics(index.root, index.entries, tasks, provenance, kept_steps)
     except (Icrl4ahtError, OSError) as error:
-        return f"what {PROVENANCE} and the shards give: {error}"
+        report.add(INFO, f"statistics cannot be computed from {PROVENANCE} and the shards: {error}")
+        return {}
 
 
 def _manifest(origin: ReleaseLocation, report: Report) -> dict[str, str]:
@@ -302,7 +306,7 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
     total = sum(map(len, members.values()))
     for name, entries in members.items():
         try:
-            shard = Shard(local, name, index.info["kind"], entries)
+            shard = Shard(local, name, index.info.kind, entries)
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue

@@ -148,11 +148,10 @@ def show(
     dataset = _load(root, filters)
     if history_id is None:
         info = dataset.info
-        kept_steps = info["environment"]["kept_steps"]
         facts = {
             "root": str(dataset.origin),
             **({"revision": remote.revision, "folder": str(dataset.root)} if (remote := dataset.origin.remote) else {}),
-            **describe(info["kind"], info["data_version"], kept_steps, dataset.entries),
+            **describe(info.kind, info.data_version, info.environment.kept_steps, dataset.entries).to_json(),
             **({"lacks": lacks} if (lacks := _lacks(dataset)) else {}),
             "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
         }

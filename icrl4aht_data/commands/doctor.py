@@ -214,7 +214,7 @@ def _look_at_network(found: Diagnosis) -> None:
 def _look_at_bundled(found: Diagnosis) -> None:
     try:
         info = read_info(MINI)
-        found.bundled = {name: info[name] for name in ("data_version", "format_version", "kind", "histories")}
+        found.bundled = {name: getattr(info, name) for name in ("data_version", "format_version", "kind", "histories")}
     except Icrl4ahtError:  # told below
         pass
     report = verify_release(MINI, quick=True)

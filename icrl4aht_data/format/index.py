@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,10 +16,9 @@ from icrl4aht_data.errors import (
     unknown,
 )
 from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
-from icrl4aht_data.format.info import read_info
+from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.paths import resolve_inside
 
 
@@ -28,14 +26,9 @@ from icrl4aht_data.utils.paths import resolve_inside
 class Index:
     """A release's index. A history's id is its place in `entries`, which makes an entry when it is asked for."""
 
-    origin: ReleaseLocation
-    info: dict[str, Any]
+    root: Path
+    info: ReleaseInfo
     entries: Columns
-
-    @property
-    def root(self) -> Path:
-        """The release's folder on this machine."""
-        return self.origin.folder
 
     def entry(self, history_id: int) -> Entry:
         """The entry of one history.
@@ -100,7 +93,7 @@ class Index:
         return ", ".join(parts) or "no histories"
 
 
-def read_index(origin: ReleaseLocation | Path) -> Index:
+def read_index(root: Path) -> Index:
     """Read and check a release's index.
 
     A large one is parsed once; what was parsed is kept in the cache folder, by content (`utils.cache`).
@@ -108,16 +101,14 @@ def read_index(origin: ReleaseLocation | Path) -> Index:
     Raises:
         RootNotFoundError, FormatTooNewError, FormatTooOldError, IndexFormatError: each names the file, and the line.
     """
-    origin = ReleaseLocation(origin) if isinstance(origin, Path) else origin
-    root = origin.folder
     info = read_info(root)
     path = resolve_inside(root, HISTORIES)
     entries = read_columns(path)
-    if len(entries) != info["histories"]:
-        raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info['histories']} histories")
+    if len(entries) != info.histories:
+        raise IndexFormatError(f"{path}: {len(entries)} lines, but {root / INFO} counts {info.histories} histories")
     lacking = np.flatnonzero(~entries.column("has_teammate_actions"))
-    if info["kind"] in KINDS and len(lacking):
+    if info.kind in KINDS and len(lacking):
         raise IndexFormatError(
-            f"{path}, line {lacking[0] + 1}: expected has_teammate_actions true in a {info['kind']} release"
+            f"{path}, line {lacking[0] + 1}: expected has_teammate_actions true in a {info.kind} release"
         )
-    return Index(origin, info, entries)
+    return Index(root, info, entries)

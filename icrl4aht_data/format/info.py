@@ -1,13 +1,17 @@
-"""meta/info.json of a release: read and checked."""
+"""meta/info.json of a release: what kind it is, what it contains, and how large its shards are."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.errors import (
@@ -17,14 +21,7 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import (
-    ALL_KINDS,
-    FORMAT_VERSION,
-    INFO,
-    Entry,
-    Kind,
-    is_name,
-)
+from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, Entry, Kind, is_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
@@ -32,103 +29,202 @@ from icrl4aht_data.utils.paths import resolve_inside
 
 _SEMVER = re.compile(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?")
 
-_INFO_TYPES: dict[str, type | tuple[type, ...]] = {
-    "kind": str,
-    "data_version": str,
-    "histories": int,
-    "environment": dict,
-    "layouts": dict,
-    "shards": dict,
-}
+_Steps = Annotated[int, Meta(gt=0, lt=2**31)]
+_Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
 
 
-def read_info(root: Path) -> dict[str, Any]:
-    """meta/info.json of a release whose format this package reads."""
+@dataclass(frozen=True)
+class EpisodeLengths:
+    """Steps per episode.
+
+    Args:
+        max_steps: steps of an episode in training.
+        kept_steps: how many of them, from the first on, the histories contain.
+    """
+
+    max_steps: _Steps
+    kept_steps: _Steps
+
+
+@dataclass(frozen=True)
+class LayoutSummary:
+    """One layout of a release.
+
+    Args:
+        environment_name: the layout's name in the paper's code.
+        map: the layout's cells, one string per row.
+        recipes: three ingredients each.
+        obs_shape: (5, 5, C) of one observation.
+        histories: number of histories on this layout.
+        tasks: number of their tasks.
+        transitions: number of their steps.
+        mean_final_return: mean of `Entry.return_end` over the histories.
+    """
+
+    environment_name: str
+    map: list[str]
+    recipes: list[list[int]]
+    obs_shape: tuple[int, int, int]
+    histories: int
+    tasks: int
+    transitions: int
+    mean_final_return: float
+
+
+@dataclass(frozen=True)
+class LayoutStatistics:
+    """One column of the paper's table "Dataset statistics per layout".
+
+    Args:
+        original_transitions: steps of all recorded streams, before the filter; None where it was not recorded.
+        filtered_transitions: steps of the release's histories.
+        history_length: steps of the shortest and of the longest history.
+        teammates: number of different teammates; None where the tasks are unknown.
+        steps_per_episode: kept steps of an episode.
+        obs_shape: (5, 5, C) of one observation.
+        actions: number of actions.
+        mean_final_return: mean of `Entry.return_end` over the histories.
+        disk_bytes: size of the shards.
+    """
+
+    original_transitions: int | None
+    filtered_transitions: int
+    history_length: tuple[int, int]
+    teammates: int | None
+    steps_per_episode: int
+    obs_shape: tuple[int, int, int]
+    actions: int
+    mean_final_return: float
+    disk_bytes: int
+
+
+@dataclass(frozen=True)
+class ReleaseInfo:
+    """The content of meta/info.json.
+
+    Args:
+        format_version: version of the file format, `schema.FORMAT_VERSION`.
+        data_version: version of the data, SemVer.
+        kind: which arrays the shards store, see `schema.Kind`.
+        actions: the actions' names by number.
+        environment: steps of an episode.
+        histories: number of histories.
+        transitions: number of their steps.
+        layouts: layout name -> summary, in order of first appearance in the index.
+        shards: shard, a path in the release -> its size in bytes.
+        statistics: layout name -> the paper's statistics; empty in releases written before there were any.
+    """
+
+    format_version: int
+    data_version: str
+    kind: Kind
+    actions: list[str]
+    environment: EpisodeLengths
+    histories: int
+    transitions: int
+    layouts: dict[str, LayoutSummary]
+    shards: dict[str, _Bytes] = field(default_factory=dict)
+    statistics: dict[str, LayoutStatistics] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """The object to write, without `shards` and `statistics` where they are empty."""
+        content = json.loads(msgspec.json.encode(self))
+        return {name: value for name, value in content.items() if value != {}}
+
+    @classmethod
+    def from_json(cls, content: Any) -> ReleaseInfo:
+        """Parse the content of an info.json of this format version.
+
+        Raises:
+            IndexFormatError: without the file, which the caller adds.
+        """
+        if isinstance(content, dict) and "shards" not in content:
+            raise IndexFormatError("Object missing required field `shards`")
+        try:
+            info = msgspec.convert(content, cls)
+        except msgspec.ValidationError as error:
+            raise IndexFormatError(str(error)) from error
+        if not is_name(info.data_version):
+            raise IndexFormatError(f"data_version {info.data_version[:100]!r}, expected a short name")
+        if len(content["environment"]) != 2:
+            raise IndexFormatError("environment: expected max_steps and kept_steps only")
+        return info
+
+
+def read_info(root: Path) -> ReleaseInfo:
+    """Read meta/info.json of a release.
+
+    Raises:
+        RootNotFoundError: if the folder is not a release.
+        FormatTooNewError, FormatTooOldError: if the release has another format version.
+        IndexFormatError: if the file is malformed.
+    """
     path = resolve_inside(root, INFO)
     if not path.is_file():
         raise RootNotFoundError(f"{root}: no release here, expected {INFO} in it; {_instead(root)}")
     try:
-        info = parse_json(read_text(path))
+        content = parse_json(read_text(path))
+        version = content.get("format_version") if isinstance(content, dict) else None
+        if not isinstance(version, int):
+            raise IndexFormatError("expected an object with an integer format_version")
+        if version == FORMAT_VERSION:
+            return ReleaseInfo.from_json(content)
     except IndexFormatError as error:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
-    version = info.get("format_version") if isinstance(info, dict) else None
-    if not isinstance(version, int):
-        raise IndexFormatError(f"{path}: malformed: expected an object with an integer format_version")
+    found = f"{path}: format version {version}, this package reads {FORMAT_VERSION}"
     if version > FORMAT_VERSION:
-        raise FormatTooNewError(
-            f"{path}: format version {version}, this package reads {FORMAT_VERSION}: `pip install -U icrl4aht-data`"
-        )
-    if version < FORMAT_VERSION:
-        raise FormatTooOldError(
-            f"{path}: format version {version}, this package reads {FORMAT_VERSION}: rebuild or fetch the release again"
-        )
-    if isinstance(info.get("data_version"), str) and not is_name(info["data_version"]):
-        raise IndexFormatError(f"{path}: malformed: data_version {info['data_version'][:100]!r}, expected a short name")
-    wrong = [name for name, kind in _INFO_TYPES.items() if not isinstance(info.get(name), kind)]
-    if wrong or info["kind"] not in ALL_KINDS or not _is_environment(info["environment"]) or not _are_sizes(info):
-        what = ", ".join(wrong) or "kind, environment or shards"
-        raise IndexFormatError(f"{path}: malformed: {what} not as expected")
-    return info
+        raise FormatTooNewError(f"{found}: `pip install -U icrl4aht-data`")
+    raise FormatTooOldError(f"{found}: rebuild or fetch the release again")
 
 
 def _instead(root: Path) -> str:
-    """What to give in place of a folder that is no release."""
-    if root.is_dir():
-        below = sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}"))
-        if below:
-            return f"did you mean {' or '.join(below[:3])}?"
-    return (
-        f"{'give the folder of a release' if root.is_dir() else 'there is no such folder: check the path'}, fetch one "
-        f"with `icrl4aht-data download`, or give none for the bundled one"
-    )
+    """What to do about a folder that is not a release."""
+    if not root.is_dir():
+        hint = "there is no such folder: check the path"
+    elif below := sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}")):
+        return f"did you mean {' or '.join(below[:3])}?"
+    else:
+        hint = "give the folder of a release"
+    return f"{hint}, fetch one with `icrl4aht-data download`, or give none for the bundled one"
 
 
 def check_version(version: str) -> str:
-    """A data version, if it is one.
+    """A data version, checked.
 
     Raises:
-        OptionError: if it is not of the form of SemVer.
+        OptionError: if it does not have the form of SemVer.
     """
     if not _SEMVER.fullmatch(version):
         raise OptionError(f"data version {version!r}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
     return version
 
 
-def _is_environment(value: dict[str, Any]) -> bool:
-    steps = [value.get(name) for name in ("max_steps", "kept_steps")]
-    return len(value) == 2 and all(isinstance(n, int) and 0 < n < 2**31 for n in steps)
-
-
-def _are_sizes(info: dict[str, Any]) -> bool:
-    return all(isinstance(size, int) and 0 <= size < 2**62 for size in info["shards"].values())
-
-
-def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry]) -> dict[str, Any]:
-    """The content of meta/info.json."""
+def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry]) -> ReleaseInfo:
+    """The info of a release with these histories, without sizes of shards and statistics."""
     layouts = {}
     for name in dict.fromkeys(entry.layout for entry in entries):
-        mine = [entry for entry in entries if entry.layout == name]
+        members = [entry for entry in entries if entry.layout == name]
         layout = get_layout(name)
-        layouts[name] = {
-            "environment_name": layout.alias,
-            "map": list(layout.rows),
-            "recipes": [list(recipe) for recipe in layout.recipes],
-            "obs_shape": list(layout.obs_shape),
-            "histories": len(mine),
-            "tasks": len({entry.task_id for entry in mine}),
-            "transitions": sum(entry.T for entry in mine),
-            "mean_final_return": round(float(np.mean([entry.return_end for entry in mine])), 3),
-        }
-    return {
-        "format_version": FORMAT_VERSION,
-        "data_version": data_version,
-        "kind": kind,
-        "actions": list(ACTIONS),
-        "environment": {"max_steps": EPISODE_STEPS, "kept_steps": kept_steps},
-        "histories": len(entries),
-        "transitions": sum(entry.T for entry in entries),
-        "layouts": layouts,
-    }
+        layouts[name] = LayoutSummary(
+            environment_name=layout.alias,
+            map=list(layout.rows),
+            recipes=[list(recipe) for recipe in layout.recipes],
+            obs_shape=layout.obs_shape,
+            histories=len(members),
+            tasks=len({entry.task_id for entry in members}),
+            transitions=sum(entry.T for entry in members),
+            mean_final_return=round(float(np.mean([entry.return_end for entry in members])), 3),
+        )
+    return ReleaseInfo(
+        format_version=FORMAT_VERSION,
+        data_version=data_version,
+        kind=kind,
+        actions=list(ACTIONS),
+        environment=EpisodeLengths(EPISODE_STEPS, kept_steps),
+        histories=len(entries),
+        transitions=sum(entry.T for entry in entries),
+        layouts=layouts,
+    )
 
 
 def shard_sizes(root: Path, entries: Iterable[Entry]) -> dict[str, int]:

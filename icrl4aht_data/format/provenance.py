@@ -1,28 +1,169 @@
-"""TODO."""
+"""meta/provenance.json of a release: how the histories of each task were made."""
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
 
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.utils.files import parse_json, read_text
 
+_Streams = Annotated[int, Meta(ge=0, lt=2**31)]
 
-def read_provenance(path: Path) -> dict[str, dict[str, Any]]:
-    """How the histories of each task were made, by task_id; what it says of a teammate is an object, too.
+
+@dataclass(frozen=True)
+class StreamReturns:
+    """Mean returns of some environment streams of one learner.
+
+    Args:
+        streams: number of streams.
+        return_start: mean over the first episodes, see `schema.curve_ends`.
+        return_end: mean over the last episodes.
+    """
+
+    streams: _Streams
+    return_start: float
+    return_end: float
+
+
+@dataclass(frozen=True)
+class StreamFilter:
+    """Effect of keeping a learner's best streams.
+
+    Args:
+        before: all recorded streams.
+        after: the streams that the release keeps.
+    """
+
+    before: StreamReturns
+    after: StreamReturns
+
+
+@dataclass(frozen=True)
+class ExpertLabels:
+    """Origin of the expert actions.
+
+    Args:
+        policy_sha256: SHA-256 of the policy's weights.
+        action: how the policy chose actions.
+    """
+
+    policy_sha256: str
+    action: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeammateSuite:
+    """The populations that a learned teammate was selected from.
+
+    Args:
+        algorithms: layout -> algorithms; older releases have one list for all `layouts`.
+        layouts: the layouts of such a list; None means every layout of the release.
+        members: policies in each population.
+        train: training teammates wanted per population.
+        total_steps: environment steps of each member's training.
+        threshold: self-play return that a checkpoint has to exceed.
+    """
+
+    algorithms: dict[str, list[str]] | list[str]
+    layouts: list[str] | None = None
+    members: int
+    train: int
+    total_steps: int
+    threshold: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """How the histories of one task were made. Whatever was not recorded is None.
+
+    Args:
+        profile: name of the profile that sized the rebuild.
+        profile_hash: hash of that profile's content.
+        ego: the ego's hyper-parameters, among them the integers `total_steps` and `environments`.
+        ego_hash: hash of these hyper-parameters.
+        code_version: version of this package.
+        jax_version: version of JAX.
+        platform: JAX backend, such as "cpu".
+        seed: the learner's seed.
+        teammate: how the teammate played: its `slot` and the source of its `noise`.
+        streams_recorded: environment streams of the learner.
+        streams_kept: how many of them became histories.
+        filter: their returns before and after keeping the best.
+        expert: where expert actions come from.
+        suite: the populations that a learned teammate comes from.
+        other: fields that this package does not know, kept as they were read.
+    """
+
+    profile: str | None = None
+    profile_hash: str | None = None
+    ego: dict[str, Any] | None = None
+    ego_hash: str | None = None
+    code_version: str | None = None
+    jax_version: str | None = None
+    platform: str | None = None
+    seed: int | None = None
+    teammate: dict[str, Any] | None = None
+    streams_recorded: _Streams | None = None
+    streams_kept: _Streams | None = None
+    filter: StreamFilter | None = None
+    expert: ExpertLabels | None = None
+    suite: TeammateSuite | None = None
+    other: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """The object to write, without what was not recorded."""
+        content = {name: value for name, value in asdict(self).items() if name != "other" and value is not None}
+        if self.suite is not None and self.suite.layouts is None:
+            del content["suite"]["layouts"]
+        return content | self.other
+
+    @classmethod
+    def from_json(cls, content: Any) -> Provenance:
+        """Parse one task's object.
+
+        Raises:
+            IndexFormatError: without the file, which the caller adds.
+        """
+        if not isinstance(content, dict):
+            raise IndexFormatError("expected an object of objects, one for each task")
+        known = {one.name for one in fields(cls)} - {"other"}
+        try:
+            found = msgspec.convert({name: value for name, value in content.items() if name in known}, cls)
+            msgspec.convert(found.ego, _EgoScale | None)
+        except msgspec.ValidationError as error:
+            raise IndexFormatError(str(error)) from error
+        return replace(found, other={name: value for name, value in content.items() if name not in known})
+
+
+@dataclass(frozen=True)
+class _EgoScale:
+    """The hyper-parameters that other parts read."""
+
+    total_steps: int
+    environments: int
+
+
+def read_provenance(path: Path) -> dict[str, Provenance]:
+    """Read how the histories of each task were made; task_id -> provenance.
 
     Raises:
-        IndexFormatError: names the file.
+        IndexFormatError: names the file, and the task where one is malformed.
     """
     text = read_text(path)
     try:
         content = parse_json(text)
     except IndexFormatError as error:
         raise IndexFormatError(f"{path}: {error}") from error
-    notes = content.values() if isinstance(content, dict) else [content]
-    if not all(isinstance(note, dict) and isinstance(note.get("teammate", {}), dict) for note in notes):
-        raise IndexFormatError(
-            f"{path}: not as `generation` writes it: expected an object of objects, one for each task"
-        )
-    return content
+    tasks = content if isinstance(content, dict) else {"": content}
+    found = {}
+    for task_id, of_task in tasks.items():
+        try:
+            found[task_id] = Provenance.from_json(of_task)
+        except IndexFormatError as error:
+            raise IndexFormatError(f"{path}: not as `generation` writes it: {task_id[:100]!r}: {error}") from error
+    return found

@@ -84,7 +84,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         published: when the release came to be.
     """
     info = read_info(root)
-    arrays = "; ".join(f"{name}: {ARRAY_TEXTS[name]}" for name, f in FIELDS.items() if info["kind"] not in f.absent)
+    arrays = "; ".join(f"{name}: {ARRAY_TEXTS[name]}" for name, f in FIELDS.items() if info.kind not in f.absent)
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -92,10 +92,10 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         "name": "icrl4aht_learning_histories",
         "description": (
             "Learning histories of ego agents that learn to cook in OvercookedV2 beside one fixed teammate each, for "
-            f"in-context reinforcement learning in ad-hoc teamwork: {info['histories']:,} histories, "
-            f"{info['transitions']:,} transitions, layouts {', '.join(info['layouts'])}. The shards are HDF5: {arrays}."
+            f"in-context reinforcement learning in ad-hoc teamwork: {info.histories:,} histories, "
+            f"{info.transitions:,} transitions, layouts {', '.join(info.layouts)}. The shards are HDF5: {arrays}."
         ),
-        "version": info["data_version"],
+        "version": info.data_version,
         "datePublished": published.isoformat(),
         "license": _LICENCE,
         "citeAs": card_file("citation.bib").read_text(encoding="utf-8").strip(),

@@ -103,7 +103,7 @@ def upload_release(
     check_whole(folder, advance)
     manifest = read_manifest(folder) | {MANIFEST: file_hash(folder / MANIFEST)}
     files = {name: _File((folder / name).stat().st_size, digest) for name, digest in manifest.items()}
-    tag = f"v{read_info(folder)['data_version']}"
+    tag = f"v{read_info(folder).data_version}"
     api = HfApi()
     with _explained(repo, api.endpoint), _bars_shown(show):
         return _Uploading(api, folder, repo, tag, files).run(private, dry_run)

@@ -336,7 +336,8 @@ class Shard:
 class Shards:
     """The release's shards, opened when first read."""
 
-    def __init__(self, index: Index) -> None:
+    def __init__(self, origin: ReleaseLocation, index: Index) -> None:
+        self.origin = origin
         self._index = index
         self._open: dict[str, Shard] = {}
         self._cache = ChunkCache()
@@ -349,5 +350,5 @@ class Shards:
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
-            self._open[name] = Shard(self._index.origin, name, self._index.info["kind"], members, self._cache)
+            self._open[name] = Shard(self.origin, name, self._index.info.kind, members, self._cache)
         return self._open[name]

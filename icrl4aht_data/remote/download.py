@@ -120,7 +120,7 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
 
     Without a selection those that a folder was filled with, see `ORIGIN`.
     """
-    index = read_index(root)
+    index = read_index(root.folder)
     listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
     every = set(index.values("shard"))
     shards = _selected(index, **wanted) if any(wanted.values()) else every

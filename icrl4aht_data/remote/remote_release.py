@@ -171,7 +171,7 @@ class Remote:
 
     @cached_property
     def _sizes(self) -> dict[str, int]:
-        return read_info(self.folder)["shards"]
+        return read_info(self.folder).shards
 
     def size(self, name: str) -> int:
         """Bytes of a file: a shard's as the release says, another's as the remote says."""

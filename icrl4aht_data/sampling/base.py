@@ -103,7 +103,7 @@ class Sampler(Generic[B]):
         self.teammate_actions = teammate_actions
         self.weights, self.episodes, self.curriculum = check_weights(weights, len(dataset)), episodes, curriculum
         self._lengths = dataset.column("T")
-        self._kept: int = dataset.info["environment"]["kept_steps"]
+        self._kept: int = dataset.info.environment.kept_steps
         ended, cut = np.divmod(self._lengths, self._kept)  # only histories of observations may end within an episode
         if (ended != dataset.column("episodes")).any() or (dataset.has_states and cut.any()):
             raise OptionError(f"some history's episodes have not {self._kept} steps; run `icrl4aht-data verify`")
@@ -148,7 +148,7 @@ class Sampler(Generic[B]):
         return {
             "sampler": type(self).__name__,
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
-            "data_version": self.dataset.info["data_version"],
+            "data_version": self.dataset.info.data_version,
             "obs": self.dataset.obs,
             "batch_size": self.batch_size,
             "length": self.length,
@@ -200,7 +200,7 @@ class Sampler(Generic[B]):
     @property
     def _record(self) -> str:
         """The field that is held of each step to show what the ego saw."""
-        return record_field(self.dataset.info["kind"]).name
+        return record_field(self.dataset.info.kind).name
 
     def _empty_records(self, group: Group, *shape: int) -> np.ndarray:
         return np.empty((*shape, *FIELDS[self._record].held(group.layout).shape), np.uint8)

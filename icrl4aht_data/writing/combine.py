@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import MANIFEST, PROVENANCE, TASKS, TEAMMATES, Kind, held_fields
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.files import read_text
@@ -63,35 +62,39 @@ def combine_releases(
                 )
             owners[task.task_id] = str(dataset.origin)
             ids = dataset.index.query(task_id=task.task_id)
-            new.append(stored_task(dataset.select(ids), task, provenance.get(task.task_id, {}), dataset.info["kind"]))
+            new.append(
+                stored_task(dataset.select(ids), task, provenance.get(task.task_id, Provenance()), dataset.info.kind)
+            )
     first = datasets[0].info
     return write_release(
         target,
-        first["kind"],
+        first.kind,
         new,
         data_version=data_version or _one_version(datasets),
         source_card=_cards(datasets),
-        kept_steps=first["environment"]["kept_steps"],
+        kept_steps=first.environment.kept_steps,
         done=done,
     )
 
 
 def _check_alike(datasets: Sequence[Dataset]) -> None:
     first = datasets[0]
+    expected = first.info.to_json()
     for other in datasets[1:]:
+        info = other.info.to_json()
         for name, remedy in (
             ("format_version", "rebuild the older one"),
             ("kind", "combine releases of one kind"),
             ("environment", "they cannot be combined"),
         ):
-            if other.info[name] != first.info[name]:
+            if info[name] != expected[name]:
                 raise OptionError(
-                    f"{other.root}: {name} {other.info[name]!r}, but {first.root} has {first.info[name]!r}; {remedy}"
+                    f"{other.root}: {name} {info[name]!r}, but {first.root} has {expected[name]!r}; {remedy}"
                 )
 
 
 def _one_version(datasets: Sequence[Dataset]) -> str:
-    versions = {dataset.info["data_version"] for dataset in datasets}
+    versions = {dataset.info.data_version for dataset in datasets}
     if len(versions) > 1:
         raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
     return versions.pop()
@@ -105,7 +108,7 @@ def release_tasks(dataset: Dataset) -> list[Task]:
 
 
 def stored_task(
-    dataset: Dataset, task: Task, provenance: dict[str, Any], kind: Kind, taken: Callable[[], None] = lambda: None
+    dataset: Dataset, task: Task, provenance: Provenance, kind: Kind, taken: Callable[[], None] = lambda: None
 ) -> NewTask:
     """A task for another release of that kind: all histories of the selection, in order, and the teammate's checkpoint.
 
@@ -148,7 +151,7 @@ class Deferred(Mapping[str, np.ndarray]):
 def _cards(datasets: Sequence[Dataset]) -> str:
     listed = [read_manifest(dataset.root) for dataset in datasets]
     parts = "\n".join(
-        f"* {dataset.root.name}: data version {dataset.info['data_version']}, {len(dataset):,} histories, "
+        f"* {dataset.root.name}: data version {dataset.info.data_version}, {len(dataset):,} histories, "
         f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}"
         for dataset in datasets
     )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import (
     KINDS,
     OBSERVATIONS,
@@ -66,7 +66,11 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Histories
 
     tasks = [
         stored_task(
-            dataset.select(ids), given[name], provenance.get(name, {}), kind, lambda: advance(next(done), len(dataset))
+            dataset.select(ids),
+            given[name],
+            provenance.get(name, Provenance()),
+            kind,
+            lambda: advance(next(done), len(dataset)),
         )
         for name, ids in by_task.items()
     ]
@@ -74,6 +78,6 @@ def to_release(dataset: Dataset, target: Path, kind: Kind, *, advance: Histories
         target,
         kind,
         tasks,
-        data_version=dataset.info["data_version"],
-        kept_steps=dataset.info["environment"]["kept_steps"],
+        data_version=dataset.info.data_version,
+        kept_steps=dataset.info.environment.kept_steps,
     )

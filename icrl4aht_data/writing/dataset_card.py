@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,14 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.info import ReleaseInfo
+from icrl4aht_data.format.provenance import Provenance, TeammateSuite, read_provenance
 from icrl4aht_data.format.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.templates import card_file, fill, markdown_table
 from icrl4aht_data.writing.field_descriptions import ARRAY_TEXTS, ENTRY_TEXTS
-from icrl4aht_data.writing.statistics import STREAMS_RECORDED, layout_statistics, statistics_rows
+from icrl4aht_data.writing.statistics import layout_statistics, statistics_rows
 
 PROTOCOL = "published"
 """The evaluation protocol whose headroom is shown: that of the paper's numbers."""
@@ -55,19 +55,20 @@ class _Release:
     """What a card is made of."""
 
     root: Path
-    info: dict[str, Any]
+    info: ReleaseInfo
     entries: list[Entry]
     tasks: list[Task]
-    provenance: dict[str, Any]
+    provenance: dict[str, Provenance]
 
     @cached_property
     def layouts(self) -> list[Layout]:
-        return [get_layout(name) for name in self.info["layouts"]]
+        return [get_layout(name) for name in self.info.layouts]
 
     def distinct(self, name: str) -> list[Any]:
         """The values that the tasks' provenances give for a name, each once."""
-        texts = {json.dumps(of_task[name]) for of_task in self.provenance.values() if name in of_task}
-        return [json.loads(text) for text in sorted(texts)]
+        values = [getattr(of_task, name) for of_task in self.provenance.values()]
+        found = {json.dumps(value, default=asdict): value for value in values if value is not None}
+        return [found[text] for text in sorted(found)]
 
     def has(self, name: str) -> bool:
         return (self.root / name).exists()
@@ -87,22 +88,19 @@ def dataset_card(root: Path) -> str:
     """
     index = read_index(root)
     provenance = read_provenance(root / PROVENANCE)
-    try:
-        return _card(_Release(root, index.info, list(index.entries), read_tasks(root / TASKS), provenance))
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise IndexFormatError(f"{root / PROVENANCE}: not as `generation` writes it: {error!r}") from error
+    return _card(_Release(root, index.info, list(index.entries), read_tasks(root / TASKS), provenance))
 
 
 def _card(release: _Release) -> str:
     info, root, provenance = release.info, release.root, release.provenance
-    statistics = info.get("statistics") or layout_statistics(
-        root, release.entries, release.tasks, provenance, info["environment"]["kept_steps"]
+    statistics = info.statistics or layout_statistics(
+        root, release.entries, release.tasks, provenance, info.environment.kept_steps
     )
     return fill(
         "dataset.md",
-        size=size_category(info["transitions"]),
+        size=size_category(info.transitions),
         configs=_configs(release),
-        version=f"data version {info['data_version']}",
+        version=f"data version {info.data_version}",
         facts=_bullets(_facts(release)),
         layout=release.layouts[0].name,
         length=str(min(500, *(entry.T for entry in release.entries))),
@@ -114,7 +112,7 @@ def _card(release: _Release) -> str:
         + _layouts(release),
         protocol=PROTOCOL,
         headroom=_picture(release, HEADROOM, "Headroom")
-        + headroom_table(read_headroom(PROTOCOL), evaluated_on(info["layouts"])),
+        + headroom_table(read_headroom(PROTOCOL), evaluated_on(info.layouts)),
         splits=_splits(release),
         fields=_fields(release),
         twin=f" and `{TWIN}/<layout>/<split>.parquet`" if release.has(TWIN) else "",
@@ -147,7 +145,7 @@ def _configs(release: _Release) -> str:
     if not release.has(TWIN):
         return ""
     lines = ["configs:", *_config("default", "*", _in_order(e.split for e in release.entries)), "  default: true"]
-    for layout in release.info["layouts"]:
+    for layout in release.info.layouts:
         own = _in_order(entry.split for entry in release.entries if entry.layout == layout)
         lines += _config(layout, layout, own)
     return "\n".join(lines) + "\n"
@@ -172,16 +170,16 @@ def _facts(release: _Release) -> list[str]:
     }
     lengths = [entry.T for entry in entries]
     length = f"{min(lengths):,}" if min(lengths) == max(lengths) else f"{min(lengths):,} to {max(lengths):,}"
-    steps = info["environment"]
+    steps = info.environment
     labelled = sum(entry.has_expert_actions for entry in entries)
     return [
         f"{len(entries):,} histories of {len({entry.task_id for entry in entries}):,} tasks, "
-        f"{info['transitions']:,} transitions; each history has {length} steps.",
+        f"{info.transitions:,} transitions; each history has {length} steps.",
         f"Layouts: {', '.join(layout.name for layout in release.layouts)}.",
         f"Teammates: {'; '.join(_teammates(release))}.",
-        f"Of every episode of {steps['max_steps']} steps the first {steps['kept_steps']} are kept.",
+        f"Of every episode of {steps.max_steps} steps the first {steps.kept_steps} are kept.",
         f"Expert actions: {'on every history' if labelled == len(entries) else f'on {labelled:,} histories'}.",
-        f"Kind `{info['kind']}`: {kinds[info['kind']]}. Format version {info['format_version']}.",
+        f"Kind `{info.kind}`: {kinds[info.kind]}. Format version {info.format_version}.",
     ]
 
 
@@ -197,7 +195,7 @@ def _teammates(release: _Release) -> list[str]:
 
 
 def _limits(release: _Release) -> list[str]:
-    entries, names = release.entries, release.info["layouts"]
+    entries, names = release.entries, release.info.layouts
     taught = {entry.teammate_family for entry in entries if entry.split != "test"} - {"rl"}
     limits = []
     if taught:
@@ -207,7 +205,7 @@ def _limits(release: _Release) -> list[str]:
             "a model trained on them."
         )
     limits += [*_missing(release), *_smaller(release)]
-    if release.info["kind"] not in KINDS:
+    if release.info.kind not in KINDS:
         limits.append(
             "Replayable: without state records nothing can be replayed or drawn. Published files, if it was made of "
             "such, do not name the recipes that were cooked; those in `meta/info.json` are the layouts' usual ones."
@@ -231,15 +229,15 @@ def _missing(release: _Release) -> Iterable[str]:
     wanted: Counter[tuple[str, str]] = Counter()
     for suite in release.distinct("suite"):
         for layout, names in _populations(release, suite).items():
-            wanted |= Counter({(layout, name): suite["train"] for name in names})
+            wanted |= Counter({(layout, name): suite.train for name in names})
     learned_on = {layout for layout, _ in wanted}
-    without = [layout for layout in release.info["layouts"] if layout not in learned_on]
+    without = [layout for layout in release.info.layouts if layout not in learned_on]
     if wanted and without:
         yield f"Learned on {', '.join(without)}: its profile has no learned teammates there, only presets of H4."
     few = [
         f"{algorithm} on {layout} ({found[layout, algorithm]} of {count})"
         for (layout, algorithm), count in wanted.items()
-        if layout in release.info["layouts"] and found[layout, algorithm] < count
+        if layout in release.info.layouts and found[layout, algorithm] < count
     ]
     if few:
         yield (
@@ -248,19 +246,18 @@ def _missing(release: _Release) -> Iterable[str]:
         )
 
 
-def _populations(release: _Release, suite: dict[str, Any]) -> dict[str, list[str]]:
+def _populations(release: _Release, suite: TeammateSuite) -> dict[str, list[str]]:
     """A suite's algorithms by layout. Older provenance has one list, and perhaps its layouts."""
-    algorithms: dict[str, list[str]] | list[str] = suite["algorithms"]
-    if isinstance(algorithms, dict):
-        return algorithms
-    return dict.fromkeys(suite.get("layouts", release.info["layouts"]), algorithms)
+    if isinstance(suite.algorithms, dict):
+        return suite.algorithms
+    return dict.fromkeys(release.info.layouts if suite.layouts is None else suite.layouts, suite.algorithms)
 
 
 def _smaller(release: _Release) -> Iterable[str]:
     """Where it falls short of the paper's scale, if it does."""
     egos = [ego["total_steps"] for ego in release.distinct("ego")]
     suites = release.distinct("suite")
-    teammates = [suite["total_steps"] for suite in suites]
+    teammates = [suite.total_steps for suite in suites]
     short = min(egos, default=PAPER_EGO_STEPS) < PAPER_EGO_STEPS
     if short or min(teammates, default=PAPER_TEAMMATE_STEPS) < PAPER_TEAMMATE_STEPS:
         own = [f"egos for {steps:,}" for steps in sorted(set(egos))]
@@ -280,14 +277,15 @@ def _curves(release: _Release) -> str:
     groups: dict[tuple[str, str, str], list[Entry]] = {}
     for entry in release.entries:
         groups.setdefault((entry.layout, entry.split, entry.teammate_kind), []).append(entry)
-    filtered = all("filter" in release.provenance.get(entry.task_id, {}) for entry in release.entries)
+    filters = {task_id: of_task.filter for task_id, of_task in release.provenance.items() if of_task.filter}
+    filtered = all(entry.task_id in filters for entry in release.entries)
     rows = []
     for names, members in groups.items():
         tasks = {entry.task_id for entry in members}
         row = [*names, f"{len(tasks):,}", f"{len(members):,}"]
         row += [f"{release.mean(members, name):z.1f}" for name in ("return_start", "return_end")]
         if filtered:
-            before = [release.provenance[task]["filter"]["before"]["return_end"] for task in tasks]
+            before = [filters[task].before.return_end for task in tasks]
             row.append(f"{np.mean(before):z.1f}")
         rows.append(row)
     header = ["layout", "split", "teammate", "tasks", "histories", "first", "last"]
@@ -328,7 +326,7 @@ def _splits(release: _Release) -> str:
 
 
 def _fields(release: _Release) -> str:
-    kind = release.info["kind"]
+    kind = release.info.kind
     shapes = {"scalar": "", "state": ", S", "obs": ", 5, 5, C"}
     rows = []
     for field in FIELDS.values():
@@ -337,7 +335,7 @@ def _fields(release: _Release) -> str:
         stored = str(field.element(release.layouts[0], kind).base) if kind not in field.absent else "rendered"
         shape = f"({field.axis}{shapes[field.row]}{',' if field.row == 'scalar' else ''})"
         rows.append([f"`{field.name}`", shape, field.dtype, stored, ARRAY_TEXTS[field.name]])
-    actions = ", ".join(f"{number} {name}" for number, name in enumerate(release.info["actions"]))
+    actions = ", ".join(f"{number} {name}" for number, name in enumerate(release.info.actions))
     return markdown_table(["array", "shape", "as read", "as stored", "what"], rows) + f"\n\nActions: {actions}."
 
 
@@ -346,7 +344,7 @@ def _provenance(release: _Release) -> list[str]:
     if egos := release.distinct("ego"):
         sizes = [f"{ego['total_steps']:,} steps over {ego['environments']:,} environments" for ego in egos]
         lines.append(f"Egos: recurrent PPO from scratch, one learner a task, {' or '.join(sizes)}.")
-    counts = {(p[STREAMS_RECORDED], p["streams_kept"]) for p in release.provenance.values() if "streams_kept" in p}
+    counts = {(p.streams_recorded or 0, p.streams_kept) for p in release.provenance.values() if p.streams_kept}
     for recorded, kept in sorted(counts):
         lines.append(f"Of a task's {recorded:,} streams the best {kept:,} by end + improvement are kept.")
     for suite in release.distinct("suite"):
@@ -354,9 +352,9 @@ def _provenance(release: _Release) -> list[str]:
         for layout, names in _populations(release, suite).items():
             alike.setdefault(", ".join(names), []).append(layout)
         lines += [
-            f"Learned teammates on {', '.join(layouts)}: populations of {suite['members']} by {names}, "
-            f"{suite['total_steps']:,} steps a member; training teammates are drawn from the checkpoints whose return "
-            f"beside their own partner, greedy, in 400 steps exceeds {suite['threshold']:g}."
+            f"Learned teammates on {', '.join(layouts)}: populations of {suite.members} by {names}, "
+            f"{suite.total_steps:,} steps a member; training teammates are drawn from the checkpoints whose return "
+            f"beside their own partner, greedy, in 400 steps exceeds {suite.threshold:g}."
             for names, layouts in alike.items()
         ]
     if release.distinct("expert"):

@@ -15,7 +15,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_tasks
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
@@ -128,7 +128,9 @@ def to_published(
         if tasks:
             write_tasks(partial / "tasks.jsonl", tasks)
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
-        write_json(partial / "provenance.json", {name: value for name, value in provenance.items() if name in wanted})
+        write_json(
+            partial / "provenance.json", {name: value.to_json() for name, value in provenance.items() if name in wanted}
+        )
         if target.exists():
             target.rmdir()
         partial.rename(target)
@@ -195,7 +197,9 @@ def from_published(
         made: Kind = kind or _kind_of(file, lines)
         groups = [_Group(file, line, made, kept_steps) for line in lines]
         new = [
-            NewTask(task, provenance.get(task.task_id, {}), len(members), lambda members=members: load(members))
+            NewTask(
+                task, provenance.get(task.task_id, Provenance()), len(members), lambda members=members: load(members)
+            )
             for task, members in _tasks_of(groups, source, tasks, made)
         ]
         write_release(target, made, new, data_version=data_version, kept_steps=kept_steps)

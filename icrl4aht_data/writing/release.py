@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import describe, shard_sizes
 from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
     HISTORIES,
     INFO,
@@ -77,14 +78,14 @@ class NewTask:
 
     Args:
         task: what was learned; a `NamedTask` only in a release of observations.
-        provenance: how; any JSON.
+        provenance: how its histories were made.
         streams: the number of histories that `load` gives.
         load: called once, when its shard is written, so that few histories are in memory at a time.
         files: others that go into the release, path there -> file; see `checkpoint_files`.
     """
 
     task: Task
-    provenance: dict[str, Any]
+    provenance: Provenance
     streams: int
     load: Callable[[], Iterable[NewHistory]]
     files: Mapping[str, Path] = field(default_factory=dict)
@@ -174,10 +175,10 @@ def _fill(
     given = [new.task for new in tasks if not isinstance(new.task, NamedTask)]
     write_tasks(root / TASKS, given)
     provenance = {new.task.task_id: new.provenance for new in tasks}
-    write_json(root / PROVENANCE, provenance)
+    write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
     statistics = layout_statistics(root, entries, given, provenance, kept_steps)
     info = describe(kind, data_version, kept_steps, entries)
-    write_json(root / INFO, info | {"shards": shard_sizes(root, entries), "statistics": statistics})
+    write_json(root / INFO, replace(info, shards=shard_sizes(root, entries), statistics=statistics).to_json())
     card, source_card = cards
     if source_card is not None:
         (root / SOURCE_CARD).write_text(source_card, encoding="utf-8")

@@ -15,11 +15,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.info import LayoutStatistics, ReleaseInfo
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.overcooked.actions import ACTIONS
-
-STREAMS_RECORDED = "streams_recorded"
-"""The key of a task's provenance that says how many streams the best ones were chosen from."""
 
 _ROWS = {
     "original_transitions": "Original transitions",
@@ -35,8 +34,8 @@ _ROWS = {
 
 
 def layout_statistics(
-    root: Path, entries: Sequence[Entry], tasks: Sequence[Task], provenance: dict[str, Any], kept_steps: int
-) -> dict[str, dict[str, Any]]:
+    root: Path, entries: Sequence[Entry], tasks: Sequence[Task], provenance: dict[str, Provenance], kept_steps: int
+) -> dict[str, LayoutStatistics]:
     """layout -> the paper's properties, as numbers. The shards must be in `root`.
 
     original_transitions is what the learners' streams held before the filter, null where a provenance does not say;
@@ -50,38 +49,38 @@ def layout_statistics(
 
 
 def _of_layout(
-    root: Path, entries: list[Entry], tasks: Sequence[Task], provenance: dict[str, Any], kept_steps: int
-) -> dict[str, Any]:
+    root: Path, entries: list[Entry], tasks: Sequence[Task], provenance: dict[str, Provenance], kept_steps: int
+) -> LayoutStatistics:
     lengths = {entry.task_id: entry.T for entry in entries}
     steps = [entry.T for entry in entries]
-    streams = [provenance.get(task_id, {}).get(STREAMS_RECORDED) for task_id in lengths]
-    known = all(type(number) is int and 0 <= number < 2**31 for number in streams)
+    recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
+    streams = [number for number in recorded if number is not None]
     teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
-    return {
-        "original_transitions": sum(map(mul, streams, lengths.values())) if known else None,
-        "filtered_transitions": sum(steps),
-        "history_length": [min(steps), max(steps)],
-        "teammates": len(teammates) or None,
-        "steps_per_episode": kept_steps,
-        "obs_shape": list(entries[0].obs_shape),
-        "actions": len(ACTIONS),
-        "mean_final_return": round(float(np.mean([entry.return_end for entry in entries])), 3),
-        "disk_bytes": sum((root / shard).stat().st_size for shard in {entry.shard for entry in entries}),
-    }
+    return LayoutStatistics(
+        original_transitions=sum(map(mul, streams, lengths.values())) if len(streams) == len(recorded) else None,
+        filtered_transitions=sum(steps),
+        history_length=(min(steps), max(steps)),
+        teammates=len(teammates) or None,
+        steps_per_episode=kept_steps,
+        obs_shape=entries[0].obs_shape,
+        actions=len(ACTIONS),
+        mean_final_return=round(float(np.mean([entry.return_end for entry in entries])), 3),
+        disk_bytes=sum((root / shard).stat().st_size for shard in {entry.shard for entry in entries}),
+    )
 
 
-def statistics_rows(statistics: dict[str, dict[str, Any]]) -> list[list[str]]:
+def statistics_rows(statistics: dict[str, LayoutStatistics]) -> list[list[str]]:
     """The table in words: a row per property, which names it and has a cell per layout."""
     return [
-        [label, *(_in_words(name, of_layout[name]) for of_layout in statistics.values())]
+        [label, *(_in_words(name, getattr(of_layout, name)) for of_layout in statistics.values())]
         for name, label in _ROWS.items()
     ]
 
 
-def print_statistics(info: dict[str, Any], console: Console) -> None:
+def print_statistics(info: ReleaseInfo, console: Console) -> None:
     """The table of a release's meta/info.json: a row per property, a column per layout."""
-    statistics = info["statistics"]
-    table = Table("property", box=box.MARKDOWN, title=escape(f"{info['kind']} release {info['data_version']}"))
+    statistics = info.statistics
+    table = Table("property", box=box.MARKDOWN, title=escape(f"{info.kind} release {info.data_version}"))
     for layout in statistics:
         table.add_column(layout, justify="right")
     for row in statistics_rows(statistics):

@@ -11,6 +11,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.dataset import MINI
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.rules import step
@@ -89,7 +90,7 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
-        tasks.append(NewTask(task, {"seed": seed}, streams, lambda histories=histories: histories))
+        tasks.append(NewTask(task, Provenance(seed=seed), streams, lambda histories=histories: histories))
     write_release(
         root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
     )

@@ -126,9 +126,9 @@ class TestFormat:
         dataset = load_icrl4aht(root, obs="uint8")
         for number in range(len(dataset)) if histories is None else histories:
             history = dataset[number]
-            for field in history.entry.stored_fields(dataset.info["kind"]):
+            for field in history.entry.stored_fields(dataset.info.kind):
                 array = reader["read"](root, number, field.name)
-                assert array.dtype == field.element(LAYOUTS[history.entry.layout], dataset.info["kind"]).base
+                assert array.dtype == field.element(LAYOUTS[history.entry.layout], dataset.info.kind).base
                 np.testing.assert_array_equal(array, history.read(field.name))
 
     def test_the_bundled_release(self, reader):
@@ -188,7 +188,7 @@ class TestFormat:
         fields = [(name, cells[1]) for cells in rows("format", "field") for name in cells[0].split(", ")]
         assert fields == [(name, JSON_NAMES[frozenset(types)]) for name, types in JSON_TYPES.items()]
         keys = {name for cells in rows("format", "key") for name in cells[0].split(", ")}
-        assert keys == load_icrl4aht(lite[0]).info.keys()
+        assert keys == load_icrl4aht(lite[0]).info.to_json().keys()
 
     def test_every_file_of_a_release_is_listed(self):
         patterns = [re.sub("<.*?>", "*", name) for cells in rows("format", "path") for name in cells[0].split(", ")]

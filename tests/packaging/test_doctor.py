@@ -60,7 +60,7 @@ def test_nothing_wrong(elsewhere):
     for expected in (
         f"icrl4aht-data    {importlib.metadata.version('icrl4aht-data')} in {MINI.parent}",
         f"hdf5             {h5py.version.hdf5_version}",
-        f"data version {info['data_version']}, lite, format {FORMAT_VERSION}, {info['histories']} histories; names and",
+        f"data version {info.data_version}, lite, format {FORMAT_VERSION}, {info.histories} histories; names and",
         "(>=0.8, extra generation)",
         "JAX     cpu: cpu",
         f"{elsewhere / 'cache'} (set by ICRL4AHT_CACHE_DIR)",

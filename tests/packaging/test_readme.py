@@ -79,7 +79,7 @@ def test_remote_commands(tmp_path, monkeypatch):
     """They run one after the other against a local hub with the bundled release."""
     monkeypatch.chdir(tmp_path)
     with hub_server(tmp_path / "hub") as hub:
-        hub.add_repo("you/icrl4aht", MINI, tag=f"v{read_info(MINI)['data_version']}")
+        hub.add_repo("you/icrl4aht", MINI, tag=f"v{read_info(MINI).data_version}")
         for arguments in REMOTE:
             run(arguments)
 

@@ -177,7 +177,7 @@ def test_it_works_alone(installed, tmp_path):
         return done.stdout + done.stderr
 
     used, here = json.loads(run("python", "-c", USE)), load_icrl4aht(split="train", layout="coord_simple")
-    assert used["histories"] == read_info(MINI)["histories"]
+    assert used["histories"] == read_info(MINI).histories
     assert used["whole"] and used["heavy"] == []
     assert used["return"] == here[0].returns()[-1]
     batch = here.ad(batch_size=2, length=50, seed=0)[0]

@@ -65,7 +65,7 @@ def measure(url: str, local: Path, windows: int, length: int) -> dict[str, Any]:
     facts["equal"] = all(np.array_equal(a, b) for a, b in pairs)
     facts["requests"], facts["bytes"] = traffic.requests, traffic.bytes
     facts["requests_a_window"] = round(traffic.requests / windows, 3)
-    facts["streamed_share"] = round(traffic.bytes / sum(dataset.info["shards"][name] for name in dataset.shards), 4)
+    facts["streamed_share"] = round(traffic.bytes / sum(dataset.info.shards[name] for name in dataset.shards), 4)
 
     began = time.perf_counter()
     plan = plan_download(url, layout=LAYOUTS[1])

@@ -26,6 +26,7 @@ import numpy as np
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, TEAMMATES
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import files_below
@@ -65,7 +66,7 @@ def make_release(root: Path) -> None:
     for task in (heuristic, learned):
         histories = [NewHistory(k, play(task.layout, 6, 20, rng)) for k in range(2)]
         kept = {f"{TEAMMATES}/{digest}/{name}": root.parent / name for name in files} if task is learned else {}
-        tasks.append(NewTask(task, {"streams_recorded": 2}, 2, lambda histories=histories: histories, kept))
+        tasks.append(NewTask(task, Provenance(streams_recorded=2), 2, lambda histories=histories: histories, kept))
     write_release(root, "lite", tasks, data_version="0.0.1", card="# hostile\n", kept_steps=20)
 
 

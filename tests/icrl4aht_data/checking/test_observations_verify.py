@@ -15,6 +15,7 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.published import to_published
@@ -39,7 +40,7 @@ def spoilt(theirs, tmp_path: Path, name: str, place: Any, value: Any) -> Path:
     arrays = {key: array.copy() for key, array in theirs[1][0].items()}
     arrays[name][place] = value
     (task,) = make_tasks(["demo_wide"])
-    new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)])
+    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)])
     return write_release(tmp_path / "r", "observations", [new], data_version="0.0.1", card="", kept_steps=KEPT)
 
 

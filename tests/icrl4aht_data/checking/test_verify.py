@@ -14,6 +14,7 @@ from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -74,7 +75,7 @@ def rewritten(tmp_path, spoil, kind: Kind = "lite"):
     """A release whose hashes hold but whose content is spoiled."""
     (task,) = make_tasks(["demo_simple"])
     arrays = play(task.layout, 6, 20, np.random.default_rng(5))
-    new = NewTask(task, {}, 1, lambda: [NewHistory(0, spoil(arrays))])
+    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, spoil(arrays))])
     return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
 
@@ -224,7 +225,7 @@ def test_lost_shards_with_their_lines(tmp_path):
 def test_equal_histories_of_a_task(tmp_path):
     (task,) = make_tasks(["demo_simple"])
     arrays = play(task.layout, 6, 20, np.random.default_rng(5))
-    new = NewTask(task, {}, 2, lambda: [NewHistory(k, arrays) for k in range(2)])
+    new = NewTask(task, Provenance(), 2, lambda: [NewHistory(k, arrays) for k in range(2)])
     write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
     assert problems(tmp_path / "r")[0].endswith("history 1: the same as history 0")
 
@@ -351,7 +352,7 @@ def test_a_teammate_of_training_and_test(tmp_path):
     layout = get_layout("coord_simple")
     (train,) = make_tasks(["coord_simple"])
     tasks = [train, make_task("teammate", "test", "coord_simple", train.teammate, 9)]
-    new = [NewTask(task, {}, 1, lambda: [NewHistory(0, play(layout, 6, 20, rng))]) for task in tasks]
+    new = [NewTask(task, Provenance(), 1, lambda: [NewHistory(0, play(layout, 6, 20, rng))]) for task in tasks]
     write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
     assert problems(tmp_path / "r") == [
         f"meta/tasks.jsonl: task {tasks[1].task_id!r} (test) has the teammate of {train.task_id!r} (train)"

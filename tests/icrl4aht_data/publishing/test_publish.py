@@ -24,6 +24,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
@@ -79,7 +80,7 @@ def beside_learned(tmp_path_factory) -> Path:
     task = make_task("teammate", "train", "demo_wide", teammate, 0)
     arrays = play(get_layout("demo_wide"), 6, 20, np.random.default_rng(0))
     files = {f"teammates/{digest}/{path.name}": path for path in (weights, folder / "policy.json")}
-    new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)], files)
+    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)], files)
     return write_release(folder / "release", "lite", [new], data_version="0.0.1", kept_steps=20)
 
 
@@ -278,7 +279,7 @@ def test_the_card_says_where_learned_teammates_are_missing(damaged, algorithms):
     path.write_text(json.dumps({task: {"suite": next(suites)} for task in json.loads(path.read_text())}))
     card = dataset_card(damaged)
     assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps a member" in card
-    others = ", ".join(name for name in read_info(damaged)["layouts"] if name != "demo_wide")
+    others = ", ".join(name for name in read_info(damaged).layouts if name != "demo_wide")
     assert f"* Learned on {others}: its profile has no learned teammates there, only presets of H4." in card
     assert "fewer training teammates than its profile wanted of fcp on demo_wide (0 of 3)." in card
 

@@ -14,6 +14,7 @@ import pytest
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS
 from icrl4aht_data.interop import hf_episodes
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -30,7 +31,7 @@ class TestConversion:
     def test_arrays_and_index_are_those_of_the_files(self, theirs, ours):
         folder, written = theirs
         dataset = load_icrl4aht(ours, obs="uint8")
-        assert dataset.info["kind"] == "observations"
+        assert dataset.info.kind == "observations"
         lines = [json.loads(line) for line in (folder / "histories_index.jsonl").read_text().splitlines()]
         by_stream = {history.entry.env_idx: history for history in dataset}
         for line, arrays in zip(lines, written, strict=True):
@@ -47,8 +48,8 @@ class TestConversion:
             assert len(history.returns()) == history.entry.episodes
             np.testing.assert_array_equal(history.obs[3:7, 2], arrays["obs"][3:7, 2])
         assert load_icrl4aht(ours)[0].obs[:5].dtype == np.float32
-        statistics = dataset.info["statistics"]["demo_wide"]
-        assert (statistics["history_length"], statistics["teammates"]) == ([50, 130], None)
+        statistics = dataset.info.statistics["demo_wide"]
+        assert (statistics.history_length, statistics.teammates) == ((50, 130), None)
 
     def test_plain_hdf5_readers_find_the_papers_fields(self, theirs, ours):
         entry = load_icrl4aht(ours).entries[0]
@@ -207,7 +208,9 @@ class TestFaults:
         (task,) = make_tasks(["demo_simple"])
         arrays = play(task.layout, 3, KEPT, np.random.default_rng(0))
         cut = {name: array if name == "episode_end_state" else array[:50] for name, array in arrays.items()}
-        new = NewTask(task, {}, 1, lambda: [NewHistory(0, cut | {"episode_end_state": cut["episode_end_state"][:2]})])
+        new = NewTask(
+            task, Provenance(), 1, lambda: [NewHistory(0, cut | {"episode_end_state": cut["episode_end_state"][:2]})]
+        )
         with pytest.raises(OptionError, match="do not all have 20 steps"):
             write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=KEPT)
 

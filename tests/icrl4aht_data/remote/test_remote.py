@@ -175,7 +175,7 @@ def test_a_new_version_at_the_same_address(lite, full, tmp_path):
         shutil.rmtree(tmp_path / "served")
         shutil.copytree(full[0], tmp_path / "served")
         second = load_icrl4aht(server.url)
-        assert (first.info["kind"], second.info["kind"]) == ("lite", "full")
+        assert (first.info.kind, second.info.kind) == ("lite", "full")
         assert first.root != second.root
         with pytest.raises(RemoteError, match="damaged or not of this version"):
             first[0].actions[:]
@@ -237,10 +237,10 @@ def test_the_revision_is_pinned_and_shown(lite, full, tmp_path):
         first = hub.add_repo("org/name", lite[0], tag="v0.0.1")
         hub.add_repo("org/name", full[0])
         tagged, newest = (load_icrl4aht(f"hf://datasets/org/name{at}") for at in ("@v0.0.1", ""))
-        assert (tagged.info["kind"], newest.info["kind"]) == ("lite", "full")
+        assert (tagged.info.kind, newest.info.kind) == ("lite", "full")
         assert str(tagged.origin) == f"hf://datasets/org/name@{first}"
         shown = json.loads(CliRunner().invoke(cli, ["show", "hf://datasets/org/name@v0.0.1", "--json"]).output)
-        assert (shown["revision"], shown["data_version"]) == (first, tagged.info["data_version"])
+        assert (shown["revision"], shown["data_version"]) == (first, tagged.info.data_version)
 
 
 @pytest.mark.parametrize("what", ["shard", "two shards", "missing", "index", "table and shard", "manifest", "all"])

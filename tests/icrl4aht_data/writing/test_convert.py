@@ -32,7 +32,7 @@ def test_full_and_lite(request, tmp_path, start, kind):
     root, _ = request.getfixturevalue(start)
     to_release(load_icrl4aht(root), tmp_path / "out", kind)
     assert verify_release(tmp_path / "out", deep=True).ok
-    assert load_icrl4aht(tmp_path / "out").info["kind"] == kind
+    assert load_icrl4aht(tmp_path / "out").info.kind == kind
     assert digest(tmp_path / "out") == digest(root)
     assert (tmp_path / "out" / "meta" / "tasks.jsonl").read_text() == (root / "meta" / "tasks.jsonl").read_text()
 

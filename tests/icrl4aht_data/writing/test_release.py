@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError, RootNotFoundError
 from icrl4aht_data.format.chunks import decode_chunk
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, episode_returns
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -164,7 +165,7 @@ def odd(arrays):
 def test_arrays_that_do_not_fit_are_refused_and_nothing_remains(tmp_path, spoil, message):
     (task,) = make_tasks(["cramped_up"])
     arrays = spoil(play(task.layout, 5, 10, np.random.default_rng(0)))
-    new = NewTask(task, {}, 1, lambda: [NewHistory(0, arrays)])
+    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)])
     with pytest.raises(OptionError, match=message):
         write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
     assert visible(tmp_path) == []
@@ -180,7 +181,7 @@ def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
 
     with pytest.raises(RuntimeError, match="no data"):
         write_release(
-            root, "lite", [NewTask(make_tasks(["cramped_up"])[0], {}, 1, fail)], data_version="1.0.0", card=""
+            root, "lite", [NewTask(make_tasks(["cramped_up"])[0], Provenance(), 1, fail)], data_version="1.0.0", card=""
         )
     assert (root / "MANIFEST.sha256").read_bytes() == before
     assert verify_release(root).ok
@@ -193,7 +194,7 @@ def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
     (task,) = make_tasks(["cramped_up"])
     arrays = play(task.layout, 5, 10, np.random.default_rng(0))
     for announced in (1, 3):
-        new = NewTask(task, {}, announced, lambda: [NewHistory(k, arrays) for k in range(2)])
+        new = NewTask(task, Provenance(), announced, lambda: [NewHistory(k, arrays) for k in range(2)])
         with pytest.raises(OptionError, match=f"2 histories, but {announced} were announced"):
             write_release(
                 tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10, shard_histories=1
@@ -203,7 +204,7 @@ def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
 
 def test_no_task_and_a_task_twice_are_refused(tmp_path):
     (task,) = make_tasks(["cramped_up"])
-    new = NewTask(task, {}, 1, list)
+    new = NewTask(task, Provenance(), 1, list)
     for tasks in ([], [new, new]):
         with pytest.raises(OptionError, match="at least one task and none twice"):
             write_release(tmp_path / "out", "lite", tasks, data_version="0.0.1", card="")
@@ -216,7 +217,7 @@ def test_two_writers_of_one_release(tmp_path):
         return [NewHistory(0, play(task.layout, 5, 10, np.random.default_rng(0)))]
 
     (task,) = make_tasks(["cramped_up"])
-    new = NewTask(task, {}, 1, meanwhile)
+    new = NewTask(task, Provenance(), 1, meanwhile)
     write_release(tmp_path / "release", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
     assert verify_release(tmp_path / "release").histories == 1
 
@@ -230,7 +231,7 @@ def test_a_writer_killed_between_the_two_renames(tmp_path):
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        new = NewTask(make_tasks(["cramped_up"])[0], {}, 1, fail)
+        new = NewTask(make_tasks(["cramped_up"])[0], Provenance(), 1, fail)
         write_release(tmp_path / "release", "lite", [new], data_version="1.0.0", card="")
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
 

@@ -120,8 +120,11 @@ def full_cache(scene: Scene, n: int) -> Iterator[Try]:
     def attempt(target: Target, size: int, mounted: bool) -> None:
         with scene.met() as to:
             disk = small_disk(to.parent, 64 * 2**20) if mounted else small_files(size)
-            index = read_index(open_root(target.url, None, PATIENCE))
-            dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+            origin = open_root(target.url, None, PATIENCE)
+            index = read_index(origin.folder)
+            dataset = Dataset(
+                index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(origin, index)
+            )
             for history in dataset:
                 history.read("dones", 0, 1)  # brings the chunk table
             began = len(target.log)

@@ -137,8 +137,11 @@ class Scene:
 
     def stream(self, url: str, to: Path | None) -> None:
         """A few batches, the right ones; what comes goes to the default folder."""
-        index = read_index(open_root(url, None, PATIENCE))
-        dataset = Dataset(index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(index))
+        origin = open_root(url, None, PATIENCE)
+        index = read_index(origin.folder)
+        dataset = Dataset(
+            index, np.arange(len(index.entries)), ReadOptions("uint8", "stream", 1), Shards(origin, index)
+        )
         check(batches(dataset) == self.batches, "other batches than those of the release")
 
     def check_arrived(self, folder: Path, everything: bool = False) -> None:
@@ -236,7 +239,7 @@ def batches(dataset: Dataset) -> bytes:
 
 def arrays(dataset: Dataset) -> bytes:
     """A hash of every stored array and of observations."""
-    names = [stored.name for stored in held_fields(dataset.info["kind"])]
+    names = [stored.name for stored in held_fields(dataset.info.kind)]
     return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names)] for h in dataset))
 
 
