@@ -15,8 +15,6 @@ from baselines.commands.cli import cli as baselines_cli
 from baselines.report.headroom import published_table
 from generation.cli import cli as generation_cli
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.dataset import MINI
-from icrl4aht_data.format.info import read_info
 from icrl4aht_data.utils.templates import card_file
 from tests.helpers.paths import ROOT
 from tests.servers.common import hub_server, uploads
@@ -49,9 +47,8 @@ def run(arguments: list[str]) -> None:
 
 
 READER = commands("icrl4aht-data")
-PUBLISHING = [arguments for arguments in READER if arguments[0] in ("release", "upload")]
-REMOTE = [a for a in READER if a not in PUBLISHING and any("icrl4aht" in argument for argument in a)]
-LOCAL = [arguments for arguments in READER if arguments not in PUBLISHING + REMOTE]
+HUB = [a for a in READER if a[:2] == ["release", "build"] or any("icrl4aht" in argument for argument in a)]
+LOCAL = [arguments for arguments in READER if arguments not in HUB]
 LONG = [
     pytest.param(program, arguments, id=" ".join([program, *arguments]))
     for program in ("python -m generation", "python -m baselines")
@@ -75,22 +72,12 @@ def test_reader_commands(arguments, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_remote_commands(tmp_path, monkeypatch):
-    """They run one after the other against a local hub with the bundled release."""
-    monkeypatch.chdir(tmp_path)
-    with hub_server(tmp_path / "hub") as hub:
-        hub.add_repo("you/icrl4aht", MINI, tag=f"v{read_info(MINI).data_version}")
-        for arguments in REMOTE:
-            run(arguments)
-
-
-@pytest.mark.slow
 @uploads
-def test_publishing_commands(tmp_path, monkeypatch):
-    """They run one after the other against a local hub."""
+def test_hub_commands(tmp_path, monkeypatch):
+    """Upload the bundled release to a local hub, then read it from there: the commands in the README's order."""
     monkeypatch.chdir(tmp_path)
     with hub_server(tmp_path / "hub") as hub:
-        for arguments in PUBLISHING:
+        for arguments in HUB:
             run(arguments)
         assert "README.md" in hub.files("you/icrl4aht")
 
@@ -110,7 +97,7 @@ def test_make_targets_exist():
 
 def test_commands_and_snippets_were_found():
     assert blocks("python")
-    assert LOCAL and REMOTE and PUBLISHING
+    assert LOCAL and HUB
     assert {case.values[0] for case in LONG} == {"python -m generation", "python -m baselines"}
 
 
