@@ -287,7 +287,7 @@ run = as_run(evaluate("stay", stay, tasks[:1], short), tasks=tasks)
 assert "| H5 |" in markdown([run])
 (row,) = rows(run)
 random_release(Path("release"), layouts=("open_kitchen",))
-ok = verify_release("release", deep=True).ok
+ok = verify_release("release", level="deep").ok
 print((row["family"], row["layout"], row["instances"], ok))
 """
 
