@@ -79,7 +79,7 @@ def run_demo(
     console.print(dataset.dpt(batch_size=8, context=500)[0].describe(), highlight=False)
 
     say(3, "verifying every byte and every step")
-    report = verify_release(MINI, deep=True)
+    report = verify_release(MINI, level="deep")
     if not report.ok:
         raise ReleaseError(f"{MINI}: {report.findings[0].file}: {report.findings[0].problem}")
     console.print(f"whole: {report.files} files, {report.chunks} chunks, {report.transitions:,} transitions replayed")

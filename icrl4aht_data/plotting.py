@@ -1,4 +1,4 @@
-"""Pictures of a dataset. Needs the extra `plot`."""
+"""Figures of datasets, layouts and reference returns. Needs the extra `plot`."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PICTURES = (".png", ".svg", ".pdf")
-"""What the name of a picture may end in."""
+"""Accepted suffixes of a figure's file name."""
 
 
 def plot_learning_curves(dataset: Dataset, path: Path) -> None:
-    """Return per episode of every task in the selection: mean over streams, band between the 10th and 90th percentile.
+    """Plot the return per episode of every task in a selection: mean over streams, band from 10th to 90th percentile.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -37,10 +37,11 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
 
 
 def plot_layout_curves(dataset: Dataset, path: Path) -> None:
-    """Return per episode on every layout in the selection, a curve for each split and kind of teammate, as above.
+    """Plot the return per episode on every layout in a selection, one curve per split and teammate kind: mean over
+    streams, band from 10th to 90th percentile.
 
     Raises:
-        OptionError: as above.
+        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
     _plot_histories(dataset, path, lambda e: (e.layout, e.layout), lambda e: f"{e.split}, {e.teammate_kind}: mean")
 
@@ -48,28 +49,29 @@ def plot_layout_curves(dataset: Dataset, path: Path) -> None:
 def _plot_histories(
     dataset: Dataset, path: Path, panel: Callable[[Entry], tuple[str, str]], curve: Callable[[Entry], str]
 ) -> None:
-    """Panels by key and title, in each a curve for each label."""
+    """Plot one panel per key and title that `panel` returns, in it one curve per label that `curve` returns."""
     panels: dict[tuple[str, str], dict[str, list[np.ndarray]]] = {}
     for history in dataset:
         panels.setdefault(panel(history.entry), {}).setdefault(curve(history.entry), []).append(history.returns())
-    alike, seen = Counter(title for _, title in panels), Counter()
+    equal, seen = Counter(title for _, title in panels), Counter()
     drawn = []
     for (_, title), curves in panels.items():
         seen[title] += 1
-        number = f", {seen[title]}" if alike[title] > 1 else ""
-        streams = {f"{label} of {len(of_label)} streams": _cut(of_label) for label, of_label in curves.items()}
+        number = f", {seen[title]}" if equal[title] > 1 else ""
+        streams = {}
+        for label, members in curves.items():
+            length = min(map(len, members))  # streams of one curve may differ in length
+            streams[f"{label} of {len(members)} streams"] = np.stack([member[:length] for member in members])
         drawn.append((title + number, streams))
     plot_curves(path, drawn)
 
 
-def _cut(streams: list[np.ndarray]) -> np.ndarray:
-    """(N, E): all of them as long as the shortest."""
-    length = min(map(len, streams))
-    return np.stack([stream[:length] for stream in streams])
-
-
 def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> None:
-    """Panels of learning curves: title, and label -> returns (N streams, E episodes), drawn as mean and band.
+    """Plot panels of learning curves, each as the mean over streams and a band from 10th to 90th percentile.
+
+    Args:
+        path: the file to write.
+        panels: for each panel its title, and label -> returns, float (streams, episodes).
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -90,7 +92,7 @@ def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]])
 
 
 def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
-    """The layouts as an episode may start: the agents where the map puts them, ego blue, teammate red.
+    """Draw the layouts at the start of an episode: agents on their cells in the map, ego blue, teammate red.
 
     Raises:
         OptionError: if matplotlib or Pillow is not installed, or the path does not end in .png, .svg or .pdf.
@@ -106,10 +108,12 @@ def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
 
 
 def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path) -> None:
-    """By how much the oracle's mean return exceeds that of an ego that stays, for each test layout and family.
+    """Plot the oracle's mean return minus that of an ego that stays, for each test layout and teammate family.
 
     Args:
-        cells: see `headroom.read_headroom`.
+        cells: the reference returns, see `reference_returns.read_headroom`.
+        layouts: names of the layouts, one column each.
+        path: the file to write.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -130,7 +134,7 @@ def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[s
 
 
 def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, list[Any]]:
-    """A figure with that many axes of that many inches, to be saved at `path`."""
+    """Return a figure and its `count` axes, each `size` inches (width, height); checks the suffix of `path`."""
     if path.suffix not in PICTURES:
         raise OptionError(f"{path}: expected a name that ends in {', '.join(PICTURES)}")
     try:
@@ -144,7 +148,7 @@ def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, 
 
 
 def legend_below(figure: Figure) -> None:
-    """One legend for all axes, in as many columns as fit the figure's width."""
+    """Add one legend for all axes below the figure, in as many columns as fit its width."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     entries = {
@@ -152,14 +156,14 @@ def legend_below(figure: Figure) -> None:
     }
     renderer = FigureCanvasAgg(figure).get_renderer()
     for columns in range(min(5, len(entries)), 0, -1):
-        place = {"loc": "outside lower center", "ncols": columns}
-        legend = figure.legend(entries.values(), entries.keys(), fontsize=9, frameon=False, **place)
+        options = {"loc": "outside lower center", "ncols": columns, "fontsize": 9, "frameon": False}
+        legend = figure.legend(entries.values(), entries.keys(), **options)
         if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
             return
         legend.remove()
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a figure, in the format that the path's suffix names."""
+    """Write a figure in the format that the path's suffix names; an existing file is replaced at once."""
     with atomic_write(path) as partial:
         figure.savefig(partial, dpi=dpi, format=path.suffix.removeprefix("."))

@@ -203,4 +203,4 @@ def bytes_per_transition(kind: Kind) -> float:
 
 
 def _first_history(task: Task) -> list[NewHistory]:
-    return [NewHistory.copied(load_icrl4aht(task_id=task.task_id)[0])]
+    return [NewHistory.from_history(load_icrl4aht(task_id=task.task_id)[0])]

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Checks of the arrays of histories: checksums, ranges, episodes, and the values that the index derives from them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icrl4aht_data.checking.physics import _physics_problems, _place_problems
+from icrl4aht_data.checking.physics import observation_faults, replay_faults
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
-from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
@@ -28,31 +28,15 @@ from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.memory import free_memory
 
-_COPIES = 4  # of a history that checking it takes
+_COPIES = 4  # of a history's arrays that checking it holds in memory
 
 
-def _check_history(history: History, index: Index, seen: dict[tuple[str, bytes], int], report: Report) -> None:
-    entry, kind = history.entry, index.info.kind
-    layout = get_layout(entry.layout)
-    bytes_a_step = sum(part.element(layout, kind).itemsize for part in entry.stored_fields(kind))
-    if (size := _COPIES * entry.T * bytes_a_step) > free_memory():
-        raise OptionError(f"takes {size / 1e9:.3g} GB of memory, more than is free")
-    for problem in _history_problems(history, index.info.environment.kept_steps, report.deep):
-        report.add(entry.shard, f"history {entry.history_id}: {problem}")
-    seen_and_done = (record_field(kind).name, "actions")
-    content = hashlib.sha256(b"".join(history.read(part).tobytes() for part in seen_and_done)).digest()
-    twin = seen.setdefault((entry.task_id, content), entry.history_id)
-    if twin != entry.history_id:
-        report.add(entry.shard, f"history {entry.history_id}: the same as history {twin}")
-    report.transitions += entry.T
-
-
-def _check_chunks(shard: Shard, report: Report) -> set[int]:
-    """Decode every chunk; the histories that have a damaged one."""
+def check_chunks(shard: Shard, report: Report) -> set[int]:
+    """Decode every chunk of a shard; returns the ids of histories with a damaged chunk."""
     damaged = set()
-    for row, history_id, field_ in shard.chunk_rows():
+    for row, history_id, field in shard.chunk_rows():
         try:
-            shard.decode(row, history_id, field_)
+            shard.decode(row, history_id, field)
         except Icrl4ahtError as error:
             report.add(shard.name, str(error))
             damaged.add(history_id)
@@ -60,11 +44,38 @@ def _check_chunks(shard: Shard, report: Report) -> set[int]:
     return damaged
 
 
-def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator[str]:
-    entry = history.entry
-    layout = get_layout(entry.layout)
-    dones, rewards, replayable = history.read("dones"), history.read("rewards"), history.kind in KINDS
-    counted = entry.episodes == entry.T // kept_steps and not (replayable and entry.T % kept_steps)
+def check_history(history: History, info: ReleaseInfo, contents: dict[tuple[str, bytes], int], report: Report) -> None:
+    """Check one history whose chunks are valid.
+
+    Args:
+        history: the history.
+        info: the release's info.
+        contents: (task id, hash of what the ego saw and did) -> history id, of the shard's histories so far; receives
+            this one.
+        report: receives the problems.
+    """
+    entry, layout = history.entry, get_layout(history.entry.layout)
+    try:
+        step_bytes = sum(field.element(layout, info.kind).itemsize for field in entry.stored_fields(info.kind))
+        if (size := _COPIES * entry.T * step_bytes) > free_memory():
+            raise OptionError(f"takes {size / 1e9:.3g} GB of memory, more than is free")
+        for fault in _history_faults(history, info.environment.kept_steps, deep=report.level == "deep"):
+            report.add(entry.shard, f"history {entry.history_id}: {fault}")
+        arrays = (history.read(name) for name in (record_field(info.kind).name, "actions"))
+        digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).digest()
+        other = contents.setdefault((entry.task_id, digest), entry.history_id)
+        if other != entry.history_id:
+            report.add(entry.shard, f"history {entry.history_id}: has the content of history {other}")
+        report.transitions += entry.T
+    except (Icrl4ahtError, MemoryError) as error:
+        report.add(entry.shard, f"history {entry.history_id}: could not be checked: {error!r}")
+
+
+def _history_faults(history: History, kept_steps: int, deep: bool) -> Iterator[str]:
+    entry, layout = history.entry, get_layout(history.entry.layout)
+    dones, rewards, has_states = history.read("dones"), history.read("rewards"), history.kind in KINDS
+    # Only a release of observations may end a history within an episode.
+    counted = entry.episodes == entry.T // kept_steps and not (has_states and entry.T % kept_steps)
     if not counted or not np.array_equal(dones, episode_ends(entry.T, kept_steps)):
         yield f"dones: expected {entry.episodes} episodes of {kept_steps} steps, found {dones.sum()} in {entry.T} steps"
         return
@@ -73,20 +84,20 @@ def _history_problems(history: History, kept_steps: int, deep: bool) -> Iterator
         if values.min() < 0 or values.max() >= len(ACTIONS):
             yield f"{name}: expected 0..{len(ACTIONS) - 1}, found {values.min()}..{values.max()}"
     if (rewards != np.rint(rewards)).any() or np.abs(rewards).max() > np.iinfo(FIELDS["rewards"].compact).max:
-        yield f"rewards: expected whole numbers that a byte holds, found {rewards.min()}..{rewards.max()}"
-    impossible = False
-    for name in ("state", "episode_end_state") if replayable else ():
+        yield f"rewards: expected integers that fit into a byte, found {rewards.min()}..{rewards.max()}"
+    possible = True
+    for name in ("state", "episode_end_state") if has_states else ():
         for fault in faults(layout, history.read(name)):
-            impossible = True
+            possible = False
             yield f"{name} has {fault}"
     returns = episode_returns(rewards, dones)[None]
-    first, last = curve_ends(returns)
-    found = {"return_start": first[0], "return_end": last[0], "return_mean": returns.mean()}
-    found["score"] = stream_score(returns)[0]
-    for name, value in found.items():
+    start, end = curve_ends(returns)
+    derived = {"return_start": start[0], "return_end": end[0], "return_mean": returns.mean()}
+    derived["score"] = stream_score(returns)[0]
+    for name, value in derived.items():
         if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
-    if deep and not replayable:
-        yield from _place_problems(layout, history)
-    elif deep and not impossible:
-        yield from _physics_problems(layout, history, dones, rewards)
+    if deep and not has_states:
+        yield from observation_faults(layout, history)
+    elif deep and possible:  # the rules are defined for possible states only
+        yield from replay_faults(layout, history, dones, rewards)

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Checks of histories against the rules of the game: what observations show, where steps lead, how episodes start."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from icrl4aht_data.overcooked.state import columns, record_size, start
 from icrl4aht_data.reading.history import History
 
 
-def _place_problems(layout: Layout, history: History) -> Iterator[str]:
+def observation_faults(layout: Layout, history: History) -> Iterator[str]:
+    """Yield a problem if observations show the layout's fixed cells from nowhere in the ego's room; needs no states."""
     fixed = fixed_channels(layout)
     records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
     records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
@@ -24,7 +25,15 @@ def _place_problems(layout: Layout, history: History) -> Iterator[str]:
         yield f"obs: {len(wrong)} steps do not show {layout.name} from any cell of the ego's, first step {wrong[0]}"
 
 
-def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
+def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
+    """Replay every step of a history with state records; yields what the rules contradict.
+
+    Args:
+        layout: the history's layout.
+        history: the history, whose states are possible.
+        dones: bool (T,), last steps of episodes.
+        rewards: (T,), the recorded rewards.
+    """
     states, ends = history.read("state"), history.read("episode_end_state")
     if history.kind == "full":
         wrong = np.flatnonzero((history.read("obs") != observe(layout, states, EGO)).any(axis=(1, 2, 3)))
@@ -34,6 +43,7 @@ def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewar
     following[dones] = ends
     recipe = columns(layout).recipe
     actions = np.stack([history.read("actions"), history.read("teammate_actions")], axis=-1)
+    # A new recipe is drawn at random: the recorded one is given to the rules.
     played = step(layout, states, np.clip(actions, 0, len(ACTIONS) - 1), following[:, recipe])
     wrong = np.flatnonzero((played.state != following).any(axis=-1))
     if len(wrong):
@@ -44,15 +54,11 @@ def _physics_problems(layout: Layout, history: History, dones: np.ndarray, rewar
         yield f"replay: {len(wrong)} rewards differ, first at step {t}: rules {played.reward[t]}, found {rewards[t]}"
     if not np.isin([*states[:, recipe], *ends[:, recipe]], layout.recipe_items).all():
         yield "a recipe is not one of the layout's"
-    yield from _start_problems(layout, states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])])
-
-
-def _start_problems(layout: Layout, starts: np.ndarray) -> Iterator[str]:
-    where = columns(layout)
-    positions = starts[:, where.positions]
-    fresh = start(layout, positions, starts[:, where.facings], starts[:, where.recipe])
-    wrong = (fresh != starts).any(axis=-1)
+    starts = states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])]
+    positions = starts[:, columns(layout).positions]
+    fresh = start(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
+    differs = (fresh != starts).any(axis=-1)
     for agent in (0, 1):
-        wrong |= ~np.isin(positions[:, agent], layout.rooms[agent])
-    if wrong.any():
-        yield f"{wrong.sum()} episodes do not start as the environment starts, first episode {wrong.argmax()}"
+        differs |= ~np.isin(positions[:, agent], layout.rooms[agent])
+    if differs.any():
+        yield f"{differs.sum()} episodes do not start as the environment starts, first episode {differs.argmax()}"

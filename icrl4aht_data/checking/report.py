@@ -1,34 +1,57 @@
-"""TODO."""
+"""The result of verifying a release."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
-_FINDINGS = 100_000
+Level = Literal["quick", "full", "deep"]
+"""Depth of a verification, see `verify_release`."""
 
+NamedProgress = Callable[[str, int, int], None]
+"""Called with the name of a stage, the number of items done, and their total."""
 
+_FINDINGS = 100_000  # a report keeps at most this many
 _LONG = 2000  # characters of a finding
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong."""
+    """One problem of a release.
 
-    file: str  # path below the root
+    Args:
+        file: path below the release's root.
+        problem: description of the problem.
+    """
+
+    file: str
     problem: str
 
 
 @dataclass
 class Report:
-    """What `verify_release` looked at and found."""
+    """The result of `verify_release`.
+
+    Args:
+        root: the release, folder or address.
+        level: depth of the verification.
+        findings: problems, in the order in which they were found.
+        notes: requested checks that were impossible, which are not problems.
+        repaired: files that `icrl4aht-data verify --repair` replaced.
+        replayed: whether every step was replayed under the rules.
+        files: number of files checked.
+        chunks: number of chunks decoded.
+        histories: number of histories checked.
+        transitions: number of their steps.
+        fetched_bytes: bytes fetched from a remote.
+        requests: requests to it.
+    """
 
     root: str
-    deep: bool
-    quick: bool = False
+    level: Level = "full"
     findings: list[Finding] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)  # what was asked for but could not be checked, which is no fault
+    notes: list[str] = field(default_factory=list)
     repaired: list[str] = field(default_factory=list)
     replayed: bool = False
     files: int = 0
@@ -40,28 +63,26 @@ class Report:
 
     @property
     def ok(self) -> bool:
+        """Whether no problem was found."""
         return not self.findings
 
     @property
     def files_at_fault(self) -> set[str]:
-        """Of the release, in which something is wrong."""
+        """Files of the release with a problem."""
         return {finding.file for finding in self.findings}
 
     def to_json(self) -> dict[str, Any]:
-        return {"ok": self.ok, **asdict(self)}
+        return {"ok": self.ok, **asdict(self), "deep": self.level == "deep", "quick": self.level == "quick"}
 
     def add(self, file: str, problem: str) -> None:
+        """Add a finding; beyond a limit only one that says that there are more."""
         if len(self.findings) < _FINDINGS:
-            self.findings.append(Finding(_plain(file), _plain(problem)))
+            self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:
-            self.findings.append(Finding(".", "and more: mend these first, then verify again"))
+            self.findings.append(Finding(".", "and more: correct these first, then verify again"))
 
 
-def _plain(text: str) -> str:
-    """Without what a terminal would obey, or cannot show."""
+def _printable(text: str) -> str:
+    """Return a text of limited length, with control characters escaped: they could command a terminal."""
     text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
     return text if text.isprintable() else text.encode("unicode_escape").decode()
-
-
-NamedProgress = Callable[[str, int, int], None]
-"""Called with what is being checked, how many are done, and how many there are."""

@@ -1,4 +1,4 @@
-"""`icrl4aht-data`: thin commands."""
+"""The `icrl4aht-data` command line: options in, calls to the package, text or JSON out."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from statistics import fmean
+from typing import Any
 
 import click
 from rich.console import Console
 from rich.table import Table
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.checking.report import Report
+from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.commands.doctor import diagnose, in_words
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
@@ -32,11 +36,19 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
-from icrl4aht_data.plotting import PICTURES
-
-if TYPE_CHECKING:
-    from icrl4aht_data.checking.report import Report
+from icrl4aht_data.format.info import describe, read_info
+from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS, Entry
+from icrl4aht_data.plotting import PICTURES, plot_learning_curves
+from icrl4aht_data.publishing.build import build_release
+from icrl4aht_data.publishing.upload import upload_release
+from icrl4aht_data.remote.download import fetch_planned, plan_download
+from icrl4aht_data.remote.download import repair as repair_files
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.parquet import to_parquet
+from icrl4aht_data.writing.published import HISTORIES_H5, from_published, to_published
+from icrl4aht_data.writing.statistics import print_statistics
 
 _root = click.argument("root", required=False, type=Root())
 
@@ -51,7 +63,7 @@ def _load(root: str | Path | None, filters: dict[str, tuple[str, ...]]) -> Datas
 
 _SECTIONS = {
     "Look": ("list", "show", "verify", "doctor"),
-    "Bring and change": ("download", "convert", "combine"),
+    "Fetch and convert": ("download", "convert", "combine"),
     "Publish": ("release", "upload"),
 }
 
@@ -64,8 +76,8 @@ _EXAMPLES = examples(
 
 _EPILOG = f"""{_EXAMPLES}
 
-Exit codes: 0 done, 1 a failure or something found wrong, 2 a misused command. The folders and environment variables
-in use: `icrl4aht-data doctor`.
+Exit codes: 0 success, 1 a failure or a problem found, 2 a misused command. `icrl4aht-data doctor` prints the folders
+and environment variables in use.
 
 \b
 Completion, in bash (for zsh and fish: zsh_source, fish_source):
@@ -79,7 +91,7 @@ def cli() -> None:
     """Read, check, fetch and publish the learning histories of the ICRL4AHT benchmark.
 
     ROOT is a release: its folder, or its address hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...
-    Without ROOT, the mini release that comes with the package is meant.
+    The default is the mini release that is part of the package.
     """
 
 
@@ -90,61 +102,50 @@ def cli() -> None:
 def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
     """List the tasks of a release.
 
-    A line a task: layout, teammate, histories, transitions, and the mean return of an episode at the start and at the
-    end of learning.
+    Prints one line per task: layout, teammate, histories, transitions, and the mean return of an episode at the start
+    and at the end of learning.
     """
-    dataset = _load(root, filters)
-    tasks: dict[str, dict[str, Any]] = {}
-    for entry in dataset.entries:
-        row = tasks.setdefault(
-            entry.task_id,
-            {
-                "task_id": entry.task_id,
-                "layout": entry.layout,
-                "track": entry.track,
-                "split": entry.split,
-                "teammate": f"{entry.teammate_family}/{entry.teammate_kind}",
-                "histories": 0,
-                "transitions": 0,
-                "return_start": 0.0,
-                "return_end": 0.0,
-            },
-        )
-        row["histories"] += 1
-        row["transitions"] += entry.T
-        for name in ("return_start", "return_end"):
-            row[name] += (getattr(entry, name) - row[name]) / row["histories"]
+    by_task: dict[str, list[Entry]] = {}
+    for entry in _load(root, filters).entries:
+        by_task.setdefault(entry.task_id, []).append(entry)
+    tasks = [
+        {
+            "task_id": task_id,
+            "layout": entries[0].layout,
+            "track": entries[0].track,
+            "split": entries[0].split,
+            "teammate": f"{entries[0].teammate_family}/{entries[0].teammate_kind}",
+            "histories": len(entries),
+            "transitions": sum(entry.T for entry in entries),
+            "return_start": fmean(entry.return_start for entry in entries),
+            "return_end": fmean(entry.return_end for entry in entries),
+        }
+        for task_id, entries in by_task.items()
+    ]
     if as_json:
-        click.echo(json.dumps(list(tasks.values()), indent=2))
+        click.echo(json.dumps(tasks, indent=2))
         return
     table = Table("layout", "track", "split", "teammate", "histories", "transitions", "return", "task")
-    for row in tasks.values():
-        returns = f"{row['return_start']:.1f} -> {row['return_end']:.1f}"
-        table.add_row(
-            *(row[name] for name in ("layout", "track", "split", "teammate")),
-            str(row["histories"]),
-            f"{row['transitions']:,}",
-            returns,
-            row["task_id"],
-        )
+    for task in tasks:
+        names = (task[name] for name in ("layout", "track", "split", "teammate"))
+        returns = f"{task['return_start']:.1f} -> {task['return_end']:.1f}"
+        table.add_row(*names, str(task["histories"]), f"{task['transitions']:,}", returns, task["task_id"])
     Console(width=None if sys.stdout.isatty() else 200, markup=False).print(table)
 
 
 @cli.command()
 @_root
 @filter_options
-@click.option("--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show this one history instead.")
+@click.option("--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history.")
 @click.option("--plot", type=NewFile(*PICTURES), metavar="FILE", help="Also draw learning curves: .png, .svg or .pdf.")
 @json_option
 def show(
     root: str | Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
 ) -> None:
-    """Show what a release, a part of it or a history is.
+    """Show a release, a part of it or one history.
 
-    Prints kind, versions, counts and layouts; of one history all that the index says. Writes nothing but --plot.
+    Prints kind, versions, counts and layouts; for one history everything in its index entry. Only --plot writes a file.
     """
-    from icrl4aht_data.format.info import describe
-
     dataset = _load(root, filters)
     if history_id is None:
         info = dataset.info
@@ -152,7 +153,7 @@ def show(
             "root": str(dataset.origin),
             **({"revision": remote.revision, "folder": str(dataset.root)} if (remote := dataset.origin.remote) else {}),
             **describe(info.kind, info.data_version, info.environment.kept_steps, dataset.entries).to_json(),
-            **({"lacks": lacks} if (lacks := _lacks(dataset)) else {}),
+            **({"missing": missing} if (missing := _missing(dataset)) else {}),
             "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
         }
     else:
@@ -164,8 +165,6 @@ def show(
         if dataset.knows_tasks:
             facts["teammate"] = dataset.recover_teammate(history_id)
     if plot is not None:
-        from icrl4aht_data.plotting import plot_learning_curves
-
         plot_learning_curves(dataset, plot)
         facts["plot"] = str(plot)
     if as_json:
@@ -177,15 +176,15 @@ def show(
         click.echo(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
 
 
-def _lacks(dataset: Dataset) -> list[str]:
-    """What a full or lite release would have, in words."""
+def _missing(dataset: Dataset) -> list[str]:
+    """Return the parts of a full or lite release that this one does not have, in words."""
     without = len(dataset) - int(dataset.column("has_teammate_actions").sum())
-    lacks = {
+    missing = {
         "state records: nothing can be replayed or drawn, obs='state' is refused": not dataset.has_states,
         "tasks: teammates are known by family and kind only": not dataset.knows_tasks,
         f"teammate actions of {without} histories": without > 0,
     }
-    return [what for what, missing in lacks.items() if missing]
+    return [what for what, is_missing in missing.items() if is_missing]
 
 
 @cli.command(
@@ -197,7 +196,7 @@ def _lacks(dataset: Dataset) -> list[str]:
 @click.argument("root", required=False, type=Root(remote=True), envvar="ICRL4AHT_REMOTE", metavar="[ADDRESS]")
 @filter_options
 @click.option("--to", type=Folder(), metavar="FOLDER", help="Write the release here.")
-@click.option("--dry-run", is_flag=True, help="Fetch the index alone; print which files would come, and their bytes.")
+@click.option("--dry-run", is_flag=True, help="Fetch only the index; print the files to download, and their bytes.")
 @quiet_option
 @json_option
 def download(
@@ -206,12 +205,10 @@ def download(
     """Download a release, or a part of it.
 
     ADDRESS is hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...; by default $ICRL4AHT_REMOTE. Each file
-    is checked on arrival; the same command goes on where a download was cut. Without --to a Hub repository goes into
-    the Hub's cache, another release below $ICRL4AHT_DATA_DIR (~/.local/share/icrl4aht); load_icrl4aht(root=ADDRESS)
-    finds either.
+    is checked when it arrives; the same command resumes an interrupted download. Without --to, a Hub repository goes
+    into the Hub's cache, another release below $ICRL4AHT_DATA_DIR (~/.local/share/icrl4aht);
+    load_icrl4aht(root=ADDRESS) finds either.
     """
-    from icrl4aht_data.remote.download import fetch_planned, plan_download
-
     if root is None:
         raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
     plan = plan_download(str(root), to=to, **_wanted(filters))
@@ -226,19 +223,19 @@ def download(
         if dry_run:
             for name in plan.absent:
                 click.echo(f"{plan.files[name]:>15,}  {name}")
-        verb = "to come" if dry_run else "have come"
+        verb = "to download" if dry_run else "downloaded"
         here = len(plan.files) - len(plan.absent)
-        click.echo(f"{plan.root}: {len(plan.absent)} files, {plan.size:,} bytes {verb}; {here} files were here")
+        click.echo(f"{plan.root}: {len(plan.absent)} files, {plan.size:,} bytes {verb}; {here} files present already")
         click.echo(f"folder: {plan.root.folder}")
 
 
 @cli.command()
 @_root
 @filter_options
-@click.option("--quick", is_flag=True, help="Check names, sizes and the index alone.")
+@click.option("--quick", is_flag=True, help="Check only names, sizes and the index.")
 @click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
-@click.option("--repair", is_flag=True, help="Fetch what is wrong or missing again, then verify once more.")
-@click.option("--from", "source", metavar="ADDRESS", help="Repair from here.", show_default="where ROOT came from")
+@click.option("--repair", is_flag=True, help="Fetch damaged and missing files again, then verify once more.")
+@click.option("--from", "source", metavar="ADDRESS", help="Repair from here.", show_default="the origin of ROOT")
 @quiet_option
 @json_option
 def verify(
@@ -253,25 +250,23 @@ def verify(
 ) -> None:
     """Verify a release: every byte, count and range.
 
-    Prints a line for each thing that is wrong, and exits with 1 if there is one. Nothing is written, unless --repair. A
-    remote release is fetched first, unless --quick; repairing a shard fetches only what is wrong in it.
+    Prints one line per problem, and exits with 1 if there is one. Writes nothing without --repair. A remote release is
+    fetched first, unless --quick; repairing a shard fetches only its damaged parts.
     """
-    from icrl4aht_data.checking.verify import verify_release
-    from icrl4aht_data.remote.download import repair as repair_files
-
     if quick and (deep or repair):
         raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
+    level = "quick" if quick else "deep" if deep else "full"
     if source and not repair:
-        raise click.UsageError("--from says where to repair from: give --repair with it")
+        raise click.UsageError("--from is the source of a repair: give --repair with it")
     wanted = _wanted(filters)
     with bars(quiet) as advance:
-        report = verify_release(root, deep=deep, quick=quick, advance=advance, **wanted)
+        report = verify_release(root, level=level, advance=advance, **wanted)
         if repair and not report.ok:
             if root is None and source is None:
                 raise OptionError("the bundled release is repaired by installing the package again")
             first = report
             outcome, traffic = repair_files(MINI if root is None else root, first.files_at_fault, source=source)
-            report = verify_release(root, deep=deep, advance=advance, **wanted)
+            report = verify_release(root, level=level, advance=advance, **wanted)
             report.repaired = [name for name, error in outcome.items() if error is None]
             report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
             report.fetched_bytes += first.fetched_bytes + traffic.bytes
@@ -290,8 +285,8 @@ def verify(
 
 def _verdict(report: Report) -> str:
     number = len(report.findings)
-    verdict = "whole" if report.ok else f"{number} problem{'s' * (number > 1)}"
-    if report.quick:
+    verdict = "valid" if report.ok else f"{number} problem{'s' * (number > 1)}"
+    if report.level == "quick":
         return f"{verdict}; checked names, sizes and the index of {report.files} files, no contents"
     physics = " and their physics" if report.replayed else ""
     fetched = f"; fetched {report.fetched_bytes:,} bytes in {report.requests} requests" if report.requests else ""
@@ -309,15 +304,15 @@ def _verdict(report: Report) -> str:
 )
 @click.argument("source", type=Root())
 @click.argument("target", type=click.Path(path_type=Path), metavar="OUT")
-@click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]), help="What to make.")
+@click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]), help="The form to convert to.")
 @click.option(
     "--tasks",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
-    help="Of published files: their tasks.",
-    show_default="tasks.jsonl beside them",
+    help="Tasks of published files.",
+    show_default="tasks.jsonl in SOURCE",
 )
-@click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Of published files: steps of an episode.")
+@click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Steps of an episode in published files.")
 @filter_options
 @quiet_option
 def convert(
@@ -332,27 +327,21 @@ def convert(
     """Convert a release, or published files, into OUT.
 
     SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. OUT becomes a
-    release folder (full, lite, observations), a folder with the published code's two files (published), or a file with
-    the index as a table (parquet). Published files become lite by default, or observations where they have no state
+    release folder (full, lite, observations), a folder with the published code's two files (published), or a Parquet
+    file with the index (parquet). Published files become lite by default, or observations where they have no state
     records.
     """
-    from icrl4aht_data.writing.convert import to_release
-    from icrl4aht_data.writing.parquet import to_parquet
-    from icrl4aht_data.writing.published import HISTORIES_H5, from_published, to_published
-
     with bars(quiet) as show:
         advance = partial(show, "histories")
-        advance(0, None)  # how many there are is known only later
+        advance(0, None)  # the total is not known yet
         if isinstance(source, Path) and (source / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
-                raise click.UsageError("published files convert to full, lite or observations, and whole")
+                raise click.UsageError("published files convert to full, lite or observations, without filters")
             form = from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
         else:
             dataset = _load(source, filters)
             if form is None:
-                raise click.UsageError(
-                    "say what to make of a release: --to full, lite, observations, published, parquet"
-                )
+                raise click.UsageError("give the form to convert to: --to full, lite, observations, published, parquet")
             if tasks or kept_steps != KEPT_STEPS:
                 raise click.UsageError(f"{source} is a release: --tasks and --kept-steps are for published files")
             if form in ALL_KINDS:
@@ -361,9 +350,9 @@ def convert(
                 to_published(dataset, target, advance=advance)
             else:
                 to_parquet(dataset, target)
-    lacking = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
+    limit = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
     if not quiet:
-        click.echo(f"{target}: {form}{lacking}")
+        click.echo(f"{target}: {form}{limit}")
 
 
 @cli.command(epilog=examples("icrl4aht-data combine both path/to/release path/to/another --data-version 1.0.0"))
@@ -372,20 +361,16 @@ def convert(
 @click.option(
     "--data-version",
     metavar="SEMVER",
-    help="Of the combination, such as 1.0.0.",
-    show_default="that of the releases, if they agree",
+    help="Data version of the combination, such as 1.0.0.",
+    show_default="the version of the releases, if they agree",
 )
 @quiet_option
 def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | None, quiet: bool) -> None:
     """Combine releases into one, in the folder OUT.
 
-    They are of one kind, and no two have a task in common. A release that is at OUT is replaced. The card is made anew;
-    those of the releases are kept in meta/source_card.md.
+    They have to be of one kind and share no task. A release at OUT is replaced. The combination gets a new card; the
+    cards of the releases are kept in meta/source_card.md.
     """
-    from icrl4aht_data.format.info import read_info
-    from icrl4aht_data.writing.combine import combine_releases
-    from icrl4aht_data.writing.statistics import print_statistics
-
     combine_releases(out, releases, data_version)
     if not quiet:
         click.echo(f"release: {out}")
@@ -394,26 +379,23 @@ def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | Non
 
 @cli.group()
 def release() -> None:
-    """Make a release ready for other people."""
+    """Prepare a release for publication."""
 
 
 @release.command()
 @click.argument("source", nargs=-1, type=Folder(), metavar="[SOURCE]")
 @click.argument("out", type=Folder())
-@click.option("--link", is_flag=True, help="Hard links instead of copies: no space, but both change if one is changed.")
+@click.option("--link", is_flag=True, help="Use hard links, not copies: saves space, but editing one changes both.")
 @quiet_option
 @json_option
 def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json: bool) -> None:
     """Build a release for publication in the folder OUT.
 
-    It holds all of SOURCE, a release folder (by default the bundled mini release), which is verified first, and what
-    people and tools look for beside it: README.md with a dataset card, figures, the index as Parquet for viewers,
-    croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras plot and
-    hf.
+    OUT gets all data of SOURCE, a release folder (by default the bundled mini release), which is verified first, and
+    what people and tools look for in a dataset: README.md with a dataset card, figures, the index as Parquet for
+    viewers, croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras
+    plot and hf.
     """
-    from icrl4aht_data.format.manifest import read_manifest
-    from icrl4aht_data.publishing.build import build_release
-
     if len(source) > 1:
         raise click.UsageError("give one SOURCE at most, then OUT")
     with bars(quiet) as advance:
@@ -430,19 +412,17 @@ def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json:
 @click.argument("folder", type=Folder())
 @click.argument("address", type=Root(remote=True))
 @click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
-@click.option("--dry-run", is_flag=True, help="Print what would be done; change nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the plan; change nothing.")
 @quiet_option
 @json_option
 def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool, as_json: bool) -> None:
     """Upload a release to the Hugging Face Hub, and tag it.
 
     FOLDER is a release, as `release build` makes it; ADDRESS is hf://datasets/<org>/<repo>. The release is verified
-    first, the repository made if there is none. The same command goes on where an upload was cut. Afterwards what the
-    repository holds is compared with the manifest; only then it is tagged with the data version. A tag never moves:
-    other data need another version. `hf auth login` gives the token.
+    first; a missing repository is created. The same command resumes an interrupted upload. Afterwards the repository's
+    content is compared with the manifest, and only then tagged with the data version. A tag never moves: other data
+    need another version. `hf auth login` stores the token.
     """
-    from icrl4aht_data.publishing.upload import upload_release
-
     with bars(quiet) as advance:
         done = upload_release(
             folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
@@ -456,17 +436,15 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
 @cli.command()
 @json_option
 def doctor(as_json: bool) -> None:
-    """Look at this installation, and say what is wrong.
+    """Examine this installation, and report problems.
 
-    Prints versions, optional packages and which extra brings them, devices, the folders in use (where they are set,
-    what they hold, whether they can be written), environment variables, and whether the bundled release is whole.
-    Nothing is written or asked of the network. Exits with 1 and a next step for each problem if there is one.
+    Prints versions, optional packages and the extras that install them, devices, the folders in use (their settings,
+    contents and permissions), environment variables, and the state of the bundled release. Writes nothing, and does
+    not use the network. Exits with 1 and a next step for each problem if there is one.
     """
-    from icrl4aht_data.commands.doctor import diagnose, in_words
-
     found = diagnose()
-    click.echo(json.dumps(found.to_json(), indent=2) if as_json else "\n".join(in_words(found)))
-    sys.exit(0 if found.ok else 1)
+    click.echo(json.dumps(found, indent=2) if as_json else "\n".join(in_words(found)))
+    sys.exit(0 if found["ok"] else 1)
 
 
 def main() -> None:

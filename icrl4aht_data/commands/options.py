@@ -1,6 +1,6 @@
-"""What the command lines `icrl4aht-data`, `python -m generation` and `python -m baselines` share.
+"""Shared parts of the command lines `icrl4aht-data`, `python -m generation` and `python -m baselines`.
 
-Exit codes: 0 done and, for `verify`, whole; 1 an error, or a release that is not whole; 2 a misused command.
+Exit codes: 0 success; 1 an error, or a release in which `verify` found a problem; 2 a misused command.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 
 from icrl4aht_data.benchmark.facts import FAMILIES, SPLITS, TRACKS
+from icrl4aht_data.commands.requirements import PACKAGE, extra_with
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.remote.remote_release import is_address
@@ -40,10 +41,10 @@ _REMEDIES = {
 
 
 class Sections(click.Group):
-    """Commands under headings, in a useful order.
+    """Command group whose help lists the commands under headings.
 
     Args:
-        sections: heading -> names of commands. Others come last.
+        sections: heading -> names of commands. Commands without a heading are listed last.
     """
 
     def __init__(self, *args: Any, sections: Mapping[str, Sequence[str]], **options: Any) -> None:
@@ -68,12 +69,12 @@ class Sections(click.Group):
 
 
 class Names(click.ParamType):
-    """One of several names, which are looked up when one is given or completed: another is a misuse.
+    """Choice of one name; the valid names are computed when needed, and errors suggest the nearest one.
 
     Args:
-        name: what they name.
-        valid: gives them.
-        offered: how many of them, the first ones, completion offers.
+        name: what the names stand for, such as "layout".
+        valid: returns the valid names.
+        offered: how many of them, the first ones, completion offers; all by default.
     """
 
     def __init__(self, name: str, valid: Callable[[], Iterable[str]], offered: int | None = None) -> None:
@@ -98,10 +99,10 @@ TRACK, SPLIT, FAMILY = (
 
 
 class Root(click.ParamType):
-    """A release: its folder as a path, or its address as a text.
+    """Release: a folder, converted to a path, or an address, kept as text.
 
     Args:
-        remote: whether it has to be an address.
+        remote: accept addresses only.
     """
 
     name = "release"
@@ -125,10 +126,10 @@ class Root(click.ParamType):
 
 
 class Folder(click.Path):
-    """A folder.
+    """Folder, which need not exist; an empty text, as from an unset shell variable, is an error.
 
     Args:
-        made_by: what makes such folders, if it has to exist.
+        made_by: the command that makes such folders, if the folder has to exist.
     """
 
     def __init__(self, made_by: str | None = None) -> None:
@@ -145,10 +146,10 @@ class Folder(click.Path):
 
 
 class NewFile(click.Path):
-    """A file to write, in a folder that exists.
+    """File to write, in an existing folder.
 
     Args:
-        suffixes: that its name may end in.
+        suffixes: accepted ends of its name; any by default.
     """
 
     def __init__(self, *suffixes: str) -> None:
@@ -164,34 +165,24 @@ class NewFile(click.Path):
         return path
 
 
-class Number(click.ParamType):
-    """A number within bounds.
-
-    Args:
-        name: what it is.
-        kind: click.INT or click.FLOAT.
-        fits: whether a number is within them.
-        expected: the bounds in words.
-    """
-
-    def __init__(self, name: str, kind: click.ParamType, fits: Callable[[Any], bool], expected: str) -> None:
-        self.name, self._kind, self._fits, self._expected = name, kind, fits, expected
+class _Rate(click.FloatRange):
+    """Positive, finite number; click's range alone accepts nan, which compares false with every bound."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = self._kind.convert(value, param, ctx)
-        if not self._fits(number):
-            self.fail(f"{value}: expected {self._expected}", param, ctx)
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
         return number
 
 
-SEED = Number("seed", click.INT, lambda seed: 0 <= seed < 2**32, "a whole number from 0 to 2**32 - 1")
-COUNT = Number("number", click.INT, lambda count: count >= 1, "a whole number from 1 on")
-COUNT_OR_NONE = Number("number", click.INT, lambda count: count >= 0, "a whole number from 0 on")
-RATE = Number("number", click.FLOAT, lambda rate: math.isfinite(rate) and rate > 0, "a number above 0")
+SEED = click.IntRange(0, 2**32 - 1)
+COUNT = click.IntRange(min=1)
+COUNT_OR_NONE = click.IntRange(min=0)
+RATE = _Rate(min=0, max=math.inf, min_open=True, max_open=True)
 
 
 def version_option(command: Any) -> Any:
-    """`--version`: the same for each program."""
+    """Add `--version`, which prints the version of the installed package."""
     return click.version_option(package_name="icrl4aht-data", message="%(package)s %(version)s")(command)
 
 
@@ -200,9 +191,9 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems 
 
 
 def filter_options(command: Any) -> Any:
-    """The options that select histories."""
+    """Add the options that select histories."""
     options = [
-        click.option("--layout", multiple=True, type=LAYOUT, help="Only this layout; again for more."),
+        click.option("--layout", multiple=True, type=LAYOUT, help="Only this layout; repeat it for more."),
         click.option("--split", multiple=True, type=SPLIT, help="Only this split: train, test or heldout."),
         click.option("--track", multiple=True, type=TRACK, help="Only this track: teammate or layout."),
         click.option(
@@ -218,47 +209,46 @@ def filter_options(command: Any) -> Any:
 
 
 def examples(*lines: str) -> str:
-    """An epilog of command lines."""
+    """Return a help epilog that shows command lines."""
     return "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)])
 
 
 @contextmanager
 def bars(quiet: bool = False, of_bytes: bool = False) -> Iterator[Callable[..., None]]:
-    """Progress of several things, on a terminal only: call what is given with a name, how many are done, of how many,
-    and maybe a note.
+    """Show progress bars on a terminal; yields a function `show(name, done, total, note="")`, one bar for each name.
 
     Args:
         quiet: show nothing.
-        of_bytes: what is counted are bytes: show them, and their speed.
+        of_bytes: the numbers are bytes: show sizes and speed.
     """
     console, running = Console(stderr=True), {}
     columns = (*Progress.get_default_columns(), *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()))
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as shown:
 
-        def show(what: str, done: int, of: int | None, note: str = "") -> None:
-            if what not in running:
-                running[what] = shown.add_task(what, total=of)
-            shown.update(running[what], completed=done, total=of, description=f"{what}{note}")
+        def show(name: str, done: int, total: int | None, note: str = "") -> None:
+            if name not in running:
+                running[name] = shown.add_task(name, total=total)
+            shown.update(running[name], completed=done, total=total, description=f"{name}{note}")
 
         yield show
 
 
-def counted(show: Callable[..., None], what: str, of: int) -> Callable[[int], None]:
-    """For who says how many more are done, from any thread: the same bar, from 0 on."""
-    total, lock = 0, threading.Lock()
+def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
+    """Return a function that advances the bar `name` of `bars` by a number; any thread may call it."""
+    done, lock = 0, threading.Lock()
 
-    def more(number: int) -> None:
-        nonlocal total
+    def advance(number: int) -> None:
+        nonlocal done
         with lock:
-            total += number
-            show(what, total, of)
+            done += number
+            show(name, done, total)
 
-    more(0)
-    return more
+    advance(0)
+    return advance
 
 
 def run(command: click.Command) -> None:
-    """Run a command line; what is wrong with the input becomes one line and an exit code."""
+    """Run a command line; errors about its input become one line and an exit code."""
     try:
         command()
     except BrokenPipeError:
@@ -270,8 +260,6 @@ def run(command: click.Command) -> None:
     except OSError as error:
         _stop(_in_words(error), 1)
     except ModuleNotFoundError as error:
-        from icrl4aht_data.commands.requirements import PACKAGE, extra_with
-
         extra = extra_with(error.name or "")
         if extra is None:
             raise
@@ -284,7 +272,7 @@ def _stop(message: str, code: int) -> None:
 
 
 def _in_words(error: OSError) -> str:
-    """With the name that the user knows: not that of a file or a lock beside it, under which it is written first."""
+    """Return the message with the user's name of the file, not that of the temporary file or lock next to it."""
     if error.errno is None or error.filename is None:
         return str(error)
     path = Path(os.fsdecode(error.filename))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Mapping
 from pathlib import Path
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
@@ -54,9 +55,15 @@ def read_manifest(folder: Path) -> dict[str, str]:
     return parse_manifest(read_text(path), path)
 
 
-def write_manifest(root: Path) -> None:
-    """MANIFEST.sha256 over every other file of the folder."""
-    files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != MANIFEST)
-    lines = [f"{file_hash(path)}  {path.relative_to(root).as_posix()}\n" for path in files]
+def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
+    """Write MANIFEST.sha256 over every other file of a folder.
+
+    Args:
+        root: the folder.
+        known: file -> SHA-256 of files that need not be read.
+    """
+    known = known or {}
+    names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
     with atomic_write(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")

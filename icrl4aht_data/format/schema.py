@@ -49,7 +49,7 @@ CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("c
 """One line of a chunk table: where the stored bytes are, how many of the chunk's rows are the history's (the last chunk
 is padded), and the checksum of the stored bytes. What lies between the chunks follows in lines of 0 rows, so that every
 byte of a shard stands in its table once. Chunks stand in the order of histories, then of `FIELDS`, then of
-chunks. In the file a history's chunks stand by time, so that a window is one range of bytes: `shard_writer.in_time`."""
+chunks. In the file a history's chunks stand by time, so that a window is one range of bytes, see `shard_writer`."""
 
 
 @dataclass(frozen=True)

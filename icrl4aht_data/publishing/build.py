@@ -1,4 +1,4 @@
-"""A release made ready for other people: card, pictures, Parquet index and Croissant beside its data."""
+"""Preparation of a release for publication: card, figures, Parquet index and Croissant added to its data."""
 
 from __future__ import annotations
 
@@ -19,26 +19,30 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.schema import INFO, MANIFEST, TEAMMATES
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.paths import files_below
 from icrl4aht_data.utils.templates import card_file, fill
 from icrl4aht_data.writing.dataset_card import (
-    CURVES,
-    HEADROOM,
-    LAYOUTS,
-    PROTOCOL,
+    CURVES_FIGURE,
+    HEADROOM_FIGURE,
+    HEADROOM_PROTOCOL,
+    LAYOUTS_FIGURE,
+    PARQUET_INDEX,
+    RELEASE_CARD,
     SOURCE_CARD,
-    TWIN,
     dataset_card,
     evaluated_on,
 )
 from icrl4aht_data.writing.parquet import to_parquet
-from icrl4aht_data.writing.release import CARD
 from icrl4aht_data.writing.release_folder import atomic_folder
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
 _POLICY = "policy.json"
+_LIBRARIES = {"matplotlib": "plot", "PIL": "plot", "pyarrow": "hf", "mlcroissant": "hf"}
+"""Modules that building needs, and the extras that install them."""
 
 
 def build_release(
@@ -49,72 +53,73 @@ def build_release(
     published: datetime.date | None = None,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Path:
-    """Write a release folder that holds everything of another, and what a published one has beside it.
+    """Write a release folder with the data of another, and the files that a published release has in addition.
 
     Args:
         source: a release folder; the bundled mini release by default.
-        target: the folder to make; a release that is there is replaced when the new one is complete.
-        link: take the files of `source` by hard links, which costs no space: then whoever changes a file in place
-            changes it in both.
+        target: the folder to write; a release there is replaced when the new one is complete.
+        link: hard-link the files of `source` instead of copying them, which saves space; editing one in place then
+            changes both.
         published: the date for Croissant; today by default.
-        advance: progress, of verifying and of copying.
+        advance: progress of verifying and of copying.
 
     Raises:
-        OptionError: if `target` is `source` or no release, or if matplotlib, Pillow or pyarrow is not installed.
-        ReleaseError: if `source` is not whole; names the first problems.
+        OptionError: if `target` is `source` or exists and is not a release, or if a library is not installed.
+        ReleaseError: if `source` is not valid; names the first problems.
     """
     source = (MINI if source is None else source).resolve()
     if target.resolve() == source:
         raise OptionError(f"{target}: the release itself; give another folder")
-    missing = [name for name in ("matplotlib", "PIL", "pyarrow") if find_spec(name) is None]
+    missing = [name for name in _LIBRARIES if find_spec(name) is None]
     if missing:
         raise OptionError(f"building a release needs {', '.join(missing)}: pip install 'icrl4aht-data[plot,hf]'")
-    check_whole(source, advance)
+    check_valid(source, advance)
     kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
     with atomic_folder(target) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
-            _take(source / name, root / name, link)
+            _copy(source / name, root / name, link)
             advance("copying", number, len(kept))
         _keep_source_card(source, root)
-        _add_pictures_and_twin(load_icrl4aht(root), root)
+        _add_figures_and_parquet(load_icrl4aht(root), root)
         for folder in sorted((root / TEAMMATES).glob("*/")):
-            (folder / CARD).write_text(teammate_card(folder), encoding="utf-8")
+            (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
         for name in _COPIED_TEXTS:
             shutil.copyfile(card_file(name), root / name)
-        (root / CARD).write_text(dataset_card(root), encoding="utf-8")
-        new = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()} - kept.keys()
-        digests = kept | {name: file_hash(root / name) for name in new}
+        (root / RELEASE_CARD).write_text(dataset_card(root), encoding="utf-8")
+        digests = {name: file_hash(root / name) for name in files_below(root)}
+        for name, digest in kept.items():
+            if digests.get(name) != digest:
+                raise ReleaseError(f"{source / name}: changed while it was copied, sha256 now {digests.get(name)}")
         today = datetime.datetime.now(datetime.UTC).date()
         write_json(root / CROISSANT, croissant(root, digests, published or today))
-        write_manifest(root)
-        _check_same(source, root, kept)
+        write_manifest(root, digests)
     return target
 
 
-def check_whole(root: Path, advance: NamedProgress = lambda what, done, total: None) -> None:
+def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: None) -> None:
     """Verify a release.
 
     Raises:
-        ReleaseError: if anything is wrong; names the first problems.
+        ReleaseError: if there is any problem; names the first ones.
     """
     if not (root / INFO).exists() and not (root / MANIFEST).exists():
-        read_info(root)  # says what to give instead
+        read_info(root)  # raises an error that suggests other folders
     report = verify_release(root, advance=advance)
     if not report.ok:
         first = "; ".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:3])
         more = f"; and {len(report.findings) - 3} more" if len(report.findings) > 3 else ""
-        raise ReleaseError(f"{root}: not whole: {first}{more}; see `icrl4aht-data verify`")
+        raise ReleaseError(f"{root}: not valid: {first}{more}; see `icrl4aht-data verify`")
 
 
 def teammate_card(folder: Path) -> str:
-    """README.md of a learned teammate, of what its policy.json says.
+    """Return the README.md of a learned teammate, made from its policy.json.
 
     Args:
         folder: `teammates/<sha256>` of a release.
 
     Raises:
-        IndexFormatError: if policy.json is missing or says not what a teammate's does; names the file.
+        IndexFormatError: if policy.json is missing or does not describe a teammate; names the file.
     """
     path = folder / _POLICY
     try:
@@ -129,7 +134,7 @@ def teammate_card(folder: Path) -> str:
             checkpoint=f"{facts['checkpoint']:d}",
             step=f"{facts['step']:,d}",
             sha256=folder.name,
-            seats=", ".join(f"{seat:d}" for seat in facts["seats"]),
+            seats=", ".join(f"{slot:d}" for slot in facts["seats"]),
             own_return=f"{facts['return']:.1f}",
             teammate_return=f"{facts['teammate_return']:.1f}",
             seed=f"{facts['seed']:d}",
@@ -142,13 +147,13 @@ def teammate_card(folder: Path) -> str:
 
 
 def _is_made_here(name: str) -> bool:
-    """Whether a file is one that building makes anew."""
+    """Return whether building writes a file, so that the source's version is not copied."""
     top, _, rest = name.partition("/")
-    is_teammates_card = top == TEAMMATES and rest.endswith(f"/{CARD}")
-    return name in (CARD, CROISSANT, *_COPIED_TEXTS) or top in ("figures", TWIN) or is_teammates_card
+    is_teammate_card = top == TEAMMATES and rest.endswith(f"/{RELEASE_CARD}")
+    return name in (RELEASE_CARD, CROISSANT, *_COPIED_TEXTS) or top in ("figures", PARQUET_INDEX) or is_teammate_card
 
 
-def _take(source: Path, target: Path, link: bool) -> None:
+def _copy(source: Path, target: Path, link: bool) -> None:
     if link:
         with suppress(OSError):  # another file system, or one without hard links
             os.link(source, target)
@@ -157,30 +162,20 @@ def _take(source: Path, target: Path, link: bool) -> None:
 
 
 def _keep_source_card(source: Path, root: Path) -> None:
-    """Keep a card that was not made by filling the template, which begins with YAML, unless one is kept already."""
-    text = read_text(source / CARD) if (source / CARD).is_file() else ""
+    """Keep a card that does not come from the template, which starts with YAML, unless one is kept already."""
+    text = read_text(source / RELEASE_CARD) if (source / RELEASE_CARD).is_file() else ""
     if text and not text.startswith("---\n") and not (root / SOURCE_CARD).exists():
         (root / SOURCE_CARD).write_text(text, encoding="utf-8")
 
 
-def _add_pictures_and_twin(dataset: Dataset, root: Path) -> None:
-    from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
-
-    (root / CURVES).parent.mkdir()
-    plot_layout_curves(dataset, root / CURVES)
-    plot_layouts(dataset.layouts, root / LAYOUTS)
+def _add_figures_and_parquet(dataset: Dataset, root: Path) -> None:
+    (root / CURVES_FIGURE).parent.mkdir()
+    plot_layout_curves(dataset, root / CURVES_FIGURE)
+    plot_layouts(dataset.layouts, root / LAYOUTS_FIGURE)
     tested = evaluated_on(layout.name for layout in dataset.layouts)
-    plot_headroom(read_headroom(PROTOCOL), tested, root / HEADROOM)
+    plot_headroom(read_headroom(HEADROOM_PROTOCOL), tested, root / HEADROOM_FIGURE)
     for layout in dataset.layouts:
-        of_layout = dataset.filter(layout=layout.name)
-        (root / TWIN / layout.name).mkdir(parents=True)
-        for split in {entry.split for entry in of_layout.entries}:
-            to_parquet(of_layout.filter(split=split), root / TWIN / layout.name / f"{split}.parquet")
-
-
-def _check_same(source: Path, root: Path, kept: dict[str, str]) -> None:
-    """Whether what was copied is what was verified."""
-    found = read_manifest(root)
-    changed = [name for name, digest in kept.items() if found.get(name) != digest]
-    if changed:
-        raise ReleaseError(f"{source / changed[0]}: changed while it was copied, sha256 now {found.get(changed[0])}")
+        histories = dataset.filter(layout=layout.name)
+        (root / PARQUET_INDEX / layout.name).mkdir(parents=True)
+        for split in {entry.split for entry in histories.entries}:
+            to_parquet(histories.filter(split=split), root / PARQUET_INDEX / layout.name / f"{split}.parquet")

@@ -1,4 +1,4 @@
-"""A release folder -> a dataset repository of the Hugging Face Hub, read back and tagged with its data version."""
+"""Upload of a release folder to a dataset repository of the Hugging Face Hub, compared afterwards and tagged."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError, UploadError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.publishing.build import check_whole
+from icrl4aht_data.publishing.build import check_valid
 from icrl4aht_data.utils.hashes import file_hash, git_hash
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
     from huggingface_hub.hf_api import RepoFile
 
-_HUBS_OWN = ".gitattributes"  # which the Hub puts into every repository
+_HUB_FILE = ".gitattributes"  # the Hub adds it to every repository
 _KIND = "dataset"
 
 
@@ -32,18 +32,18 @@ class _File(NamedTuple):
 
 @dataclass(frozen=True)
 class Upload:
-    """What `upload_release` did, or would do.
+    """The result, or the plan, of `upload_release`.
 
     Args:
         repo: ORG/REPO.
-        tag: the data version's.
+        tag: the data version's tag.
         done: "already there" if the tag has this content; otherwise "uploaded", or "nothing" in a dry run.
         creates: whether the repository is new.
-        private: as it was asked for.
-        files: path -> bytes, of the whole release.
-        deletes: files of another version that the repository no longer has beside those.
-        commit: that has the tag; None in a dry run.
-        url: where people see it.
+        private: whether a private repository was requested.
+        files: path -> bytes, of the complete release.
+        deletes: files of another version, which are removed from the repository.
+        commit: the tagged commit; None in a dry run.
+        url: address of the repository's page.
     """
 
     repo: str
@@ -60,7 +60,7 @@ class Upload:
         return asdict(self) | {"bytes": sum(self.files.values())}
 
     def in_words(self) -> list[str]:
-        """Lines for people: in a dry run every file, otherwise what there is now."""
+        """Return lines for people: in a dry run every file, otherwise a summary."""
         total = f"{len(self.files)} files, {sum(self.files.values()):,} bytes"
         if self.done != "nothing":
             return [f"{self.url}: {self.done}, {total}; tag {self.tag} is commit {self.commit}"]
@@ -79,38 +79,40 @@ def upload_release(
     show: bool = False,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Upload:
-    """Upload a release, compare what the repository then holds with its manifest, and tag that commit.
+    """Upload a release, compare the repository's content with its manifest, and tag that commit.
 
-    What is there already is not sent again, so that the same call goes on with an upload that was cut off.
+    Files that are in the repository already are not sent again, so that the same call resumes an interrupted upload.
 
     Args:
         folder: the release; it is verified first.
-        address: hf://datasets/ORG/REPO; the repository is made if there is none.
-        private: make a new repository private, and take an existing one only if it is.
-        dry_run: look, and change nothing.
-        show: the client's progress bars.
+        address: hf://datasets/ORG/REPO; a missing repository is created.
+        private: make a new repository private, and accept an existing one only if it is private.
+        dry_run: change nothing.
+        show: show the client's progress bars.
         advance: progress of verifying.
 
     Raises:
-        ReleaseError: if the release is not whole.
-        OptionError: if the address is none.
+        ReleaseError: if the release is not valid.
+        OptionError: if the address has another form.
         UploadError: if the Hub refuses or cannot be reached, the tag has other content, the repository has files that
-            are no release's, or what it holds in the end differs from the manifest.
+            belong to no release, or its content differs from the manifest after the upload.
     """
-    repo = _repo_of(address)
     from huggingface_hub import HfApi
 
-    check_whole(folder, advance)
+    repo = _repo_of(address)
+    check_valid(folder, advance)
     manifest = read_manifest(folder) | {MANIFEST: file_hash(folder / MANIFEST)}
     files = {name: _File((folder / name).stat().st_size, digest) for name, digest in manifest.items()}
     tag = f"v{read_info(folder).data_version}"
     api = HfApi()
-    with _explained(repo, api.endpoint), _bars_shown(show):
-        return _Uploading(api, folder, repo, tag, files).run(private, dry_run)
+    with _wrap_hub_errors(repo, api.endpoint), _progress_bars(show):
+        return _Uploader(api, folder, repo, tag, files).run(private, dry_run)
 
 
 @dataclass
-class _Uploading:
+class _Uploader:
+    """One upload; `files` has the size and hash of every file of the release."""
+
     api: HfApi
     folder: Path
     repo: str
@@ -145,8 +147,8 @@ class _Uploading:
         differences = self._differences(self._tree(commit))
         if differences:
             raise UploadError(
-                f"{self.repo}: after the upload, commit {commit} is not the release: {_some(differences)}; it got no "
-                "tag; go on with the same command"
+                f"{self.repo}: after the upload, commit {commit} is not the release: {_some(differences)}; it was "
+                "not tagged; run the same command again"
             )
         self.api.create_tag(self.repo, tag=self.tag, revision=commit, repo_type=_KIND)
         return self._upload("uploaded", creates=tags is None, private=private, deletes=foreign, commit=commit)
@@ -165,7 +167,7 @@ class _Uploading:
         return Upload(self.repo, self.tag, done, creates, private, sizes, deletes or [], commit, url)
 
     def _tags(self) -> dict[str, str] | None:
-        """Tag -> commit; None if there is no such repository."""
+        """Return tag -> commit; None if there is no such repository."""
         from huggingface_hub.errors import RepositoryNotFoundError
 
         try:
@@ -175,17 +177,17 @@ class _Uploading:
         return {reference.name: reference.target_commit for reference in refs.tags}
 
     def _tree(self, revision: str) -> dict[str, RepoFile]:
-        """Path -> what the Hub knows of the file."""
+        """Return path -> the Hub's size and hashes of the file."""
         from huggingface_hub.hf_api import RepoFile
 
         listed = self.api.list_repo_tree(self.repo, recursive=True, revision=revision, repo_type=_KIND)
-        return {entry.path: entry for entry in listed if isinstance(entry, RepoFile) and entry.path != _HUBS_OWN}
+        return {entry.path: entry for entry in listed if isinstance(entry, RepoFile) and entry.path != _HUB_FILE}
 
     def _foreign(self) -> list[str]:
-        """The files of the repository that are another version's.
+        """Return the files of the repository that belong to another version of the release.
 
         Raises:
-            UploadError: if there are files that no manifest of ours has listed.
+            UploadError: if there are files that the repository's manifest does not list.
         """
         tree = self._tree("main")
         foreign = sorted(tree.keys() - self.files.keys())
@@ -196,24 +198,24 @@ class _Uploading:
         unknown = [name for name in foreign if name not in listed]
         if unknown:
             raise UploadError(
-                f"{self.repo}: holds {len(unknown)} files that are no release's, such as {unknown[0]}: expected an "
+                f"{self.repo}: has {len(unknown)} files that belong to no release, such as {unknown[0]}: expected an "
                 "empty repository or one with a release; remove them, or give another repository"
             )
         return foreign
 
     def _differences(self, tree: Mapping[str, RepoFile]) -> list[str]:
-        """In what a tree of the repository is not the release."""
+        """Return the differences between a tree of the repository and the release."""
         found = [f"{name}: not in the release" for name in sorted(tree.keys() - self.files.keys())]
         for name, file in self.files.items():
-            there = tree.get(name)
-            if there is None:
+            remote = tree.get(name)
+            if remote is None:
                 found.append(f"{name}: missing")
-            elif there.size != file.size:
-                found.append(f"{name}: expected {file.size} bytes, found {there.size}")
-            elif there.lfs is not None and there.lfs.sha256 != file.sha256:
-                found.append(f"{name}: expected sha256 {file.sha256}, found {there.lfs.sha256}")
-            elif there.lfs is None and there.blob_id != (blob := git_hash((self.folder / name).read_bytes())):
-                found.append(f"{name}: expected git's blob {blob}, found {there.blob_id}")
+            elif remote.size != file.size:
+                found.append(f"{name}: expected {file.size} bytes, found {remote.size}")
+            elif remote.lfs is not None and remote.lfs.sha256 != file.sha256:
+                found.append(f"{name}: expected sha256 {file.sha256}, found {remote.lfs.sha256}")
+            elif remote.lfs is None and remote.blob_id != (blob := git_hash((self.folder / name).read_bytes())):
+                found.append(f"{name}: expected git's blob {blob}, found {remote.blob_id}")
         return found
 
 
@@ -230,8 +232,8 @@ def _some(differences: list[str]) -> str:
 
 
 @contextmanager
-def _bars_shown(show: bool) -> Iterator[None]:
-    """Progress bars of huggingface_hub only where they are asked for."""
+def _progress_bars(show: bool) -> Iterator[None]:
+    """Show progress bars of huggingface_hub only if `show`."""
     from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
     if show or are_progress_bars_disabled():
@@ -245,8 +247,8 @@ def _bars_shown(show: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _explained(repo: str, endpoint: str) -> Iterator[None]:
-    """Errors of the Hub's client as ours, which name the repository, what happened, and what to do."""
+def _wrap_hub_errors(repo: str, endpoint: str) -> Iterator[None]:
+    """Raise errors of the Hub's client as `UploadError`, which names the repository, the cause and a remedy."""
     from huggingface_hub.errors import HTTPError, LocalTokenNotFoundError  # pyright: ignore[reportPrivateImportUsage]
 
     try:
@@ -256,11 +258,11 @@ def _explained(repo: str, endpoint: str) -> Iterator[None]:
     except (HTTPError, OSError, RuntimeError, ValueError) as error:
         cause = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error
         status = getattr(getattr(cause, "response", None), "status_code", None)
-        remedy = "what was sent stays there: go on with the same command"
+        remedy = "files sent so far are kept: run the same command to resume"
         if status in (401, 403) or isinstance(cause, (LocalTokenNotFoundError, PermissionError)):
             remedy = f"expected a token that may write to {repo.split('/')[0]}: `hf auth login`, or set HF_TOKEN"
         elif isinstance(cause, ValueError):
-            remedy = "correct it, then give the same command"
+            remedy = "correct it, then run the same command"
         lines = [line.strip() for line in str(cause).splitlines()]
         text = " ".join(line for line in lines if line and not line.startswith("For more information"))
         raise UploadError(f"{repo} at {endpoint}: {text or repr(cause)}; {remedy}") from error

@@ -1,4 +1,4 @@
-"""TODO."""
+"""The index as a Parquet file."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ from pathlib import Path
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import (
-    JSON_TYPES,
-)
+from icrl4aht_data.format.schema import JSON_TYPES
 from icrl4aht_data.utils.files import atomic_write
 
 
 def to_parquet(dataset: Dataset, path: Path) -> Path:
-    """The selection's index as a Parquet file, one row a history. Needs pyarrow, which the extra `hf` brings.
+    """Write the selection's index as a Parquet file, one row per history. Needs pyarrow, of the extra `hf`.
 
     Raises:
         OptionError: if pyarrow is not installed.

@@ -1,4 +1,12 @@
-"""TODO."""
+"""Conversion from and to the two files of the published code.
+
+The published code keeps all histories in `histories.h5`, one group each, with observations as float32 in gzip-6 chunks
+of 4096 steps and action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3).
+Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl` and `provenance.json`, which
+the published readers ignore; converted back they lose only the checkpoints of learned teammates. Files without states,
+which observations do not determine, become a release of observations; files without tasks one that knows its tasks by
+name.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +14,11 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -16,6 +26,7 @@ from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_ta
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
 from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.safe_hdf5 import exists, member, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
@@ -33,20 +44,14 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_lines, write_json
 from icrl4aht_data.utils.paths import resolve_inside
 from icrl4aht_data.utils.validation import check_int
-from icrl4aht_data.writing.combine import Deferred
-from icrl4aht_data.writing.convert import HistoriesDone, _quiet
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-
-if TYPE_CHECKING:
-    import h5py
+from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
 """File names of the published code."""
 
-
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
-
 
 PUBLISHED_FIELDS = (
     "history_id",
@@ -66,23 +71,10 @@ PUBLISHED_FIELDS = (
 )
 """Fields of an index line (paper, App. D.3)."""
 
-
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)
 
-
 FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
-"""Action id of the published files -> ours."""
-
-
-@contextmanager
-def _errors_as(what: str) -> Iterator[None]:
-    """What h5py raises for a file of others, which may be anything, as ours."""
-    try:
-        yield
-    except Icrl4ahtError:
-        raise
-    except Exception as error:
-        raise PublishedFormatError(f"{what}: {error}") from error
+"""int32 (6,): action id of the published files -> action id of this package."""
 
 
 def to_published(
@@ -91,13 +83,13 @@ def to_published(
     *,
     chunk: int = PUBLISHED_CHUNK,
     states: bool = True,
-    advance: HistoriesDone = _quiet,
+    advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
-    """The selection as the published code's two files, numbered anew from 0.
+    """Write a selection as the published code's two files, its histories numbered from 0.
 
     Args:
-        dataset: all of a release, or a part.
-        target: the folder to make.
+        dataset: a release, or a part of one.
+        target: the folder to write; nothing or an empty folder may be there.
         chunk: steps per chunk.
         states: also store the state records, if there are any: without them `from_published` makes a release of
             observations.
@@ -106,16 +98,14 @@ def to_published(
     Raises:
         OptionError: if `target` exists and is not empty.
     """
-    import h5py
-
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise OptionError(f"{target}: exists; give a new folder")
-    partial = target.with_name(f".{target.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    folder = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
     try:
-        with h5py.File(partial / HISTORIES_H5, "w") as file, (partial / HISTORIES_INDEX).open("w") as index:
+        with h5py.File(folder / HISTORIES_H5, "w") as file, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = file.create_group(f"/{number}")
                 for field in history.entry.stored_fields(kind):
@@ -126,16 +116,15 @@ def to_published(
         wanted = {entry.task_id for entry in dataset.entries}
         tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in wanted]
         if tasks:
-            write_tasks(partial / "tasks.jsonl", tasks)
+            write_tasks(folder / "tasks.jsonl", tasks)
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
-        write_json(
-            partial / "provenance.json", {name: value.to_json() for name, value in provenance.items() if name in wanted}
-        )
+        kept = {task_id: of_task.to_json() for task_id, of_task in provenance.items() if task_id in wanted}
+        write_json(folder / "provenance.json", kept)
         if target.exists():
             target.rmdir()
-        partial.rename(target)
+        folder.rename(target)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
     return target
 
 
@@ -156,95 +145,65 @@ def from_published(
     tasks: Path | None = None,
     data_version: str = "0.1.0",
     kept_steps: int = KEPT_STEPS,
-    advance: HistoriesDone = _quiet,
+    advance: HistoryProgress = lambda done, total: None,
 ) -> Kind:
-    """A release from a folder with the published code's two files.
+    """Write a release from a folder with the published code's two files.
 
     Args:
         source: a folder with `histories.h5` and `histories_index.jsonl`.
-        target: the folder to make; a release that is there is replaced.
+        target: the folder to write; a release there is replaced.
         kind: by default "lite" if the groups have state records, "observations" if none has.
         tasks: a JSONL file with the tasks that the index names; by default `tasks.jsonl` in `source`. A release of
-            observations may do without: it then knows of its tasks what the index says.
-        data_version: SemVer of the data.
+            observations can be made without: it knows of its tasks what the index says.
+        data_version: version of the data, SemVer.
         kept_steps: steps of every episode; an unfinished one may end a history.
         advance: progress.
 
     Returns:
-        The kind of release that was made.
+        The kind of the release.
 
     Raises:
-        PublishedFormatError: if a file is missing or malformed, or a group lacks what a release of that kind is made
-            of; names file and group.
+        PublishedFormatError: if a file is missing or malformed, or a group has no array that a release of that kind
+            needs; names file and group.
     """
-    import h5py
-
     kept_steps = check_int("kept_steps", kept_steps, 1)
     lines = _read_index(resolve_inside(source, HISTORIES_INDEX))
-    noted = resolve_inside(source, "provenance.json")
-    provenance = read_provenance(noted) if noted.is_file() else {}
-    done = iter(range(1, len(lines) + 1))
+    provenance_path = resolve_inside(source, "provenance.json")
+    provenance = read_provenance(provenance_path) if provenance_path.is_file() else {}
+    numbers = iter(range(1, len(lines) + 1))
     path = resolve_inside(source, HISTORIES_H5)
-    with _errors_as(f"{path}: cannot be opened as HDF5"):
+    with _wrap_errors(f"{path}: cannot be opened as HDF5"):
         file = h5py.File(path, "r")
 
-    def load(members: list[_Group]) -> Iterator[NewHistory]:
-        for group in members:
-            yield NewHistory(group.line["env_idx"], Deferred(group.names, group.read))
-            advance(next(done), len(lines))
+    def load(groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
+        for group in groups:
+            yield NewHistory(group.line["env_idx"], LazyArrays(group.field_names(), group.read))
+            advance(next(numbers), len(lines))
 
     with file:
-        made: Kind = kind or _kind_of(file, lines)
-        groups = [_Group(file, line, made, kept_steps) for line in lines]
+        found: Kind = kind or _stored_kind(file, lines)
+        histories = [_PublishedHistory(file, line, found, kept_steps) for line in lines]
+        for history in histories:
+            history.check_arrays()
         new = [
             NewTask(
                 task, provenance.get(task.task_id, Provenance()), len(members), lambda members=members: load(members)
             )
-            for task, members in _tasks_of(groups, source, tasks, made)
+            for task, members in _tasks(histories, source, tasks, found)
         ]
-        write_release(target, made, new, data_version=data_version, kept_steps=kept_steps)
-    return made
+        write_release(target, found, new, data_version=data_version, kept_steps=kept_steps)
+    return found
 
 
-def _kind_of(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
-    """Lite if every group has states, observations if none has."""
-    from icrl4aht_data.format.safe_hdf5 import exists
-
-    with _errors_as(f"{file.filename}: cannot be read"):
-        groups = [line["h5_group"] for line in lines if exists(file, line["h5_group"])]
-        lacking = [group for group in groups if not exists(file, f"{group}/state")]
-    if 0 < len(lacking) < len(groups):
-        raise PublishedFormatError(
-            f"{file.filename}, group {lacking[0]}: lacks state, which other groups have; leave them all out with "
-            f"`convert --to observations`"
-        )
-    return OBSERVATIONS if lacking else "lite"
-
-
-def _tasks_of(groups: list[_Group], source: Path, path: Path | None, kind: Kind) -> list[tuple[Task, list[_Group]]]:
-    """The tasks that the index names, in its order, with their histories."""
-    by_task: dict[str, list[_Group]] = {}
-    for group in groups:
-        by_task.setdefault(group.line["task_id"], []).append(group)
-    found = path or resolve_inside(source, "tasks.jsonl")
-    if found.is_file():
-        known = {task.task_id: task for task in read_tasks(found)}
-    elif kind == OBSERVATIONS and path is None:
-        known = {name: named_task(members[0].line) for name, members in by_task.items()}
-    else:
-        raise PublishedFormatError(f"{found}: missing; give a file with the tasks that the index names")
-    absent = by_task.keys() - known.keys()
-    if absent:
-        raise PublishedFormatError(f"{found}: lacks {len(absent)} tasks of the index, such as {min(absent)!r}")
-    for group in groups:
-        task, line = known[group.line["task_id"]], named_task(group.line)
-        one, two = ((t.track, t.split, t.layout.name, t.teammate_family, t.teammate_kind) for t in (line, task))
-        if one != two:
-            raise PublishedFormatError(
-                f"{source / HISTORIES_INDEX}: history {group.line['history_id']} is of {one}, its task "
-                f"{task.task_id!r} of {two}; mend the index or the tasks"
-            )
-    return [(known[name], members) for name, members in by_task.items()]
+@contextmanager
+def _wrap_errors(what: str) -> Iterator[None]:
+    """Raise errors of h5py, which a damaged file makes raise anything, as `PublishedFormatError`."""
+    try:
+        yield
+    except Icrl4ahtError:
+        raise
+    except Exception as error:
+        raise PublishedFormatError(f"{what}: {error}") from error
 
 
 def _read_index(path: Path) -> list[dict[str, Any]]:
@@ -254,7 +213,7 @@ def _read_index(path: Path) -> list[dict[str, Any]]:
             line = parse_json(text)
             missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
             if missing:
-                raise PublishedFormatError(f"lacks the fields {sorted(missing)}")
+                raise PublishedFormatError(f"missing the fields {sorted(missing)}")
             for name in PUBLISHED_FIELDS:
                 check_value(name, line[name])
             named_task(line)
@@ -266,75 +225,131 @@ def _read_index(path: Path) -> list[dict[str, Any]]:
     return lines
 
 
-class _Group:
-    """One history of the published file; its arrays are read, checked and put in our form when they are asked for."""
+def _stored_kind(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
+    """Return "lite" if every group has states, "observations" if none has."""
+    with _wrap_errors(f"{file.filename}: cannot be read"):
+        groups = [line["h5_group"] for line in lines if exists(file, line["h5_group"])]
+        without = [group for group in groups if not exists(file, f"{group}/state")]
+    if 0 < len(without) < len(groups):
+        raise PublishedFormatError(
+            f"{file.filename}, group {without[0]}: missing state, which other groups have; convert without states by "
+            f"`convert --to observations`"
+        )
+    return OBSERVATIONS if without else "lite"
 
-    def __init__(self, file: h5py.File, line: dict[str, Any], kind: Kind, kept_steps: int) -> None:
-        """Looks which arrays are there.
+
+def _tasks(
+    histories: list[_PublishedHistory], source: Path, path: Path | None, kind: Kind
+) -> list[tuple[Task, list[_PublishedHistory]]]:
+    """Return the tasks that the index names, in its order, with their histories."""
+    by_task: dict[str, list[_PublishedHistory]] = {}
+    for history in histories:
+        by_task.setdefault(history.line["task_id"], []).append(history)
+    found = path or resolve_inside(source, "tasks.jsonl")
+    if found.is_file():
+        known = {task.task_id: task for task in read_tasks(found)}
+    elif kind == OBSERVATIONS and path is None:
+        known = {name: named_task(members[0].line) for name, members in by_task.items()}
+    else:
+        raise PublishedFormatError(f"{found}: missing; give a file with the tasks that the index names")
+    absent = by_task.keys() - known.keys()
+    if absent:
+        raise PublishedFormatError(f"{found}: missing {len(absent)} tasks of the index, such as {min(absent)!r}")
+    for history in histories:
+        task, line = known[history.line["task_id"]], named_task(history.line)
+        one, two = ((t.track, t.split, t.layout.name, t.teammate_family, t.teammate_kind) for t in (line, task))
+        if one != two:
+            raise PublishedFormatError(
+                f"{source / HISTORIES_INDEX}: history {history.line['history_id']} is of {one}, its task "
+                f"{task.task_id!r} of {two}; correct the index or the tasks"
+            )
+    return [(known[name], members) for name, members in by_task.items()]
+
+
+@dataclass(frozen=True)
+class _PublishedHistory:
+    """One history of the published file; its arrays are read, checked and converted on access.
+
+    Args:
+        file: the open file.
+        line: its index line.
+        kind: kind of the release to write.
+        kept_steps: steps of every episode.
+    """
+
+    file: h5py.File
+    line: dict[str, Any]
+    kind: Kind
+    kept_steps: int
+
+    @property
+    def where(self) -> str:
+        """File and group, for messages."""
+        return f"{self.file.filename}, group {self.line['h5_group']}"
+
+    def field_names(self) -> list[str]:
+        """Return the names of the arrays that the release takes."""
+        return [f.name for f in held_fields(self.kind) if self.kind not in f.optional or self.line[f"has_{f.name}"]]
+
+    def check_arrays(self) -> None:
+        """Check that the group has the arrays that the release takes, and observations.
 
         Raises:
-            PublishedFormatError: if one that a release of that kind takes is missing.
+            PublishedFormatError: names the group and the missing arrays.
         """
-        from icrl4aht_data.format import safe_hdf5 as hdf5
-
-        self._file, self.line, self._kept_steps = file, line, kept_steps
-        self._layout = get_layout(line["layout"])
-        self._where = f"{file.filename}, group {line['h5_group']}"
-        with _errors_as(f"{self._where}: cannot be read"):
-            group = hdf5.member(file, line["h5_group"]) if hdf5.exists(file, line["h5_group"]) else None
-            here = set() if group is None else {name for name in ("obs", *FIELDS) if hdf5.exists(group, name)}
+        name = self.line["h5_group"]
+        with _wrap_errors(f"{self.where}: cannot be read"):
+            group = member(self.file, name) if exists(self.file, name) else None
+            present = set() if group is None else {name for name in ("obs", *FIELDS) if exists(group, name)}
         if not hasattr(group, "keys"):
-            raise PublishedFormatError(f"{self._where}: missing, but the index names it")
-        self.names = [f.name for f in held_fields(kind) if kind not in f.optional or line[f"has_{f.name}"]]
-        missing = [name for name in dict.fromkeys(("obs", *self.names)) if name not in here]
+            raise PublishedFormatError(f"{self.where}: missing, but the index names it")
+        missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
         if missing:
-            remedy = "the index promises it; complete the file or mend the index"
+            remedy = "the index lists it; complete the file or correct the index"
             if "state" in missing:
                 remedy = (
-                    f"a {kind} release is made of state records, which observations do not determine; "
+                    f"a {self.kind} release is made of state records, which observations do not determine; "
                     f"convert with `--to {OBSERVATIONS}`"
                 )
-            raise PublishedFormatError(f"{self._where}: lacks {', '.join(missing)}: {remedy}")
+            raise PublishedFormatError(f"{self.where}: missing {', '.join(missing)}: {remedy}")
 
     def read(self, name: str) -> np.ndarray:
-        """One array: (T, ...), or (E, S) for `episode_end_state`, in the field's compact dtype.
+        """Return one array in the field's compact dtype: (T, ...), or (E, S) for `episode_end_state`.
 
         Raises:
-            PublishedFormatError: names the array, and what was expected and found.
+            PublishedFormatError: names the array, and the expected and found values.
         """
-        from icrl4aht_data.format.safe_hdf5 import member, read_dataset
-
-        field, steps = FIELDS[name], self.line["T"]
-        rows = steps if field.axis == "T" else steps // self._kept_steps
-        expected = (rows, *field.held(self._layout).shape)
-        with _errors_as(f"{self._where}: {name}: {steps} steps on {self._layout.name}"):
-            found = read_dataset(member(self._file, f"{self.line['h5_group']}/{name}"), expected)
-        array = self._whole(name, found)
+        field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
+        rows = steps if field.axis == "T" else steps // self.kept_steps
+        expected = (rows, *field.held(layout).shape)
+        with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
+            found = read_dataset(member(self.file, f"{self.line['h5_group']}/{name}"), expected)
+        array = self._compact(name, found)
         if name in ACTION_FIELDS:
             return FROM_PUBLISHED[array]
-        if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self._kept_steps))):
+        if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self.kept_steps))):
             raise PublishedFormatError(
-                f"{self._where}: dones: expected an end every {self._kept_steps} steps, found {array.sum()} in {steps} "
+                f"{self.where}: dones: expected an end every {self.kept_steps} steps, found {array.sum()} in {steps} "
                 f"steps, the first at {np.flatnonzero(array)[:3].tolist()}; give the episodes' length with --kept-steps"
             )
         if name == "state":
             obs = self.read("obs")
-            if not np.array_equal(obs, fast_observe(self._layout, array, np.empty_like(obs))):
-                raise PublishedFormatError(f"{self._where}: obs is not what state shows")
+            if not np.array_equal(obs, fast_observe(layout, array, np.empty_like(obs))):
+                raise PublishedFormatError(f"{self.where}: obs is not what state shows")
         return array
 
-    def _whole(self, name: str, found: np.ndarray) -> np.ndarray:
-        """The values in the field's compact dtype, if they are whole numbers of its range."""
+    def _compact(self, name: str, found: np.ndarray) -> np.ndarray:
+        """Convert values to the field's compact dtype, if they are integers in its range."""
         compact = np.dtype(FIELDS[name].compact)
         low, high = (0, 1) if compact.kind == "b" else (np.iinfo(compact).min, np.iinfo(compact).max)
         if name in ACTION_FIELDS:
             low, high = 0, len(ACTIONS) - 1
-        with np.errstate(invalid="ignore"):  # what the cast spoils is found by comparing
+        with np.errstate(invalid="ignore"):  # the comparison finds values that the cast changed
             array = found.astype(compact)
         wrong = (array != found) | (found < low) | (found > high)
         if wrong.any():
-            place = tuple(np.argwhere(wrong)[0].tolist())
+            first = tuple(np.argwhere(wrong)[0].tolist())
             raise PublishedFormatError(
-                f"{self._where}: {name}{list(place)}: expected a whole number {low}..{high}, found {found[place]}"
+                f"{self.where}: {name}{list(first)}: expected an integer {low}..{high}, found {found[first]}"
             )
         return array

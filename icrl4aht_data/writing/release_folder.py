@@ -1,4 +1,4 @@
-"""TODO."""
+"""Atomic replacement of a release folder."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import (
-    INFO,
-)
+from icrl4aht_data.format.schema import INFO
 
 
 @contextmanager
 def atomic_folder(target: Path) -> Iterator[Path]:
-    """A new folder to fill, which takes the place of the release at `target` when the block ends without an error.
+    """Yield a new folder to fill, which replaces the release at `target` if the block ends without an error.
 
     Raises:
-        OptionError: if `target` is not a release, or if another process is writing it.
+        OptionError: if `target` exists and is not a release, or if another process is writing it.
     """
     target = target.resolve()
     check_replaceable(target)
@@ -46,10 +44,10 @@ def atomic_folder(target: Path) -> Iterator[Path]:
 
 
 def check_replaceable(target: Path) -> None:
-    """Whether a release may be written there.
+    """Check that a release may be written at a path: nothing, an empty folder or a release may be there.
 
     Raises:
-        OptionError: if there is a file, or a folder that is neither empty nor a release.
+        OptionError: if there is anything else.
     """
     if target.exists() and not (target.is_dir() and ((target / INFO).exists() or not any(target.iterdir()))):
         raise OptionError(f"{target}: exists and is not a release; give another folder or remove it")

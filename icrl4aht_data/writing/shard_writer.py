@@ -1,12 +1,13 @@
-"""Writes one HDF5 shard, chunk by chunk, with its chunk table."""
+"""Writer of one HDF5 shard, chunk by chunk, with its chunk table."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
@@ -14,30 +15,36 @@ from icrl4aht_data.format.chunks import BETWEEN, chunk_places, chunk_table_path
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
-if TYPE_CHECKING:
-    import h5py
-
-_Arrays = Mapping[str, np.ndarray]
-
 _DEFLATE_LEVEL = 8
-_BLOCK = 2000  # steps: a chunk of scalars, two of records
+_BLOCK = 2000  # steps: one chunk of scalars, two of records
 
 
-def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[_Arrays]) -> None:
-    """Write a shard and its chunk table into a folder that no reader has seen yet.
+class EncodedChunk(NamedTuple):
+    """One chunk of a history, ready to be stored.
+
+    Args:
+        field: the field.
+        start: its first row, a step or an episode of the history.
+        data: the shuffled and deflated bytes.
+    """
+
+    field: Field
+    start: int
+    data: bytes
+
+
+def write_shard(
+    root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[Sequence[EncodedChunk]]
+) -> None:
+    """Write a shard and its chunk table into a release folder that no reader has opened yet.
 
     Args:
         root: the release folder.
-        shard: path below it, as in every entry.
-        kind: of the release.
-        entries: the histories' index entries; `h5_group` and `h5_row` say where each one goes.
-        histories: for each entry, field name -> array in the field's dtype.
-
-    Raises:
-        OptionError: if a value does not survive the stored dtype, or an array has not the entry's length.
+        shard: path in the release, as in every entry.
+        kind: kind of the release.
+        entries: index entries of the histories; `h5_group` and `h5_row` say where each one is stored.
+        histories: the chunks of each entry's history, see `encode_history`.
     """
-    import h5py
-
     path, table_path = root / shard, chunk_table_path(root, shard)
     path.parent.mkdir(parents=True, exist_ok=True)
     table_path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,18 +55,21 @@ def write_shard(root: Path, shard: str, kind: Kind, entries: Sequence[Entry], hi
         file.attrs["layout"] = layout.name
         for group in dict.fromkeys(entry.h5_group for entry in entries):
             _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
-        for entry, arrays in zip(entries, histories, strict=True):
-            checksums += _write_history(file[entry.h5_group], layout, kind, entry, arrays)
-    with h5py.File(path, "r") as file:
+        for entry, chunks in zip(entries, histories, strict=True):
+            group: Any = file[entry.h5_group]
+            for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
+                position = (start,) if entry.h5_row is None else (entry.h5_row, start)
+                group[field.name].id.write_direct_chunk(position, data)
+            checksums += [zlib.crc32(chunk.data) for chunk in chunks]
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = checksums
         places = [place for entry in entries for place in chunk_places(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
-    np.save(table_path, np.concatenate([table, _between(path, table)]), allow_pickle=False)
+    np.save(table_path, np.concatenate([table, _metadata_lines(path, table)]), allow_pickle=False)
 
 
-def _between(path: Path, chunks: np.ndarray) -> np.ndarray:
-    """Lines for what lies between a shard's chunks."""
+def _metadata_lines(path: Path, chunks: np.ndarray) -> np.ndarray:
+    """Return chunk table lines for the bytes between the chunks: HDF5 writes them, so they are read from the file."""
     ordered = np.sort(chunks, order="offset")
     starts = [*ordered["offset"].tolist(), path.stat().st_size]
     stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
@@ -74,7 +84,7 @@ def _between(path: Path, chunks: np.ndarray) -> np.ndarray:
 
 
 def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
-    """The empty datasets of a group: (T,) for one history, (histories, T) for stacked ones."""
+    """Create the empty datasets of a group: (T,) for one history, (histories, T) for stacked ones."""
     first = entries[0]
     group = file.create_group(first.h5_group)
     for field in first.stored_fields(kind):
@@ -93,20 +103,11 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
         )
 
 
-def _write_history(group: Any, layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> list[int]:
-    """Write every chunk of a history, by time; their checksums, in table order."""
-    encoded = list(_encoded(layout, kind, entry, arrays))
-    for field, start, data in sorted(encoded, key=lambda part: in_time(*part[:2])):
-        place = (start,) if entry.h5_row is None else (entry.h5_row, start)
-        group[field.name].id.write_direct_chunk(place, data)
-    return [zlib.crc32(data) for _, _, data in encoded]
+def file_order(field: Field, start: int) -> tuple[int, ...]:
+    """Return the sort key of a chunk in the file, so that a window of steps is one byte range.
 
-
-def in_time(field: Field, start: int) -> tuple[int, ...]:
-    """Sorts the chunks of a history as they stand in the file: what a window needs in one range of bytes.
-
-    That is by block of `_BLOCK` steps, and in a block the first records, what every window needs of scalars, the other
-    records, labels, observations.
+    Chunks are ordered by block of `_BLOCK` steps, and in a block: the first state records, the scalars that every
+    window needs, the other records, labels, observations.
     """
     if field.axis == "E":
         return (1,)
@@ -115,38 +116,45 @@ def in_time(field: Field, start: int) -> tuple[int, ...]:
     return (0, start // _BLOCK, -1 if leads else order.index(field.name), start)
 
 
-def stored_bytes(kind: Kind, entry: Entry, arrays: _Arrays) -> int:
-    """What the chunks of a history take in a shard."""
-    return sum(len(data) for _, _, data in _encoded(get_layout(entry.layout), kind, entry, arrays))
+def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -> list[EncodedChunk]:
+    """Return every chunk of a history, in the order of the chunk table.
 
+    Args:
+        kind: kind of the release.
+        entry: the history's index entry.
+        arrays: field name -> array, of the field's dtype or another one with the same values.
 
-def _encoded(layout: Layout, kind: Kind, entry: Entry, arrays: _Arrays) -> Iterator[tuple[Field, int, bytes]]:
-    """Every chunk of a history as (field, first row, bytes), in table order."""
+    Raises:
+        OptionError: if the stored dtype cannot hold a value, or an array does not have the entry's length.
+    """
+    layout, chunks = get_layout(entry.layout), []
     for field in entry.stored_fields(kind):
-        element = field.element(layout, kind)
-        stored = _as_stored(field, element, arrays[field.name], entry)
-        step = min(field.chunk, len(stored))
-        for start in range(0, len(stored), step):
-            yield field, start, encode_chunk(stored[start : start + step], step, element.itemsize)
-
-
-def _as_stored(field: Field, element: np.dtype, array: np.ndarray, entry: Entry) -> np.ndarray:
-    if len(array) != entry.rows(field):
-        raise OptionError(
-            f"history {entry.history_id}: field {field.name} has {len(array)} rows, expected {entry.rows(field)}"
-        )
-    stored = np.ascontiguousarray(array, element.base)
-    if not np.array_equal(stored, array):
-        raise OptionError(f"history {entry.history_id}: field {field.name} has values that {element.base} cannot hold")
-    return stored
+        element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
+        where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
+        if len(array) != rows:
+            raise OptionError(f"{where} has {len(array)} rows, expected {rows}")
+        stored = np.ascontiguousarray(array, element.base)
+        if not np.array_equal(stored, array):
+            raise OptionError(f"{where} has values that {element.base} cannot hold")
+        length = min(field.chunk, rows)
+        for start in range(0, rows, length):
+            data = encode_chunk(stored[start : start + length], length, element.itemsize)
+            chunks.append(EncodedChunk(field, start, data))
+    return chunks
 
 
 def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
-    """What HDF5's shuffle and deflate filters make of a chunk of `length` rows, the missing ones zero."""
+    """Return what HDF5's shuffle and deflate filters make of a chunk.
+
+    Args:
+        rows: its rows.
+        length: rows of a full chunk; missing ones are zero.
+        itemsize: bytes of a row.
+    """
     raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
     if itemsize > 1:
         raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
-    # Short matches among actions, which are drawn at random, cost more than they save.
+    # Actions are drawn at random: short matches among them cost more bytes than they save.
     strategy = zlib.Z_FILTERED if rows.ndim == 1 else zlib.Z_DEFAULT_STRATEGY
     deflater = zlib.compressobj(_DEFLATE_LEVEL, strategy=strategy)
     return deflater.compress(raw) + deflater.flush()

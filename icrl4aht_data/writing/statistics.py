@@ -1,11 +1,10 @@
-"""A release's statistics per layout: the rows of the paper's table "Dataset statistics per layout"."""
+"""Statistics of a release by layout: the paper's table "Dataset statistics per layout"."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import mul
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,43 +33,46 @@ _ROWS = {
 
 
 def layout_statistics(
-    root: Path, entries: Sequence[Entry], tasks: Sequence[Task], provenance: dict[str, Provenance], kept_steps: int
+    entries: Sequence[Entry],
+    tasks: Sequence[Task],
+    provenance: Mapping[str, Provenance],
+    kept_steps: int,
+    sizes: Mapping[str, int],
 ) -> dict[str, LayoutStatistics]:
-    """layout -> the paper's properties, as numbers. The shards must be in `root`.
+    """Return the statistics of every layout, in order of first appearance.
 
-    original_transitions is what the learners' streams held before the filter, null where a provenance does not say;
-    teammates is null where the tasks were not given; history_length is the shortest and the longest; mean_final_return
-    is over histories, `return_end` of each.
+    Args:
+        entries: the index.
+        tasks: the release's tasks.
+        provenance: task id -> how its histories were made.
+        kept_steps: steps of an episode.
+        sizes: shard -> bytes.
     """
-    return {
-        layout: _of_layout(root, [e for e in entries if e.layout == layout], tasks, provenance, kept_steps)
-        for layout in dict.fromkeys(entry.layout for entry in entries)
-    }
+    statistics = {}
+    for layout in dict.fromkeys(entry.layout for entry in entries):
+        members = [entry for entry in entries if entry.layout == layout]
+        lengths = {entry.task_id: entry.T for entry in members}
+        recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
+        streams = [number for number in recorded if number is not None]
+        original = sum(map(mul, streams, lengths.values())) if len(streams) == len(recorded) else None
+        teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
+        steps = [entry.T for entry in members]
+        statistics[layout] = LayoutStatistics(
+            original_transitions=original,
+            filtered_transitions=sum(steps),
+            history_length=(min(steps), max(steps)),
+            teammates=len(teammates) or None,
+            steps_per_episode=kept_steps,
+            obs_shape=members[0].obs_shape,
+            actions=len(ACTIONS),
+            mean_final_return=round(float(np.mean([entry.return_end for entry in members])), 3),
+            disk_bytes=sum(sizes[shard] for shard in {entry.shard for entry in members}),
+        )
+    return statistics
 
 
-def _of_layout(
-    root: Path, entries: list[Entry], tasks: Sequence[Task], provenance: dict[str, Provenance], kept_steps: int
-) -> LayoutStatistics:
-    lengths = {entry.task_id: entry.T for entry in entries}
-    steps = [entry.T for entry in entries]
-    recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
-    streams = [number for number in recorded if number is not None]
-    teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
-    return LayoutStatistics(
-        original_transitions=sum(map(mul, streams, lengths.values())) if len(streams) == len(recorded) else None,
-        filtered_transitions=sum(steps),
-        history_length=(min(steps), max(steps)),
-        teammates=len(teammates) or None,
-        steps_per_episode=kept_steps,
-        obs_shape=entries[0].obs_shape,
-        actions=len(ACTIONS),
-        mean_final_return=round(float(np.mean([entry.return_end for entry in entries])), 3),
-        disk_bytes=sum((root / shard).stat().st_size for shard in {entry.shard for entry in entries}),
-    )
-
-
-def statistics_rows(statistics: dict[str, LayoutStatistics]) -> list[list[str]]:
-    """The table in words: a row per property, which names it and has a cell per layout."""
+def statistics_rows(statistics: Mapping[str, LayoutStatistics]) -> list[list[str]]:
+    """Return the table's rows as text: the name of a property, and its value on each layout."""
     return [
         [label, *(_in_words(name, getattr(of_layout, name)) for of_layout in statistics.values())]
         for name, label in _ROWS.items()
@@ -78,14 +80,13 @@ def statistics_rows(statistics: dict[str, LayoutStatistics]) -> list[list[str]]:
 
 
 def print_statistics(info: ReleaseInfo, console: Console) -> None:
-    """The table of a release's meta/info.json: a row per property, a column per layout."""
-    statistics = info.statistics
+    """Print the statistics in a release's info, one row per property and one column per layout."""
     table = Table("property", box=box.MARKDOWN, title=escape(f"{info.kind} release {info.data_version}"))
-    for layout in statistics:
+    for layout in info.statistics:
         table.add_column(layout, justify="right")
-    for row in statistics_rows(statistics):
+    for row in statistics_rows(info.statistics):
         table.add_row(*row)
-    console.print(table, width=max(console.width, 30 + 16 * len(statistics)), crop=False)
+    console.print(table, width=max(console.width, 30 + 16 * len(info.statistics)), crop=False)
 
 
 def _in_words(name: str, value: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -19,13 +20,14 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError
+from tests.helpers.paths import ROOT
 
 PROGRAMS = {"reader": cli, "generation": generation_cli, "baselines": baselines_cli}
 
 
 @pytest.fixture
 def say(capsys, monkeypatch, tmp_path):
-    """Runs a program in a folder with an empty folder, a file and a folder with a release in it; exit code, message."""
+    """Run a program in a folder with an empty folder, a file and a folder with a release: exit code and output."""
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("hi")
     (tmp_path / "outer").mkdir()
@@ -44,140 +46,105 @@ def say(capsys, monkeypatch, tmp_path):
     return say
 
 
-MISUSED = [
-    ("reader", "lst", "No such command 'lst'. Did you mean 'list'?"),
-    ("reader", "list --layout demo_wied", "unknown layout 'demo_wied'; valid: coord_simple, "),
-    ("reader", "list --split tran", "unknown split 'tran'; valid: train, test, heldout. Did you mean 'train'?"),
-    ("reader", "verify --teammate-family h4", "unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?"),
-    (
-        "reader",
-        "verify --teammate-kind greedy",
-        "unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, comedi, fcp.",
-    ),
-    ("reader", "verify --from x", "--from says where to repair from: give --repair with it"),
-    ("reader", "show --history -1", "-1: expected a whole number from 0 on"),
-    ("reader", "show --history 184", "this selection has no history [184], ids are within 0..183"),
-    ("reader", "show --plot curves.jpg", "curves.jpg: expected a name that ends in .png or .svg or .pdf"),
-    ("reader", "show --plot none/curves.png", "no folder none: make it first, or give another path"),
-    ("reader", "show --plot empty", "'empty' is a directory"),
-    ("reader", "download", "give the ADDRESS of a release, or set ICRL4AHT_REMOTE"),
-    ("reader", "download empty", "empty: expected an address such as hf://datasets/<org>/<repo>"),
-    ("reader", "download s3://a/b --to file", "'file' is a file"),
-    (
-        "reader",
-        f"convert {MINI} out",
-        "say what to make of a release: --to full, lite, observations, published, parquet",
-    ),
-    ("reader", f"convert {MINI} out --to parquet --kept-steps 50", "--kept-steps are for published files"),
-    ("reader", f"convert {MINI} out --to lite --kept-steps 0", "0: expected a whole number from 1 on"),
-    ("reader", f"convert {MINI} out --to lite --tasks none", "'none' does not exist"),
-    ("reader", f"combine file {MINI}", "'file' is a file"),
-    ("reader", "release build a b c", "give one SOURCE at most, then OUT"),
-    ("reader", f"upload {MINI} folder", "folder: expected an address such as hf://datasets/<org>/<repo>"),
-    (
-        "generation",
-        "generate --out g --profile smke",
-        "unknown profile 'smke'; valid: mini, paper, smoke. Did you mean",
-    ),
-    ("generation", "generate --out file", "'file' is a file"),
-    ("generation", "generate --out g --seed -1", "-1: expected a whole number from 0 to 2**32 - 1"),
-    ("generation", "generate --out g --workers 2", "--address and --workers need --executor ray"),
-    ("generation", "plan --devices 0", "0: expected a whole number from 1 on"),
-    ("generation", "speed --layout x", "unknown layout 'x'; valid: coord_simple, "),
-    (
-        "generation",
-        "teammates --algorithm fpc --suite s",
-        "unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.",
-    ),
-    ("baselines", "train da --layout demo_wide", "unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline."),
-    ("baselines", "train ad --layout demo_wide --size smal", "unknown size 'smal'; valid: small, medium, large."),
-    ("baselines", "train ad --layout demo_wide --order rnd", "unknown order 'rnd'; valid: contiguous, random."),
-    ("baselines", "train ad --layout demo_wide --batch-size 0", "0: expected a whole number from 1 on"),
-    ("baselines", "train ad --layout demo_wide --learning-rate nan", "nan: expected a number above 0"),
-    ("baselines", "train ad --layout demo_wide --coordinator x", "x: expected HOST:PORT, such as 10.0.0.1:6000"),
-    ("baselines", "train ad --layout demo_wide --process 1", "expected a --coordinator HOST:PORT as well"),
-    (
-        "baselines",
-        "train ad --layout demo_wide --coordinator a:1 --process 2",
-        "--process 2: expected a number below 1",
-    ),
-    ("baselines", "evaluate --agent randm --out e", "unknown agent 'randm'; valid: stay, random, oracle. Did you mean"),
-    ("baselines", "evaluate --agent none --out e", "A trained model is named by its folder"),
-    ("baselines", "evaluate --agent empty --out e", "empty: no run: config.json is missing"),
-    ("baselines", "evaluate --agent stay --out e --acting cach", "unknown acting 'cach'; valid: cached, exact."),
-    (
-        "baselines",
-        "evaluate --agent stay --out e --suite none",
-        "none: no such folder; `python -m generation teammates`",
-    ),
-    ("baselines", "evaluate --agent stay --out e --manifest empty", "'empty' is a directory"),
-    ("baselines", "watch --layout demo_wide --out e.png", "e.png: expected a name that ends in .gif"),
-    ("baselines", "watch --layout demo_wide --out e.gif --teammate H9/t0", "unknown teammate 'H9/t0'; valid: H1/t0,"),
-    ("baselines", "headroom --protocol x", "unknown protocol 'x'; valid: published, seeded."),
-    ("baselines", "sweep contxt", "unknown sweep 'contxt'; valid: context, size. Did you mean 'context'?"),
-    ("baselines", "sweep size --only smal", "unknown setting of sweep size 'smal'; valid: small, medium, large."),
-    ("baselines", "ablate tb", "unknown ablate 'tb'; valid: ta."),
-    ("baselines", "heldout-rl --suite file", "'file' is a file"),
-]
+MISUSED = """
+reader: lst | No such command 'lst'. Did you mean 'list'?
+reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
+reader: list --split tran | unknown split 'tran'; valid: train, test, heldout. Did you mean 'train'?
+reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
+reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, comedi
+reader: verify --from x | --from is the source of a repair: give --repair with it
+reader: show --history -1 | -1 is not in the range x>=0
+reader: show --history 184 | this selection has no history [184], ids are within 0..183
+reader: show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
+reader: show --plot none/curves.png | no folder none: make it first, or give another path
+reader: show --plot empty | 'empty' is a directory
+reader: download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
+reader: download empty | empty: expected an address such as hf://datasets/<org>/<repo>
+reader: download s3://a/b --to file | 'file' is a file
+reader: convert {MINI} out | give the form to convert to: --to full, lite, observations, published, parquet
+reader: convert {MINI} out --to parquet --kept-steps 50 | --kept-steps are for published files
+reader: convert {MINI} out --to lite --kept-steps 0 | 0 is not in the range x>=1
+reader: convert {MINI} out --to lite --tasks none | 'none' does not exist
+reader: combine file {MINI} | 'file' is a file
+reader: release build a b c | give one SOURCE at most, then OUT
+reader: upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
+generation: generate --out g --profile smke | unknown profile 'smke'; valid: mini, paper, smoke. Did you mean
+generation: generate --out file | 'file' is a file
+generation: generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
+generation: generate --out g --workers 2 | --address and --workers need --executor ray
+generation: plan --devices 0 | 0 is not in the range x>=1
+generation: speed --layout x | unknown layout 'x'; valid: coord_simple,
+generation: teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
+baselines: train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline.
+baselines: train ad --layout demo_wide --size smal | unknown size 'smal'; valid: small, medium, large.
+baselines: train ad --layout demo_wide --order rnd | unknown order 'rnd'; valid: contiguous, random.
+baselines: train ad --layout demo_wide --batch-size 0 | 0 is not in the range x>=1
+baselines: train ad --layout demo_wide --learning-rate nan | nan is not in the range 0<x<inf
+baselines: train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
+baselines: train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
+baselines: train ad --layout demo_wide --coordinator a:1 --process 2 | --process 2: expected a number below 1
+baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle. Did you mean
+baselines: evaluate --agent none --out e | A trained model is named by its folder
+baselines: evaluate --agent empty --out e | empty: no run: config.json is missing
+baselines: evaluate --agent stay --out e --acting cach | unknown acting 'cach'; valid: cached, exact.
+baselines: evaluate --agent stay --out e --suite none | none: no such folder; `python -m generation teammates`
+baselines: evaluate --agent stay --out e --manifest empty | 'empty' is a directory
+baselines: watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
+baselines: watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
+baselines: headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
+baselines: sweep contxt | unknown sweep 'contxt'; valid: context, size. Did you mean 'context'?
+baselines: sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
+baselines: ablate tb | unknown ablate 'tb'; valid: ta.
+baselines: heldout-rl --suite file | 'file' is a file
+"""
 
-FAILED = [
-    ("reader", "list none", "none: no release here, expected meta/info.json in it; there is no such folder: check"),
-    ("reader", "list empty", "empty: no release here, expected meta/info.json in it; give the folder of a release"),
-    ("reader", "list outer", "outer: no release here, expected meta/info.json in it; did you mean outer/lite?"),
-    ("reader", "list file", "file: no release here"),
-    ("reader", "list --split test", "no history has split=['test']. This release has train/coord_simple"),
-    (
-        "reader",
-        "verify none",
-        "none: no such folder; give the folder or the address of a release none: 1 problem; checked",
-    ),
-    ("reader", "verify --split test", "no history has split=['test']"),
-    ("reader", "list htps://x", "not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/"),
-    ("reader", "convert none out", "none: no release here"),
-    ("reader", f"convert {MINI} file/x --to lite", "file: File exists; a file is where a folder is needed"),
-    ("reader", f"convert {MINI} none/index --to parquet", "none/index: No such file or directory; check the path;"),
-    ("reader", f"combine out {MINI} --data-version banana", "data version 'banana': expected one such as 1.0.0"),
-    ("reader", f"combine out {MINI} {MINI}", "leave one of them out"),
-    ("reader", "release build empty out", "empty: no release here"),
-    ("reader", "upload none hf://datasets/a/b --dry-run", "none: no release here"),
-    ("generation", "check none empty", "none: no such folder"),
-    (
-        "generation",
-        "diversity --suite empty",
-        "empty: no layout has all its populations finished; `python -m generation",
-    ),
-    (
-        "baselines",
-        "train ad --layout asymm_right",
-        "no history has split='train', layout=['asymm_right']. This release",
-    ),
-    ("baselines", "train ad --layout demo_wide --root none", "none: no release here"),
-    ("baselines", "report empty", "empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`"),
-    ("baselines", "evaluate --agent stay --out e --layout cramped_up", "no task on cramped_up in"),
-    ("baselines", "drift empty", "empty: not a run"),
-]
+FAILED = """
+reader: list none | none: no release here, expected meta/info.json in it; there is no such folder: check
+reader: list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
+reader: list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
+reader: list file | file: no release here
+reader: list --split test | no history has split=['test']. This release has train/coord_simple
+reader: verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
+reader: verify --split test | no history has split=['test']
+reader: list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
+reader: convert none out | none: no release here
+reader: convert {MINI} file/x --to lite | file: File exists; a file is where a folder is needed
+reader: convert {MINI} none/index --to parquet | none/index: No such file or directory; check the path;
+reader: combine out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
+reader: combine out {MINI} {MINI} | leave one of them out
+reader: release build empty out | empty: no release here
+reader: upload none hf://datasets/a/b --dry-run | none: no release here
+generation: check none empty | none: no such folder
+generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
+baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
+baselines: train ad --layout demo_wide --root none | none: no release here
+baselines: report empty | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
+baselines: evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
+baselines: drift empty | empty: not a run
+"""
 
 
-@pytest.mark.parametrize(("program", "words", "message"), MISUSED)
-def test_misuse_is_exit_code_2(say, program, words, message):
-    code, said = say(program, *words.split())
+def cases(text: str, code: int) -> Iterator[tuple[str, str, str, int]]:
+    """Program, arguments, message and exit code of each line."""
+    for line in text.strip().splitlines():
+        command, _, message = line.partition(" | ")
+        program, _, arguments = command.partition(": ")
+        yield program, arguments.replace("{MINI}", str(MINI)), message, code
+
+
+@pytest.mark.parametrize(("program", "arguments", "message", "code"), [*cases(MISUSED, 2), *cases(FAILED, 1)])
+def test_bad_input_has_a_message_and_an_exit_code(say, program, arguments, message, code):
+    found, said = say(program, *arguments.split())
     assert message in said
-    assert code == 2
+    assert found == code
 
 
-@pytest.mark.parametrize(("program", "words", "message"), FAILED)
-def test_failure_is_exit_code_1(say, program, words, message):
-    code, said = say(program, *words.split())
-    assert message in said
-    assert code == 1
-
-
-def test_a_shell_variable_that_is_not_set(say):
+def test_empty_arguments_are_refused(say):
     assert say("reader", "list", "")[1].endswith("expected a release folder or an address, found an empty text")
     assert say("reader", "release", "build", "")[1].endswith("expected a folder, found an empty text")
 
 
-def test_verify_does_not_call_a_misspelt_name_a_fault():
+def test_verify_raises_for_unknown_names():
     with pytest.raises(UnknownNameError, match="unknown layout 'demo_wied'"):
         verify_release(layout="demo_wied")
     with pytest.raises(EmptySelectionError):
@@ -187,17 +154,13 @@ def test_verify_does_not_call_a_misspelt_name_a_fault():
 @pytest.mark.parametrize(
     ("number", "name", "message"),
     [
-        (
-            errno.EACCES,
-            "out/.x.png.partial",
-            "error: out/x.png: Permission denied; give a folder that you may write to",
-        ),
+        (errno.EACCES, "out/.x.png.partial", "error: out/x.png: Permission denied; give a folder that you may write"),
         (errno.ENOSPC, "out/.lite.lock", "error: out/lite: No space left on device; free some space"),
         (errno.EROFS, "/disc/x", "error: /disc/x: Read-only file system; give a folder that can be written to"),
         (errno.EIO, "x.h5", "error: x.h5: Input/output error\n"),
     ],
 )
-def test_errors_of_the_disk_name_the_file_that_the_user_knows(capsys, monkeypatch, number, name, message):
+def test_disk_errors_name_the_users_file(capsys, monkeypatch, number, name, message):
     @click.command()
     def fail() -> None:
         raise OSError(number, "in other words", name)
@@ -209,7 +172,7 @@ def test_errors_of_the_disk_name_the_file_that_the_user_knows(capsys, monkeypatc
     assert capsys.readouterr().err.startswith(message)
 
 
-def test_a_bug_is_no_misuse(monkeypatch):
+def test_bugs_are_raised(monkeypatch):
     @click.command()
     def fail() -> None:
         raise ModuleNotFoundError("No module named 'nowhere'", name="nowhere")
@@ -219,7 +182,7 @@ def test_a_bug_is_no_misuse(monkeypatch):
         run(fail)
 
 
-def test_a_ray_that_is_not_there_is_missed_at_once():
+def test_unreachable_ray_is_reported():
     with (
         pytest.raises(OptionError, match=r"Ray at 127\.0\.0\.1:1 cannot be reached: .*; check the address"),
         on_ray._connected(CollectOptions("ray", "127.0.0.1:1")),
@@ -227,15 +190,15 @@ def test_a_ray_that_is_not_there_is_missed_at_once():
         pass
 
 
-def test_a_data_version_in_a_profile(tmp_path: Path, say):
+def test_invalid_data_version_in_a_profile(tmp_path: Path, say):
     profile = tmp_path / "mine.toml"
-    smoke = (Path(on_ray.__file__).parents[1] / "profiles" / "smoke.toml").read_text(encoding="utf-8")
+    smoke = (ROOT / "generation" / "profiles" / "smoke.toml").read_text(encoding="utf-8")
     profile.write_text(smoke.replace('data_version = "0.0.1"', 'data_version = "new"'), encoding="utf-8")
     code, said = say("generation", "plan", "--profile", str(profile))
     assert (code, "mine.toml: data version 'new': expected one such as 1.0.0" in said) == (1, True)
 
 
-def test_json_of_what_is_damaged(damaged, say):
+def test_verify_prints_json_for_a_damaged_release(damaged, say):
     (damaged / "meta" / "tasks.jsonl").write_text("{")
     code, said = say("reader", "verify", "--json", str(damaged))
     assert code == 1

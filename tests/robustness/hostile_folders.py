@@ -339,7 +339,7 @@ case("index: wide names", "printable characters", lines(many_names))
 case("index: a surrogate", "printable characters", entry(task_id="\ud800"))
 case("index: not a number", "expected a number below", entry(score=float("nan")))
 case("index: infinite", "expected a number below", entry(return_end=1e308))
-case("index: many sets of shards", "promises this shard", many_sets)
+case("index: many sets of shards", "implies this shard", many_sets)
 case("tasks: one endless line", "expected at most", replaced(TASKS, content(b"a" * 2**24)))
 case(
     "tasks: deep theta",

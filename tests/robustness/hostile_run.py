@@ -139,7 +139,7 @@ def sample(root: Path | str) -> None:
 
 
 def verified(root: Path) -> str:
-    report = verify_release(root, deep=True)
+    report = verify_release(root, level="deep")
     assert not report.ok, "verify calls it whole"
     return "\n".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:1000])
 
@@ -149,7 +149,7 @@ def release_steps(root: Path, out: Path) -> dict[str, Callable[[], Any]]:
         "read": lambda: read(root),
         "sample": lambda: sample(root),
         "verify": lambda: verified(root),
-        "quick": lambda: verify_release(root, quick=True),
+        "quick": lambda: verify_release(root, level="quick"),
         "convert": lambda: to_release(load_icrl4aht(root), out / "full", "full"),
         "published": lambda: to_published(load_icrl4aht(root), out / "published"),
         "combine": lambda: combine_releases(out / "combined", [root]),

@@ -173,7 +173,7 @@ def test_names_that_windows_keeps(tmp_path):
 
 
 def test_findings_are_bounded_and_fit_for_a_terminal():
-    report = Report("r", deep=False)
+    report = Report("r")
     for _ in range(100_010):
         report.add("a\x1b[2J\udcff", "x" * 10_000)
     assert len(report.findings) == 100_001

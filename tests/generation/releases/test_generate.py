@@ -44,7 +44,7 @@ from tests.helpers.tiny import LEARNED, TINY, artefact
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
 def test_releases_are_whole_and_replay(built, kind):
-    report = verify_release(built / "a" / kind, deep=True)
+    report = verify_release(built / "a" / kind, level="deep")
     assert report.ok, report.findings
     assert (report.histories, report.transitions) == (3, 3 * 500)
 
@@ -73,7 +73,7 @@ def test_entries_say_where_they_come_from(built):
     provenance = json.loads((root / "meta" / "provenance.json").read_text())[entry.task_id]
     assert provenance["ego"]["environments"] == 8
     assert provenance["streams_kept"] == 3
-    assert "What it is not" in (root / "README.md").read_text()
+    assert "## Limits" in (root / "README.md").read_text()
 
 
 def test_the_final_ego_is_kept(built):
@@ -205,8 +205,8 @@ def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned
 def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_path):
     root = tmp_path / "lite"
     shutil.copytree(learned / "lite", root)
-    assert verify_release(root, deep=True).ok
-    assert verify_release(learned / "full", deep=True).ok
+    assert verify_release(root, level="deep").ok
+    assert verify_release(learned / "full", level="deep").ok
     weights = next(root.glob("teammates/**/policy.safetensors"))
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
@@ -224,7 +224,7 @@ def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
     both = combine_releases(tmp_path / "both", [half, other])
     for root, count in ((half, 1), (both, 2)):
         assert len(list(root.glob("teammates/**/policy.safetensors"))) == count
-        assert verify_release(root, deep=True).ok
+        assert verify_release(root, level="deep").ok
         recover_teammate(load_icrl4aht(root), 0)
 
 
@@ -237,7 +237,7 @@ def test_two_rebuilds_whose_teammates_have_the_same_place_in_their_suites(learne
     assert (tmp_path / "other/demo_wide/fcp/population.json").is_file()
     assert not (tmp_path / "out/suite").exists()
     combine_releases(tmp_path / "both", [learned / "lite", tmp_path / "out/lite"])
-    assert verify_release(tmp_path / "both", deep=True).ok
+    assert verify_release(tmp_path / "both", level="deep").ok
     both = load_icrl4aht(tmp_path / "both")
     weights = {
         np.asarray(jax.tree.leaves(recover_teammate(both, number).params)[0]).tobytes() for number in range(0, 12, 3)
@@ -303,17 +303,17 @@ def test_a_population_that_another_process_trains_is_waited_for(learned, monkeyp
 
 def test_the_card_says_who_the_teammates_are(learned):
     card = (learned / "lite" / "README.md").read_text()
-    assert "Learned teammates on demo_wide: populations of 2 by fcp, brdiv, 4,000 steps a member" in card
+    assert "Learned teammates on demo_wide: populations of 2 by fcp, brdiv, 4,000 steps per member" in card
     assert "| demo_wide | train | brdiv | 1 | 3 |" in card
     assert "Here egos for 16,000, teammates for 4,000." in card
     assert "policies learned by fcp, brdiv" in card
     assert "fewer training teammates" not in card
-    assert "stand in for the learned ones" not in card
+    assert "in place of the learned teammates" not in card
 
 
 def test_the_card_says_which_teammates_are_missing(learned, tmp_path):
     part = to_release(load_icrl4aht(learned / "lite", teammate_kind="fcp"), tmp_path / "part", "lite")
-    assert "than its profile wanted of brdiv on demo_wide (0 of 1)." in (part / "README.md").read_text()
+    assert "than its profile asks for: brdiv on demo_wide (0 of 1)." in (part / "README.md").read_text()
 
 
 def test_a_second_rebuild_trains_nothing(learned, monkeypatch):

@@ -29,9 +29,9 @@ from icrl4aht_data.format.schema import FIELDS, JSON_TYPES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
 from icrl4aht_data.utils.templates import card_file, fill
+from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.dataset_card import dataset_card, evaluated_on, size_category
-from icrl4aht_data.writing.field_descriptions import ARRAY_TEXTS, ENTRY_TEXTS
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.paths import ROOT
 from tests.helpers.random_play import play, random_release
@@ -89,7 +89,7 @@ def front_matter(card: str) -> dict:
 
 
 def test_it_holds_the_source_and_is_whole(release, published):
-    report = verify_release(published, deep=True)
+    report = verify_release(published, level="deep")
     assert report.ok, report.findings
     made_anew = {"README.md"}
     old, new = read_manifest(release), read_manifest(published)
@@ -157,7 +157,7 @@ def test_links_cost_no_space(release, tmp_path):
 def test_a_source_that_is_not_whole_is_refused(damaged, tmp_path):
     shard = next(damaged.rglob("*.h5"))
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
-    with pytest.raises(ReleaseError, match=r"release: not whole: .*\.h5: sha256: expected .*; see `icrl4aht"):
+    with pytest.raises(ReleaseError, match=r"release: not valid: .*\.h5: sha256: expected .*; see `icrl4aht"):
         build_release(damaged, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(OptionError, match="the release itself"):
@@ -278,10 +278,10 @@ def test_the_card_says_where_learned_teammates_are_missing(damaged, algorithms):
     suites = chain([suite | {"train": 1}], repeat(suite))
     path.write_text(json.dumps({task: {"suite": next(suites)} for task in json.loads(path.read_text())}))
     card = dataset_card(damaged)
-    assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps a member" in card
+    assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps per member" in card
     others = ", ".join(name for name in read_info(damaged).layouts if name != "demo_wide")
-    assert f"* Learned on {others}: its profile has no learned teammates there, only presets of H4." in card
-    assert "fewer training teammates than its profile wanted of fcp on demo_wide (0 of 3)." in card
+    assert f"* No learned teammates on {others}: the profile trains only with presets of H4 there." in card
+    assert "fewer training teammates than its profile asks for: fcp on demo_wide (0 of 3)." in card
 
 
 def test_sizes_have_the_hubs_names():
@@ -295,8 +295,8 @@ def test_those_who_learn_on_a_layout_are_tested_on_these():
 
 
 def test_every_field_is_described():
-    assert list(ARRAY_TEXTS) == list(FIELDS)
-    assert list(ENTRY_TEXTS) == list(JSON_TYPES)
+    assert list(card_texts("arrays")) == list(FIELDS)
+    assert list(card_texts("index")) == list(JSON_TYPES)
 
 
 def test_learned_teammates_have_cards(beside_learned, tmp_path):
@@ -307,12 +307,12 @@ def test_learned_teammates_have_cards(beside_learned, tmp_path):
     assert "member 1 of a\npopulation trained with fcp, checkpoint 4, after 4,000 environment steps" in card
     assert "| mean return as a teammate | 35.5 |" in card
     assert folder.name in card
-    report = verify_release(out, deep=True)
+    report = verify_release(out, level="deep")
     assert report.ok and not report.notes, report
     assert not (out / "meta/source_card.md").exists()
     card = (out / "README.md").read_text()
     assert "policies learned by fcp, which act greedily" in card
-    assert "stand in for the learned ones" not in card
+    assert "in place of the learned teammates" not in card
     assert verify_release(build_release(out, tmp_path / "again")).ok
 
 

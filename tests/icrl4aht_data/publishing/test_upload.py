@@ -124,7 +124,7 @@ def test_a_repository_with_other_peoples_files_is_left_alone(hub, published, tmp
     (tmp_path / "mine/thesis.txt").write_text("years")
     hub.add_repo(REPO, tmp_path / "mine")
     for dry_run in (True, False):
-        with pytest.raises(UploadError, match=r"holds 1 files that are no release's, such as thesis\.txt"):
+        with pytest.raises(UploadError, match=r"has 1 files that belong to no release, such as thesis\.txt"):
             upload_release(published, ADDRESS, dry_run=dry_run)
     assert hub.files(REPO) == {"thesis.txt": b"years"}
 
@@ -137,7 +137,7 @@ def test_a_public_repository_is_not_taken_for_a_private_one(hub, published, tmp_
 
 def test_what_is_not_whole_is_not_uploaded(hub, damaged):
     (damaged / "meta/info.json").unlink()
-    with pytest.raises(ReleaseError, match=r"not whole: meta/info\.json: listed in the manifest, but missing"):
+    with pytest.raises(ReleaseError, match=r"not valid: meta/info\.json: listed in the manifest, but missing"):
         upload_release(damaged, ADDRESS)
     assert not hub.log
 
@@ -187,8 +187,8 @@ def test_a_burst_of_server_errors_is_survived(hub, published):
     [
         ("*/refs", "GET", 403, r"token that may write to us: `hf auth login`, or set HF_TOKEN"),
         ("*/repos/create", "POST", 401, r"token that may write to us"),
-        ("*/commit/main", "POST", 500, r"what was sent stays there: go on with the same command"),
-        ("*/tag/*", "POST", 500, r"what was sent stays there"),
+        ("*/commit/main", "POST", 500, r"files sent so far are kept: run the same command"),
+        ("*/tag/*", "POST", 500, r"files sent so far are kept"),
     ],
 )
 def test_server_errors_become_ours_and_the_same_command_goes_on(hub, published, path, method, status, message):
@@ -203,7 +203,7 @@ def test_server_errors_become_ours_and_the_same_command_goes_on(hub, published, 
 def test_a_hub_that_is_not_there(published, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         hub.close()
-        with pytest.raises(UploadError, match=r"us/histories at http://127\.0\.0\.1:\d+: .*go on with the same"):
+        with pytest.raises(UploadError, match=r"us/histories at http://127\.0\.0\.1:\d+: .*run the same command"):
             upload_release(published, ADDRESS)
 
 
@@ -224,7 +224,7 @@ def test_what_differs_after_the_upload_gets_no_tag(hub, published, tmp_path):
         upload_release(published, ADDRESS)
     assert not hub.repo(REPO).tags
     hub.faults.clear()
-    with pytest.raises(UploadError, match=r"no release's, such as more\.txt"):
+    with pytest.raises(UploadError, match=r"belong to no release, such as more\.txt"):
         upload_release(published, ADDRESS)
 
 
@@ -234,7 +234,7 @@ def test_a_card_that_the_hub_refuses(hub, published, tmp_path):
     card = (root / "README.md").read_text()
     (root / "README.md").write_text(card.replace("license: mit", "license: mine"))
     write_manifest(root)
-    with pytest.raises(UploadError, match=r"README\.md.*license.*; correct it, then give the same command"):
+    with pytest.raises(UploadError, match=r"README\.md.*license.*; correct it, then run the same command"):
         upload_release(root, ADDRESS)
 
 
@@ -262,4 +262,4 @@ def test_what_was_uploaded_loads(hub, published, tmp_path, monkeypatch):
     there, here = (load_icrl4aht(root, layout="demo_wide") for root in (f"{ADDRESS}@v0.0.1", published))
     assert str(there.origin) == f"{ADDRESS}@{done.commit}" and there.info == here.info
     assert_equal(there.ad(batch_size=4, length=30)[0], here.ad(batch_size=4, length=30)[0])
-    assert verify_release(f"{ADDRESS}@v0.0.1", deep=True).ok
+    assert verify_release(f"{ADDRESS}@v0.0.1", level="deep").ok

@@ -69,7 +69,7 @@ class TestConversion:
     def test_a_part(self, ours, tmp_path):
         part = load_icrl4aht(ours, layout="demo_wide")
         to_release(part, tmp_path / "part", "observations")
-        assert verify_release(tmp_path / "part", deep=True).ok
+        assert verify_release(tmp_path / "part", level="deep").ok
         for old, new in zip(part, load_icrl4aht(tmp_path / "part"), strict=True):
             np.testing.assert_array_equal(old.obs[:], new.obs[:])
 
@@ -78,7 +78,7 @@ class TestConversion:
         with pytest.raises(OptionError, match=rf"has observations only, and a {kind} release is made of state records"):
             to_release(load_icrl4aht(ours), tmp_path / "out", kind)
         with pytest.raises(
-            PublishedFormatError, match=r"group /0: lacks state, episode_end_state: .* `--to observations`"
+            PublishedFormatError, match=r"group /0: missing state, episode_end_state: .* `--to observations`"
         ):
             from_published(theirs[0], tmp_path / "out", kind, kept_steps=KEPT)
 
@@ -95,7 +95,7 @@ class TestConversion:
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
             del file["/4/state"]
-        with pytest.raises(PublishedFormatError, match="group /4: lacks state, which other groups have"):
+        with pytest.raises(PublishedFormatError, match="group /4: missing state, which other groups have"):
             from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
 
     def test_generation_offers_the_other_kinds_only(self):
@@ -141,25 +141,25 @@ class TestFaults:
         [
             (
                 put("/1/obs", (7, 1, 2, 3), 0.5),
-                r"group /1: obs\[7, 1, 2, 3\]: expected a whole number 0\.\.255, .* 0\.5",
+                r"group /1: obs\[7, 1, 2, 3\]: expected an integer 0\.\.255, .* 0\.5",
             ),
             (put("/0/obs", (7, 1, 2, 3), -1), r"group /0: obs\[7, 1, 2, 3\]: expected .* found -1"),
             (put("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
             (put("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
-            (put("/0/actions", 9, 6), r"group /0: actions\[9\]: expected a whole number 0\.\.5, found 6"),
-            (put("/0/teammate_actions", 9, -1), r"teammate_actions\[9\]: expected a whole number 0\.\.5, found -1"),
+            (put("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
+            (put("/0/teammate_actions", 9, -1), r"teammate_actions\[9\]: expected an integer 0\.\.5, found -1"),
             (put("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
-            (put("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected a whole number -128\.\.127, found 0\.25"),
+            (put("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25"),
             (put("/2/rewards", 5, np.inf), r"group /2: rewards\[5\]"),
-            (put("/2/dones", 5, 2), r"group /2: dones\[5\]: expected a whole number 0\.\.1, found 2"),
+            (put("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
             (
                 put("/2/dones", 5, 1),
                 r"group /2: dones: expected an end every 20 steps, found 4 .*\[5, 19, 39\].*--kept",
             ),
             (put("/2/dones", slice(None), 0), r"group /2: dones: expected an end every 20 steps, found 0 in 60 steps"),
-            (drop("/1/obs"), r"histories\.h5, group /1: lacks obs: the index promises it"),
-            (drop("/1/rewards"), r"group /1: lacks rewards"),
-            (drop("/1/expert_actions"), r"group /1: lacks expert_actions: the index promises it"),
+            (drop("/1/obs"), r"histories\.h5, group /1: missing obs: the index lists it"),
+            (drop("/1/rewards"), r"group /1: missing rewards"),
+            (drop("/1/expert_actions"), r"group /1: missing expert_actions: the index lists it"),
             (drop("/3"), r"group /3: missing, but the index names it"),
             (replace("/3", np.zeros(4)), r"group /3: missing"),
             (
@@ -191,7 +191,7 @@ class TestFaults:
         if message is None:
             from_published(files, tmp_path / "out", kept_steps=KEPT)
             assert verify_release(tmp_path / "out").ok
-            (finding,) = verify_release(tmp_path / "out", deep=True).findings
+            (finding,) = verify_release(tmp_path / "out", level="deep").findings
             assert "obs: 60 steps do not show demo_simple from any cell" in finding.problem
             return
         with pytest.raises(PublishedFormatError, match=message):
@@ -235,7 +235,7 @@ class TestTasks:
 
     def test_all_are_given_or_none(self, theirs, tmp_path):
         write_tasks(tmp_path / "tasks.jsonl", make_tasks(["demo_wide"]))
-        with pytest.raises(PublishedFormatError, match=r"tasks\.jsonl: lacks 3 tasks of the index, such as 'task_a'"):
+        with pytest.raises(PublishedFormatError, match=r"tasks\.jsonl: missing 3 tasks of the index, such as 'task_a'"):
             from_published(theirs[0], tmp_path / "out", tasks=tmp_path / "tasks.jsonl", kept_steps=KEPT)
         with pytest.raises(PublishedFormatError, match=r"other\.jsonl: missing; give a file"):
             from_published(theirs[0], tmp_path / "out", tasks=tmp_path / "other.jsonl", kept_steps=KEPT)
@@ -381,7 +381,7 @@ class TestCombine:
         index.write_text(index.read_text().replace('": "task_', '": "more_'))
         from_published(other, tmp_path / "more", kept_steps=KEPT)
         combine_releases(tmp_path / "out", [ours, tmp_path / "more"])
-        assert verify_release(tmp_path / "out", deep=True).ok
+        assert verify_release(tmp_path / "out", level="deep").ok
         combined = load_icrl4aht(tmp_path / "out", obs="uint8")
         assert len(combined) == 8
         assert not combined.knows_tasks

@@ -141,10 +141,10 @@ def test_a_part_is_downloaded(served, lite, folders):
         dataset.ad(batch_size=4, length=30)[0],
         load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=4, length=30)[0],
     )
-    report = verify_release(served, deep=True, layout="demo_wide")
-    assert report.ok and report.notes == ["1 of 2 shards were not asked for"], report.findings
+    report = verify_release(served, level="deep", layout="demo_wide")
+    assert report.ok and report.notes == ["1 of 2 shards were not selected"], report.findings
     assert report.requests == 0
-    report = verify_release(served, deep=True)
+    report = verify_release(served, level="deep")
     assert report.ok and report.notes == [] and report.histories == 12
 
 
@@ -153,7 +153,7 @@ def test_a_download_into_a_folder_of_its_own(served, lite, tmp_path):
     fetch_planned(plan_download(served, to=target, layout="coord_simple"))
     assert verify_release(target).ok, "it has the part that was asked for"
     fetch_planned(plan_download(served, to=target, layout="demo_wide"))
-    assert verify_release(target, deep=True).notes == []
+    assert verify_release(target, level="deep").notes == []
     (target / ORIGIN).unlink()
     assert in_part(target) == in_part(lite[0])
     shard = load_icrl4aht(target).shards[0]
@@ -311,13 +311,13 @@ def test_a_source_that_is_damaged_itself_damages_nothing(lite, tmp_path):
 
 
 def test_quick_looks_at_sizes_alone(served, lite, tmp_path):
-    report = verify_release(served, quick=True)
+    report = verify_release(served, level="quick")
     assert report.ok and report.chunks == 0
     root = tmp_path / "copy"
     shutil.copytree(lite[0], root)
     shard = load_icrl4aht(root).shards[0]
     (root / shard).write_bytes((root / shard).read_bytes()[:-1])
-    assert [finding.problem[:8] for finding in verify_release(root, quick=True).findings] == ["expected"]
+    assert [finding.problem[:8] for finding in verify_release(root, level="quick").findings] == ["expected"]
 
 
 def test_command(lite, tmp_path, monkeypatch):
@@ -330,10 +330,10 @@ def test_command(lite, tmp_path, monkeypatch):
         assert "MANIFEST" not in result.output and "meta/chunks/teammate/demo_wide" in result.output
         monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
         result = run.invoke(cli, ["download", "--to", str(tmp_path / "mine")])
-        assert result.exit_code == 0 and "bytes have come" in result.output
+        assert result.exit_code == 0 and "bytes downloaded" in result.output
         assert in_part(lite[0]).items() <= in_part(tmp_path / "mine").items()
         result = run.invoke(cli, ["convert", server.url, str(tmp_path / "full"), "--to", "full"])
-        assert result.exit_code == 0 and verify_release(tmp_path / "full", deep=True).ok
+        assert result.exit_code == 0 and verify_release(tmp_path / "full", level="deep").ok
     monkeypatch.delenv("ICRL4AHT_REMOTE")
     assert run.invoke(cli, ["download"]).exit_code == 2
 

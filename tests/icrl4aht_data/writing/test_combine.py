@@ -34,7 +34,7 @@ def test_histories_are_those_of_the_parts(parts, tmp_path):
     result = CliRunner().invoke(cli, ["combine", str(tmp_path / "out"), *map(str, parts)], catch_exceptions=False)
     assert result.exit_code == 0
     assert "Filtered transitions" in result.output
-    report = verify_release(tmp_path / "out", deep=True)
+    report = verify_release(tmp_path / "out", level="deep")
     assert report.ok, report.findings
     combined = load_icrl4aht(tmp_path / "out")
     before = {(h.entry.task_id, h.entry.env_idx): h for part in parts for h in load_icrl4aht(part)}

@@ -31,7 +31,7 @@ def published(lite, tmp_path_factory):
 def test_full_and_lite(request, tmp_path, start, kind):
     root, _ = request.getfixturevalue(start)
     to_release(load_icrl4aht(root), tmp_path / "out", kind)
-    assert verify_release(tmp_path / "out", deep=True).ok
+    assert verify_release(tmp_path / "out", level="deep").ok
     assert load_icrl4aht(tmp_path / "out").info.kind == kind
     assert digest(tmp_path / "out") == digest(root)
     assert (tmp_path / "out" / "meta" / "tasks.jsonl").read_text() == (root / "meta" / "tasks.jsonl").read_text()
@@ -41,7 +41,7 @@ def test_a_part_of_a_release(lite, tmp_path):
     part = load_icrl4aht(lite[0]).select([7, 2])
     to_release(part, tmp_path / "out", "lite")
     out = load_icrl4aht(tmp_path / "out")
-    assert verify_release(tmp_path / "out", deep=True).ok
+    assert verify_release(tmp_path / "out", level="deep").ok
     for old, new in zip(part, out, strict=True):
         np.testing.assert_array_equal(new.state[:], old.state[:])
 
@@ -66,7 +66,7 @@ def test_published_files_are_as_the_paper_says(lite, published):
 
 def test_there_and_back(lite, published, tmp_path):
     from_published(published, tmp_path / "back", "lite", data_version="0.0.1", kept_steps=20)
-    assert verify_release(tmp_path / "back", deep=True).ok
+    assert verify_release(tmp_path / "back", level="deep").ok
     assert digest(tmp_path / "back") == digest(lite[0])
     for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/provenance.json", "meta/info.json"):
         assert (tmp_path / "back" / name).read_text() == (lite[0] / name).read_text()
@@ -83,7 +83,7 @@ def test_published_files_with_faults(published, tmp_path):
         group: Any = file["/3"]
         group["obs"][5] += 1
         del file["/1/state"]
-    fails(r"histories\.h5, group /1: lacks state: a lite release is made of state records")
+    fails(r"histories\.h5, group /1: missing state: a lite release is made of state records")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         file["/1/state"] = file["/0/state"]
     fails(r"group /1: obs is not what state shows")
@@ -91,7 +91,7 @@ def test_published_files_with_faults(published, tmp_path):
     fails("cannot be opened as HDF5")
     index = tmp_path / "files" / "histories_index.jsonl"
     index.write_text(index.read_text().replace('"track"', '"trick"', 1))
-    fails(r"histories_index\.jsonl, line 1: lacks the fields \['track'\]")
+    fails(r"histories_index\.jsonl, line 1: missing the fields \['track'\]")
     (tmp_path / "files" / "tasks.jsonl").unlink()
     for name in ("histories.h5", "histories_index.jsonl"):
         shutil.copy(published / name, tmp_path / "files")
@@ -128,5 +128,5 @@ def test_on_the_command_line(lite, tmp_path, to):
             cli, ["convert", str(target), str(tmp_path / "r"), "--to", "lite", "--kept-steps", "20"]
         )
         assert back.exit_code == 0, back.output
-        assert verify_release(tmp_path / "r", deep=True).ok
+        assert verify_release(tmp_path / "r", level="deep").ok
         assert CliRunner().invoke(cli, ["convert", str(target), str(tmp_path / "x"), "--to", "parquet"]).exit_code != 0

@@ -1,4 +1,4 @@
-"""Writing: what goes in comes out, by our reader and by plain h5py; nothing half-written is ever taken for whole."""
+"""Writing: releases read back as written, by our reader and by plain h5py; no unfinished one is ever read."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -30,7 +32,7 @@ from tests.helpers.paths import ROOT
 from tests.helpers.random_play import make_tasks, play, random_release
 
 
-def test_our_reader_gives_back_every_array(either):
+def test_our_reader_returns_every_array(either):
     root, written = either
     dataset = load_icrl4aht(root)
     assert len(dataset) == len(written) == 12
@@ -45,7 +47,7 @@ def test_our_reader_gives_back_every_array(either):
         )
 
 
-def test_plain_h5py_reads_the_same(either):
+def test_plain_h5py_reads_every_array(either):
     root, written = either
     for entry in load_icrl4aht(root).entries:
         with h5py.File(root / entry.shard) as file:
@@ -97,7 +99,7 @@ def test_any_release_round_trips_and_verifies(tmp_path, layout, episodes, length
         seed=seed,
         shard_histories=shard_histories,
     )
-    report = verify_release(root, deep=True)
+    report = verify_release(root, level="deep")
     assert report.ok, report.findings
     assert report.transitions == 3 * episodes * length
     dataset = load_icrl4aht(root)
@@ -138,36 +140,46 @@ def test_returns_of_episodes():
 
 
 def visible(folder):
-    """What is in a folder but for lock files."""
+    """Return the names in a folder, without lock files."""
     return sorted(path.name for path in folder.iterdir() if path.suffix != ".lock")
 
 
-def lossy(arrays):
-    return arrays | {"rewards": arrays["rewards"] + 0.5}
+def write_cramped(root: Path, load: Callable[[], list[NewHistory]], streams: int = 1, **options: Any) -> None:
+    """Write a release of one task on cramped_up with episodes of 10 steps."""
+    (task,) = make_tasks(["cramped_up"])
+    new = NewTask(task, Provenance(), streams, load)
+    write_release(root, "lite", [new], data_version="0.0.1", card="", kept_steps=10, **options)
 
 
-def short(arrays):
-    return arrays | {"actions": arrays["actions"][:-1]} | {"state": arrays["state"][:-1]}
+def played() -> dict[str, np.ndarray]:
+    """Return the arrays of one history of 5 episodes of 10 steps on cramped_up."""
+    return play(get_layout("cramped_up"), 5, 10, np.random.default_rng(0))
 
 
-def bare(arrays):
-    return {name: array for name, array in arrays.items() if name != "episode_end_state"}
-
-
-def odd(arrays):
-    return arrays | {"dones": np.roll(arrays["dones"], 1)}
+def fail() -> list[NewHistory]:
+    raise RuntimeError("no data")
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
-    [(lossy, "values that int8 cannot hold"), (short, "rows, expected"), (bare, "lacks the arrays"), (odd, "10 steps")],
+    [
+        (lambda a: a | {"rewards": a["rewards"] + 0.5}, "values that int8 cannot hold"),
+        (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, "rows, expected"),
+        (lambda a: {name: array for name, array in a.items() if name != "episode_end_state"}, "has no arrays"),
+        (lambda a: a | {"dones": np.roll(a["dones"], 1)}, "10 steps"),
+    ],
 )
-def test_arrays_that_do_not_fit_are_refused_and_nothing_remains(tmp_path, spoil, message):
-    (task,) = make_tasks(["cramped_up"])
-    arrays = spoil(play(task.layout, 5, 10, np.random.default_rng(0)))
-    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)])
+def test_unfit_arrays_are_refused_and_nothing_remains(tmp_path, spoil, message):
     with pytest.raises(OptionError, match=message):
-        write_release(tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
+        write_cramped(tmp_path / "out", lambda: [NewHistory(0, spoil(played()))])
+    assert visible(tmp_path) == []
+
+
+@pytest.mark.parametrize("announced", [1, 3])
+def test_a_wrong_number_of_histories_is_refused(tmp_path, announced):
+    arrays = played()
+    with pytest.raises(OptionError, match=f"2 histories, but {announced} were announced"):
+        write_cramped(tmp_path / "out", lambda: [NewHistory(k, arrays) for k in range(2)], announced, shard_histories=1)
     assert visible(tmp_path) == []
 
 
@@ -175,31 +187,13 @@ def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
     root = tmp_path / "release"
     random_release(root, seed=1)
     before = (root / "MANIFEST.sha256").read_bytes()
-
-    def fail():
-        raise RuntimeError("no data")
-
     with pytest.raises(RuntimeError, match="no data"):
-        write_release(
-            root, "lite", [NewTask(make_tasks(["cramped_up"])[0], Provenance(), 1, fail)], data_version="1.0.0", card=""
-        )
+        write_cramped(root, fail)
     assert (root / "MANIFEST.sha256").read_bytes() == before
     assert verify_release(root).ok
     random_release(root, seed=2)
     assert (root / "MANIFEST.sha256").read_bytes() != before
     assert visible(tmp_path) == ["release"]
-
-
-def test_a_task_that_gives_other_than_announced_is_refused(tmp_path):
-    (task,) = make_tasks(["cramped_up"])
-    arrays = play(task.layout, 5, 10, np.random.default_rng(0))
-    for announced in (1, 3):
-        new = NewTask(task, Provenance(), announced, lambda: [NewHistory(k, arrays) for k in range(2)])
-        with pytest.raises(OptionError, match=f"2 histories, but {announced} were announced"):
-            write_release(
-                tmp_path / "out", "lite", [new], data_version="0.0.1", card="", kept_steps=10, shard_histories=1
-            )
-    assert visible(tmp_path) == []
 
 
 def test_no_task_and_a_task_twice_are_refused(tmp_path):
@@ -211,14 +205,12 @@ def test_no_task_and_a_task_twice_are_refused(tmp_path):
 
 
 def test_two_writers_of_one_release(tmp_path):
-    def meanwhile():
+    def meanwhile() -> list[NewHistory]:
         with pytest.raises(OptionError, match="another process is writing it"):
             random_release(tmp_path / "release")
-        return [NewHistory(0, play(task.layout, 5, 10, np.random.default_rng(0)))]
+        return [NewHistory(0, played())]
 
-    (task,) = make_tasks(["cramped_up"])
-    new = NewTask(task, Provenance(), 1, meanwhile)
-    write_release(tmp_path / "release", "lite", [new], data_version="0.0.1", card="", kept_steps=10)
+    write_cramped(tmp_path / "release", meanwhile)
     assert verify_release(tmp_path / "release").histories == 1
 
 
@@ -226,13 +218,8 @@ def test_a_writer_killed_between_the_two_renames(tmp_path):
     random_release(tmp_path / "release", seed=1)
     before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
     (tmp_path / "release").rename(tmp_path / ".release.old")
-
-    def fail():
-        raise RuntimeError
-
     with pytest.raises(RuntimeError):
-        new = NewTask(make_tasks(["cramped_up"])[0], Provenance(), 1, fail)
-        write_release(tmp_path / "release", "lite", [new], data_version="1.0.0", card="")
+        write_cramped(tmp_path / "release", fail)
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
 
 
@@ -244,47 +231,54 @@ def test_a_link_to_a_release_is_followed(tmp_path):
     assert verify_release(tmp_path / "real").histories == 4
 
 
-def test_a_file_in_the_way(tmp_path):
-    (tmp_path / "release").write_text("mine")
-    with pytest.raises(OptionError, match="is not a release"):
-        random_release(tmp_path / "release")
-
-
-def test_a_folder_that_is_no_release_is_not_replaced(tmp_path):
+def test_only_releases_are_replaced(tmp_path):
+    (tmp_path / "file").write_text("mine")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
-    with pytest.raises(OptionError, match="is not a release"):
-        random_release(tmp_path / "mine")
+    for name in ("file", "mine"):
+        with pytest.raises(OptionError, match="is not a release"):
+            random_release(tmp_path / name)
+    assert (tmp_path / "file").read_text() == "mine"
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.05, 0.2])
-def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, delay):
+@pytest.mark.parametrize(
+    ("pause", "delay", "streams"),
+    [
+        (60, 0.0, 2),  # killed after the first shard
+        pytest.param(0, 0.05, 40, marks=pytest.mark.slow),  # killed at any point after it
+        pytest.param(0, 0.2, 40, marks=pytest.mark.slow),
+    ],
+)
+def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, pause, delay, streams):
     root = tmp_path / "release"
-    code = (
-        "import sys; from pathlib import Path; from tests.helpers.random_play import random_release;"
-        "print('go', flush=True);"
-        "random_release(Path(sys.argv[1]), streams=40, episodes=60, length=100)"
-    )
+    code = f"""
+import sys, time
+from pathlib import Path
+from icrl4aht_data.writing import release
+from tests.helpers.random_play import random_release
+
+def write_shard(*arguments, write=release.write_shard):
+    write(*arguments)
+    print("written", flush=True)
+    time.sleep({pause})
+
+release.write_shard = write_shard
+random_release(Path(sys.argv[1]), streams={streams}, episodes=60, length=100)
+"""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    writer = subprocess.Popen(
-        [sys.executable, "-c", code, str(root)], stdout=subprocess.PIPE, text=True, env=environment
-    )
-    assert writer.stdout is not None
-    writer.stdout.readline()
-    deadline = time.monotonic() + 60
-    while not (tmp_path / ".release.partial").exists() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    time.sleep(delay)
-    writer.send_signal(signal.SIGKILL)
-    writer.wait()
-    writer.stdout.close()
+    command = [sys.executable, "-c", code, str(root)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "written\n"
+        time.sleep(delay)
+        writer.send_signal(signal.SIGKILL)
     assert not root.exists()
     with pytest.raises(RootNotFoundError):
         load_icrl4aht(root)
     assert (tmp_path / ".release.partial").exists(), "the writer was killed too late for this test"
     assert not verify_release(tmp_path / ".release.partial").ok
-    random_release(root, streams=1)  # the next writer clears up and succeeds
+    random_release(root, streams=1)  # the next writer removes the rest
     assert verify_release(root).ok
     assert visible(tmp_path) == ["release"]
 

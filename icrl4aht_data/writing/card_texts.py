@@ -1,0 +1,24 @@
+"""Texts of `cards/dataset_texts.toml`: sentences of dataset cards, and descriptions of a release's fields."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from string import Template
+
+from icrl4aht_data.utils.templates import card_file
+
+
+@cache
+def card_texts(section: str) -> dict[str, str]:
+    """Return a section of the file, name -> text.
+
+    Args:
+        section: "sentences", "kinds" (of release), "arrays" (`schema.FIELDS`) or "index" (fields of `schema.Entry`).
+    """
+    return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
+
+
+def sentence(name: str, **values: object) -> str:
+    """Return a sentence with every $name replaced by its value."""
+    return Template(card_texts("sentences")[name].strip("\n")).substitute(values)

@@ -1,0 +1,73 @@
+"""Histories of existing releases as input of `write_release`, read one array at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import TASKS, TEAMMATES, Kind, held_fields
+from icrl4aht_data.writing.release import NewHistory, NewTask
+
+HistoryProgress = Callable[[int, int], None]
+"""Called with the number of histories done, and their total."""
+
+
+class LazyArrays(Mapping[str, np.ndarray]):
+    """The arrays of one history, each read when it is accessed, so that a shard's arrays need not fit in memory.
+
+    Args:
+        names: names of the fields.
+        read: returns the array of a field.
+    """
+
+    def __init__(self, names: Sequence[str], read: Callable[[str], np.ndarray]) -> None:
+        self._names, self._read = names, read
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._read(name)
+
+    def __contains__(self, name: object) -> bool:  # the base class would read the array
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def release_tasks(dataset: Dataset) -> list[Task]:
+    """Return the tasks of a selection's release; without given tasks those of the selection, known by name only."""
+    if dataset.knows_tasks:
+        return read_tasks(dataset.origin.file(TASKS))
+    return list({entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}.values())
+
+
+def stored_task(
+    dataset: Dataset, task: Task, provenance: Provenance, kind: Kind, done: Callable[[], None] = lambda: None
+) -> NewTask:
+    """Return a task to write, with all histories of a selection in order, and the checkpoint of its teammate.
+
+    Args:
+        dataset: histories of the task.
+        task: the task.
+        provenance: how the histories were made.
+        kind: kind of the release to write.
+        done: called after each history.
+    """
+
+    def load() -> Iterator[NewHistory]:
+        for history in dataset:
+            names = [field.name for field in held_fields(kind) if history.entry.has(field)]
+            yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read))
+            done()
+
+    files = checkpoint_files(dataset.origin.below(TEAMMATES), task, dataset.root)
+    return NewTask(task, provenance, len(dataset), load, files)
