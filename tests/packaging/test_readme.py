@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from baselines.commands.cli import cli as baselines_cli
-from baselines.report.headroom import published_table
+from baselines.report.summary import published_table
 from generation.cli import cli as generation_cli
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.utils.templates import card_file
