@@ -29,7 +29,7 @@ import jax
 from benchmarks.common import folder_size, peak_memory, print_line
 from generation.collection.task import make_learner, run_task
 from generation.collection.task_folder import last_timing
-from generation.learners.network import Widths
+from generation.learners.config import Widths
 from generation.profiles import Profile, load_profile
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS

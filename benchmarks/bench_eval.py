@@ -23,7 +23,7 @@ from baselines.evaluate.rollout import EvaluationRollout, task_key
 from benchmarks.common import elapsed, print_line, rates_in_turn
 from generation.env import Environment
 from generation.teammates.instances import published_tasks
-from generation.teammates.registry import build
+from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -34,7 +34,7 @@ _EPISODES = 20
 def evaluator(layout: Layout, family: str) -> tuple[Any, int]:
     """A function that plays one episode of every task of a family, and the number of tasks."""
     tasks = [t for t in published_tasks(track_of(layout.name)) if (t.layout, t.teammate_kind) == (layout, family)]
-    mates = [build(layout, task.teammate, noise="seeded") for task in tasks]
+    mates = [build_teammate(layout, task.teammate, noise="seeded") for task in tasks]
     rollout = EvaluationRollout(layout, random(layout), mates, replace(PROTOCOLS["seeded"], episodes=_EPISODES))
     play, params = jax.jit(rollout.episode), rollout.teammate_params
     environments = rollout.start(jnp.stack([task_key(0, task.task_id) for task in tasks]))

@@ -22,9 +22,9 @@ import jax
 from benchmarks.common import print_line, rates_in_turn, ratio_facts
 from benchmarks.peers import jaxmarl_environment
 from generation.env import Environment
+from generation.learners.config import PPOConfig
 from generation.learners.population.fcp import FCP
 from generation.learners.population.population import Population
-from generation.learners.ppo import PPOConfig
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 

@@ -1,22 +1,23 @@
-"""`python -m generation`: thin commands."""
+"""Commands of `python -m generation`: they parse, call, and print."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
-from generation.collection.options import EXECUTORS, Executor, Options, ask_for_determinism, leave_memory_to_workers
+from generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
+from generation.learners.config import PPOConfig, Widths
 from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
-    COUNT_OR_NONE,
     LAYOUT,
     SEED,
     SETTINGS,
@@ -32,9 +33,16 @@ from icrl4aht_data.format.schema import KINDS, Kind
 
 console = Console(soft_wrap=True)
 
-_profile = click.option(
+_profile_option = click.option(
     "--profile", "profile_name", default="smoke", metavar="PROFILE", help="smoke, mini or paper, or a TOML file."
 )
+
+_ego_options = dataclass_options(
+    PPOConfig,
+    "ego",
+    default_text={field.name: "the profile's" for kind in (PPOConfig, Widths) for field in fields(kind)},
+)
+"""One option for every hyper-parameter of the egos; those given replace the profile's."""
 
 _SECTIONS = {
     "Rebuild": ("plan", "generate", "check"),
@@ -57,8 +65,8 @@ _SECTIONS = {
 def cli() -> None:
     """Rebuild the ICRL4AHT dataset from the environment and the teammates.
 
-    Needs the extra generation. What a command has finished is kept: after a stop the same command goes on. Exit codes:
-    0 done, 1 a failure or a difference, 2 a misused command.
+    Needs the extra generation. Finished work is kept: the same command resumes a stopped one. Exit codes: 0 done, 1 a
+    failure or a difference, 2 a misused command.
     """
 
 
@@ -69,28 +77,22 @@ def cli() -> None:
         "python -m generation generate --profile paper --out build/paper --executor ray",
     )
 )
-@_profile
+@_profile_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write artefacts and releases here.")
 @click.option(
     "--kind",
     type=click.Choice(KINDS),
     multiple=True,
     default=("lite",),
-    help="Of release, in OUT/KIND; again for more.",
+    help="Kind of release, written to OUT/KIND; repeat for more.",
 )
-@click.option("--suite", type=Folder(), metavar="FOLDER", help="The learned teammates.", show_default="OUT/suite")
-@click.option("--seed", type=SEED, default=0, help="Of the learned teammates.")
-@click.option("--bundle", is_flag=True, help="Also make the lite release the one that the package bundles.")
-@click.option("--executor", type=click.Choice(EXECUTORS), default="local", help="One task at a time here, or Ray.")
-@click.option("--address", metavar="HOST:PORT", help="Of a running Ray cluster.", show_default="a Ray made here")
 @click.option(
-    "--workers",
-    type=COUNT,
-    help="Tasks at a time on the Ray made here.",
-    show_default="one per GPU, or per core",
+    "--suite", type=Folder(), metavar="FOLDER", help="Folder of the learned teammates.", show_default="OUT/suite"
 )
-@click.option("--retries", type=COUNT_OR_NONE, default=0, help="Of a task that failed.")
-@click.option("--fail-fast", is_flag=True, help="Begin no task after one has failed.")
+@click.option("--seed", type=SEED, default=0, help="Seed of the learned teammates.")
+@click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
+@dataclass_options(CollectOptions, "collect")
+@_ego_options
 def generate(
     profile_name: str,
     out: Path,
@@ -98,31 +100,30 @@ def generate(
     suite: Path | None,
     seed: int,
     bundle: bool,
-    executor: Executor,
-    address: str | None,
-    workers: int | None,
-    retries: int,
-    fail_fast: bool,
+    collect: dict[str, Any],
+    ego: dict[str, Any],
 ) -> None:
-    """Rebuild a release, from nothing or from where it was.
+    """Rebuild a release, or resume a rebuild.
 
     Trains the teammates of a profile and an ego for each of its tasks, records how they learn (OUT/artefacts), and
-    packs the release OUT/lite or OUT/full. What is not finished goes on from its last saved update. Teammates are
-    trained by this process, tasks by the executor. Tasks that fail are listed in OUT/failed.jsonl; the others are
-    finished, nothing is packed, and the exit code is 1.
+    packs the release OUT/lite or OUT/full. Unfinished work resumes from its last saved update. This process trains the
+    teammates, the executor collects the tasks. Tasks that fail are listed in OUT/failed.jsonl; the others are finished,
+    nothing is packed, and the exit code is 1. Hyper-parameters of the egos replace those of the profile.
     """
+    from generation.profiles import load_profile
     from generation.releases.build import build_releases
     from generation.releases.package import bundle_release
 
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
-    if executor == "local" and (address or workers):
+    options = replace_given(CollectOptions(), collect)
+    if options.executor == "local" and (options.address or options.workers):
         raise click.UsageError("--address and --workers need --executor ray")
-    ask_for_determinism()
-    if executor == "ray":
-        leave_memory_to_workers()
-    options = Options(executor, address, workers, retries, fail_fast)
-    releases = dict(zip(kind, build_releases(profile_name, out, kind, console, options, suite, seed), strict=True))
+    request_determinism()
+    if options.executor == "ray":
+        allocate_gpu_memory_on_demand()
+    profile = load_profile(profile_name).with_ego(ego)
+    releases = dict(zip(kind, build_releases(profile, out, kind, console, options, suite, seed), strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
@@ -130,22 +131,23 @@ def generate(
 
 
 @cli.command()
-@_profile
-@click.option("--devices", type=COUNT, default=8, help="Also say the hours on so many of these devices.")
+@_profile_option
+@click.option("--devices", type=COUNT, default=8, help="Also estimate the hours on this many devices.")
 @json_option
-def plan(profile_name: str, devices: int, as_json: bool) -> None:
-    """Say what a rebuild will cost.
+@_ego_options
+def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) -> None:
+    """Estimate the cost of a rebuild.
 
-    Prints tasks, environment steps, disk, and hours at the speed that is measured here. Writes nothing.
+    Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
     """
-    from generation.planning.plan import cost
+    from generation.planning.plan import estimate_cost
     from generation.profiles import load_profile
 
-    costs = cost(load_profile(profile_name), devices)
+    cost = estimate_cost(load_profile(profile_name).with_ego(ego), devices)
     if as_json:
-        click.echo(json.dumps(costs.to_json(), indent=2))
+        click.echo(json.dumps(cost.to_json(), indent=2))
     else:
-        for name, value in costs.in_words():
+        for name, value in cost.rows():
             click.echo(f"{name:<28} {value}")
 
 
@@ -156,26 +158,27 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 def check(a: Path, b: Path, as_json: bool) -> None:
     """Compare two rebuilds bit for bit.
 
-    A and B are releases, artefacts, or folders that `generate` has made. Prints what differs, and exits with 1 if
-    anything does. Writes nothing.
+    A and B are releases, artefacts, or folders that `generate` wrote. Prints the differences, and exits with 1 if
+    there are any. Writes nothing.
     """
-    from generation.releases.check import compare
+    from generation.releases.check import compare_rebuilds
 
-    compared = compare(a, b)
+    compared = compare_rebuilds(a, b)
     if as_json:
         click.echo(json.dumps(compared.to_json(), indent=2))
     else:
-        for name, how in compared.differences.items():
-            click.echo(f"{name}: {how}")
+        for name, difference in compared.differences.items():
+            click.echo(f"{name}: {difference}")
         verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
         click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
     sys.exit(1 if compared.differences else 0)
 
 
 @cli.command()
-@_profile
-@click.option("--layout", type=LAYOUT, default="demo_wide", help="The layout.")
-def speed(profile_name: str, layout: str) -> None:
+@_profile_option
+@click.option("--layout", type=LAYOUT, default="demo_wide", help="Layout to measure on.")
+@_ego_options
+def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
     """Measure how fast a profile's ego learns.
 
     Prints one JSON line: steps/s, and the shares of environment, forward pass and update. Writes nothing.
@@ -186,7 +189,7 @@ def speed(profile_name: str, layout: str) -> None:
     from icrl4aht_data.overcooked.layouts import get_layout
 
     name = get_layout(layout).name
-    profile = load_profile(profile_name)
+    profile = load_profile(profile_name).with_ego(ego)
     measured = learner_speed(task_learner(replace(profile, layouts=(name,)), profile.ego))
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
 
@@ -194,9 +197,9 @@ def speed(profile_name: str, layout: str) -> None:
 @cli.command()
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 if the files differ.")
 def manifests(check: bool) -> None:
-    """Write the lists of published test tasks anew.
+    """Write the manifests of the published test tasks.
 
-    Makes icrl4aht_data/manifests/*.jsonl from the parameter tables.
+    Makes icrl4aht_data/manifests/*.jsonl from the published parameter sets.
     """
     from generation.teammates.instances import published_tasks
     from icrl4aht_data.benchmark.facts import TRACKS
@@ -208,78 +211,73 @@ def manifests(check: bool) -> None:
         if not check:
             write_tasks(path, tasks)
         elif read_tasks(path) != tasks:
-            raise TaskFormatError(f"{path}: differs from the parameter tables; run `python -m generation manifests`")
+            raise TaskFormatError(f"{path}: differs from the parameter sets; run `python -m generation manifests`")
         console.print(f"{path}: {len(tasks)} tasks")
 
 
-def _layouts(shown: str) -> Callable[[Any], Any]:
+def _layouts_option(default_text: str) -> Callable[[Any], Any]:
     return click.option(
-        "--layout",
-        "layouts",
-        type=LAYOUT,
-        multiple=True,
-        help="On this layout; again for more.",
-        show_default=shown,
+        "--layout", "layouts", type=LAYOUT, multiple=True, help="Layout; repeat for more.", show_default=default_text
     )
 
 
-_algorithms = click.option(
+_algorithms_option = click.option(
     "--algorithm",
     "algorithms",
     type=Names("algorithm", lambda: ALGORITHMS),
     multiple=True,
     default=ALGORITHMS,
-    help="fcp, brdiv, lbrdiv or comedi; again for more.",
+    help="fcp, brdiv, lbrdiv or comedi; repeat for more.",
     show_default="all",
 )
 
 
 @cli.command(epilog=examples("python -m generation teammates --profile mini --layout cramped_up --algorithm fcp"))
-@_profile
-@_layouts("the profile's")
-@_algorithms
-@click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write them here.")
-@click.option("--seed", type=SEED, default=0, help="Of their training.")
+@_profile_option
+@_layouts_option("the profile's")
+@_algorithms_option
+@click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write the populations here.")
+@click.option("--seed", type=SEED, default=0, help="Seed of their training.")
 def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, seed: int) -> None:
     """Train populations of teammates.
 
-    Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by what they earn, and writes
-    the lists of tasks with those that are left, SUITE/manifests. Finished populations are kept. Without --layout these
-    are the populations that the profile names, or all on its layouts if it names none.
+    Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by their returns, and writes
+    tasks with the remaining ones, SUITE/manifests. Finished populations are kept. Without --layout, trains the
+    populations of the profile, or all algorithms on its layouts if it names none.
     """
     from generation.populations.build import build_suite
     from generation.profiles import load_profile
     from icrl4aht_data.errors import OptionError
     from icrl4aht_data.overcooked.layouts import get_layout
 
-    ask_for_determinism()
+    request_determinism()
     profile = load_profile(profile_name)
     if layouts:
         wanted = dict.fromkeys((get_layout(name).name for name in layouts), algorithms)
     else:
-        of_profile = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
-        wanted = {layout: [name for name in names if name in algorithms] for layout, names in of_profile.items()}
+        available = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
+        wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}
         if not any(wanted.values()):
             raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: name a --layout")
     build_suite(profile, suite, wanted, seed, console)
 
 
 @cli.command()
-@_layouts("all that are finished")
-@_algorithms
+@_layouts_option("all that are finished")
+@_algorithms_option
 @click.option(
     "--suite",
     type=Folder(),
     metavar="FOLDER",
     default="build/suite",
-    help="What `teammates` has made.",
+    help="Folder that `teammates` wrote.",
 )
-@click.option("--greedy", is_flag=True, help="In seat 1 act greedily, as teammates do.")
+@click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
-    """Show how much the teammates of a suite differ.
+    """Report how much the teammates of a suite differ.
 
-    Prints self-play and cross-play of each population, and the Hamming distances of all teammates, and draws them into
-    SUITE/LAYOUT.
+    Prints self-play and cross-play returns of each population and the Hamming distances of all teammates, and draws
+    them into SUITE/LAYOUT.
     """
     from generation.populations.build import report_diversity
 
@@ -287,5 +285,5 @@ def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path
 
 
 def main() -> None:
-    """Entry point."""
+    """Entry point of `python -m generation`."""
     run(cli)

@@ -1,4 +1,4 @@
-"""Progress on a terminal; silence where output is not one."""
+"""Progress bars on a terminal; silent where the output is not one."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 _PERIOD = 300.0
-"""Seconds over which the time left is reckoned."""
+"""Seconds over which the speed is averaged for the remaining time."""
 
 
-def progress(console: Console) -> Progress:
-    """A bar with description, count, time left, and a `note` field per task."""
+def progress_bars(console: Console) -> Progress:
+    """Bars with description, count and remaining time, and a field `note` for each."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -25,23 +25,24 @@ def progress(console: Console) -> Progress:
     )
 
 
-class Board:
-    """What a collection shows: a bar for all of it (tasks, steps/s, time left), and one for each running task.
+class ProgressBoard:
+    """Progress of a collection: a bar for all tasks with steps/s and remaining time, and one for each running task.
 
     Args:
-        tasks: how many there are to do.
-        updates: of each.
+        console: where to show it.
+        tasks: number of tasks.
+        updates: number of updates of each task.
     """
 
     def __init__(self, console: Console, tasks: int, updates: int) -> None:
-        self._bars = progress(console)
+        self._bars = progress_bars(console)
         self._tasks, self._updates = tasks, updates
         self._done = 0
         self._running: dict[str, tuple[TaskID, int, float]] = {}
         self._all = self._bars.add_task("all", total=tasks * updates, note="")
         self._show()
 
-    def __enter__(self) -> Board:
+    def __enter__(self) -> ProgressBoard:
         self._bars.start()
         return self
 
@@ -50,15 +51,15 @@ class Board:
     ) -> None:
         self._bars.stop()
 
-    def running(self, task_id: str, updates: int, steps_per_second: float) -> None:
-        """So many updates of a task are done."""
+    def show_running(self, task_id: str, updates: int, steps_per_second: float) -> None:
+        """Show that a task has done so many updates."""
         bar, _, _ = self._running.get(task_id) or (self._bars.add_task(task_id, total=self._updates, note=""), 0, 0.0)
         self._running[task_id] = bar, updates, steps_per_second
         self._bars.update(bar, completed=updates, note=f"{steps_per_second:,.0f} steps/s")
         self._show()
 
-    def ended(self, task_id: str) -> None:
-        """A task is finished, given up, or left to someone else."""
+    def show_ended(self, task_id: str) -> None:
+        """Remove the bar of a task that is finished or failed."""
         bar = self._running.pop(task_id, None)
         if bar is not None:
             self._bars.remove_task(bar[0])

@@ -25,7 +25,7 @@ from baselines.evaluate.protocols import Protocol
 from baselines.evaluate.results import Result, find_result, write_result
 from baselines.evaluate.rollout import Episode, EvaluationRollout, RolloutState, task_key
 from generation.policy import Policy
-from generation.teammates.registry import build, check_theta
+from generation.teammates.registry import build_teammate, check_theta
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
@@ -114,7 +114,7 @@ def _check_teammate(task: Task, suite: Path | None) -> None:
         if task.teammate["kind"] == "heuristic":
             check_theta(task.teammate)
         else:
-            build(task.layout, task.teammate, suite=suite)
+            build_teammate(task.layout, task.teammate, suite=suite)
     except Icrl4ahtError as error:
         error.args = (f"task {task.task_id}: {error}",)
         raise
@@ -164,7 +164,7 @@ def prepare_rollout(
         OptionError: if the ego's action is not one integer for each observation.
     """
     layout = tasks[0].layout
-    mates = [build(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks]
+    mates = [build_teammate(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks]
     rollout = EvaluationRollout(layout, make_ego(layout), [mate for mate in mates for _ in seeds], protocol)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)

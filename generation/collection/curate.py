@@ -1,4 +1,4 @@
-"""Choosing streams and labelling them (paper, App. F.1 and App. D.1)."""
+"""Selects streams of a task and labels them with expert actions (paper, App. F.1 and App. D.1)."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from icrl4aht_data.plotting import plot_curves
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
-    """float64 (N, E): the return of every episode's kept steps.
+    """float64 (N, E): returns of every episode's kept steps.
 
     Args:
-        rewards: (N, T).
+        rewards: int8 (N, T).
     """
     return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
 
 def best_streams(rewards: np.ndarray, keep: int) -> np.ndarray:
-    """The `keep` streams with the highest end + improvement, best first, ties by number.
+    """int (keep,): numbers of the streams with the highest end + improvement, best first, ties by number.
 
     Args:
-        rewards: (N, T).
+        rewards: int8 (N, T).
+        keep: how many.
     """
     return np.argsort(-stream_score(stream_returns(rewards)), kind="stable")[:keep]
 
@@ -49,19 +50,22 @@ def filter_report(rewards: np.ndarray, streams: np.ndarray) -> StreamFilter:
 
 
 def plot_filter(path: Path, title: str, rewards: np.ndarray, streams: np.ndarray) -> None:
-    """The learning curves of all streams and of the chosen ones, into a PNG."""
+    """Draw the learning curves of all streams and of the selected ones into a PNG."""
     returns = stream_returns(rewards)
     curves = {f"before: {len(returns)} streams": returns, f"after: {len(streams)} streams": returns[streams]}
     plot_curves(path, [(title, curves)])
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """What the final checkpoint would do, greedily, at every step of each stream.
+    """Yields the final checkpoint's most probable action at every step of each stream.
 
-    Its recurrent state starts from zero at each episode and is carried through it.
+    The recurrent state is zero at the start of each episode, as in training.
 
     Args:
-        states: uint8 (T, S) of each stream.
+        layout: the layout.
+        network: the ego's network.
+        params: its final parameters.
+        states: uint8 (T, S) for each stream.
 
     Yields:
         int8 (T,) for each stream.

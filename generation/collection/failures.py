@@ -1,4 +1,4 @@
-"""TODO."""
+"""failed.jsonl: the tasks of a rebuild that failed, and why."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from generation.collection.job import Outcome
+from generation.collection.job import TaskOutcome
 from icrl4aht_data.utils.files import atomic_write, read_text
 
 FAILED = "failed.jsonl"
 
 
 class FailureLog:
-    """failed.jsonl: one line per failed task that is still without an artefact. Collectors may share it."""
+    """One line per failed task that still has no artefact. Collectors may share the file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock = FileLock(path.with_name(f".{path.name}.lock"))
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: TaskOutcome) -> None:
+        """Add a task's line, or replace the one of an earlier attempt."""
         line = {
             "task_id": outcome.task.task_id,
             "attempts": outcome.attempts,
@@ -31,7 +32,7 @@ class FailureLog:
         self._change(lambda lines: [*(old for old in lines if old["task_id"] != line["task_id"]), line])
 
     def forget(self, task_ids: Iterable[str]) -> None:
-        """Drop the lines of tasks that are finished."""
+        """Remove the lines of tasks that are finished."""
         finished = set(task_ids)
         self._change(lambda lines: [line for line in lines if line["task_id"] not in finished])
 

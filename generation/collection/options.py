@@ -1,4 +1,4 @@
-"""How to collect: what the command line asks for."""
+"""Options of a collection, and environment variables that JAX reads when it is first used."""
 
 from __future__ import annotations
 
@@ -6,39 +6,37 @@ import os
 from dataclasses import dataclass
 from typing import Literal
 
-Executor = Literal["local", "ray"]
-EXECUTORS: tuple[Executor, ...] = ("local", "ray")
+from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 
 @dataclass(frozen=True)
-class Options:
-    """How to collect.
+class CollectOptions:
+    """How tasks are collected. See the fields' help texts."""
 
-    Args:
-        executor: "local" for one task after the other in this process; "ray".
-        address: of a running Ray cluster; a local Ray is started for the occasion by default.
-        workers: of the Ray that is started, and so tasks at a time; one per GPU, or else per core, by default.
-        retries: of a task that failed.
-        fail_fast: whether to begin no task after one has failed.
-    """
+    executor: Literal["local", "ray"] = option_field("local", "Run one task at a time here, or use Ray.")
+    address: str | None = option_field(
+        None, "HOST:PORT of a running Ray cluster.", default_text="start a local Ray for this command"
+    )
+    workers: int | None = option_field(
+        None, "Tasks at a time on the local Ray.", at_least=1, default_text="one per GPU, or per core"
+    )
+    retries: int = option_field(0, "Further attempts for a task that failed.", at_least=0)
+    fail_fast: bool = option_field(False, "Start no task after one has failed.")
 
-    executor: Executor = "local"
-    address: str | None = None
-    workers: int | None = None
-    retries: int = 0
-    fail_fast: bool = False
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
-def ask_for_determinism() -> None:
-    """Have XLA choose only operations that give the same bits in every run; before JAX is first used.
+def request_determinism() -> None:
+    """Make XLA choose only GPU operations that give the same bits in every run; call before JAX is first used.
 
-    On a CPU they are; on a GPU they are chosen by measured speed, and some add up in any order.
+    On a CPU all of them do; on a GPU they are chosen by measured speed, and some sum in varying order.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_gpu_deterministic_ops" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
 
 
-def leave_memory_to_workers() -> None:
-    """Have JAX take GPU memory as it needs it, not most of it at once; before JAX is first used."""
+def allocate_gpu_memory_on_demand() -> None:
+    """Make JAX allocate GPU memory as needed instead of most of it at once; call before JAX is first used."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

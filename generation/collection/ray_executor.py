@@ -1,4 +1,4 @@
-"""Tasks on Ray, which schedules them, gives each a GPU where there are any, and tries failed ones again.
+"""Tasks on Ray, which schedules them, assigns a GPU to each if there are any, and retries failed ones.
 
 A Ray that is started here listens on 127.0.0.1 only, without dashboard and usage reports.
 """
@@ -13,20 +13,22 @@ from typing import Any
 
 from rich.text import Text
 
-from generation.collection.job import Job, Outcome
-from generation.collection.options import Options, ask_for_determinism
+from generation.collection.job import CollectionJob, TaskOutcome
+from generation.collection.options import CollectOptions, request_determinism
 from generation.collection.task_folder import last_timing
-from generation.progress import Board
+from generation.progress import ProgressBoard
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 
 _POLL_SECONDS = 1.0
-_REACHED = 10  # seconds
+_CONNECT_SECONDS = 10.0
 _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the disk; nothing large passes through Ray
 
 
-def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
-    """Tasks as workers are free. The artefacts' folder must be the same on every machine.
+def run_on_ray(
+    job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+) -> Generator[TaskOutcome]:
+    """Runs tasks as workers are free. The artefacts' folder must be shared by all machines.
 
     Raises:
         OptionError: if Ray is not installed, or cannot be reached.
@@ -38,7 +40,7 @@ def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> G
         remote = ray.remote(
             num_cpus=1,
             num_gpus=int(accelerated),
-            max_calls=1,  # a process of its own for each task, so that its memory goes with it
+            max_calls=1,  # a process for each task, so that its memory is released
             max_retries=options.retries,
             retry_exceptions=True,
         )(_work)
@@ -48,40 +50,40 @@ def on_ray(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> G
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
                 for reference in ready:
                     yield _outcome(ray, reference, pending.pop(reference), options)
-                _show(job, pending.values(), board)
+                _show_progress(job, pending.values(), board)
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
 
 
-def _show(job: Job, tasks: Iterable[Task], board: Board) -> None:
-    for task in tasks:
+def _show_progress(job: CollectionJob, tasks: Iterable[Task], board: ProgressBoard) -> None:
+    for task in tasks:  # workers report through their artefacts' timing files
         timing = last_timing(job.folder(task))
         if timing:
-            board.running(task.task_id, int(timing["update"]) + 1, timing["steps_per_second"])
+            board.show_running(task.task_id, int(timing["update"]) + 1, timing["steps_per_second"])
 
 
-def _work(job: Job, task: Task) -> str:
-    ask_for_determinism()
+def _work(job: CollectionJob, task: Task) -> str:
+    request_determinism()
     return job(task)
 
 
-def _outcome(ray: Any, reference: Any, task: Task, options: Options) -> Outcome:
+def _outcome(ray: Any, reference: Any, task: Task, options: CollectOptions) -> TaskOutcome:
     try:
-        return Outcome(task, ray.get(reference))
-    except ray.exceptions.RayError as error:  # what the task raised, or the worker itself is gone
+        return TaskOutcome(task, ray.get(reference))
+    except ray.exceptions.RayError as error:  # raised by the task, or the worker died
         cause = getattr(error, "cause", error)
         trace = Text.from_ansi(str(error)).plain
-        return Outcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
+        return TaskOutcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
 
 
 def _check_reachable(address: str | None) -> None:
-    """Whether something listens at HOST:PORT, for which Ray would wait for minutes."""
+    """Raise an error if nothing listens at HOST:PORT; Ray itself would wait for minutes."""
     host, _, port = (address or "").rpartition(":")
     if not host or "/" in host or not port.isdecimal():
         return
     try:
-        socket.create_connection((host, int(port)), timeout=_REACHED).close()
+        socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
     except (OSError, OverflowError, UnicodeError) as error:
         raise OptionError(
             f"Ray at {address} cannot be reached: {error}; check the address, and `ray status`"
@@ -89,10 +91,10 @@ def _check_reachable(address: str | None) -> None:
 
 
 @contextmanager
-def _connected(options: Options) -> Iterator[Any]:
+def _connected(options: CollectOptions) -> Iterator[Any]:
     if options.address is None:
-        # Read when Ray is first imported. It is named after its main use; what it does is to take the loopback address
-        # for this machine's, which is where Ray's servers listen.
+        # Read when Ray is first imported. The name is misleading: this makes Ray's servers listen on the loopback
+        # address.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     elif options.workers is not None:

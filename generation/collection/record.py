@@ -1,4 +1,4 @@
-"""Learner + teammate -> history arrays: keeps the first steps of every episode. No files of its own."""
+"""Roll-outs -> arrays of learning histories: the first steps of every episode. Writes no files."""
 
 from __future__ import annotations
 
@@ -6,25 +6,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from generation.learners.ppo import PPOConfig, Rollout
+from generation.learners.config import PPOConfig
+from generation.learners.rollout import Rollout
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
 
-class Histories(NamedTuple):
-    """N histories of T = episodes x 100 steps; arrays or memory maps."""
+class HistoryArrays(NamedTuple):
+    """N histories of E episodes and T = 100 E steps; NumPy arrays or memory maps.
 
-    state: np.ndarray  # uint8 (N, T, S), before each step
-    actions: np.ndarray  # int8 (N, T), sampled by the ego
-    teammate_actions: np.ndarray  # int8 (N, T)
-    rewards: np.ndarray  # int8 (N, T), the team's, unshaped
-    episode_end_state: np.ndarray  # uint8 (N, E, S), after each episode's last kept step
+    Attributes:
+        state: uint8 (N, T, S), state records before each step.
+        actions: int8 (N, T), the ego's sampled actions.
+        teammate_actions: int8 (N, T).
+        rewards: int8 (N, T), the team's, unshaped.
+        episode_end_state: uint8 (N, E, S), state records after each episode's last kept step.
+    """
+
+    state: np.ndarray
+    actions: np.ndarray
+    teammate_actions: np.ndarray
+    rewards: np.ndarray
+    episode_end_state: np.ndarray
 
 
-def shapes(layout: Layout, config: PPOConfig) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Shape and dtype of every array of `Histories`."""
+def array_shapes(layout: Layout, config: PPOConfig) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Shape and dtype of every field of `HistoryArrays`."""
     n, episodes, size = config.environments, config.episodes, record_size(layout)
     steps = (n, episodes * KEPT_STEPS)
     return {
@@ -36,18 +45,18 @@ def shapes(layout: Layout, config: PPOConfig) -> dict[str, tuple[tuple[int, ...]
     }
 
 
-def keep(histories: Histories, update: int, rollout: Rollout) -> None:
+def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> None:
     """Write the kept steps of one roll-out into the histories.
 
-    All environments start together and never end early, so the number of a step says its episode and its clock; writing
-    a roll-out twice changes nothing.
+    All environments start together and never end early, so the number of a step determines its episode and its clock;
+    writing a roll-out twice changes nothing, which a resumed task relies on.
     """
     length = rollout.record.shape[0]
     step = np.arange(update * length, (update + 1) * length)
     episode, clock = step // EPISODE_STEPS, step % EPISODE_STEPS
-    whole = episode < histories.episode_end_state.shape[1]
-    kept = whole & (clock < KEPT_STEPS)
-    after = whole & (clock == KEPT_STEPS)
+    complete = episode < histories.episode_end_state.shape[1]
+    kept = complete & (clock < KEPT_STEPS)
+    after = complete & (clock == KEPT_STEPS)
     record = np.asarray(rollout.record).swapaxes(0, 1)
     actions = np.asarray(rollout.actions).swapaxes(0, 1)
     to = episode[kept] * KEPT_STEPS + clock[kept]

@@ -1,4 +1,4 @@
-"""All tasks of a rebuild: in this process, or on Ray. What fails is written down, the rest goes on."""
+"""All tasks of a rebuild, in this process or on Ray. Failures are logged, and the other tasks continue."""
 
 from __future__ import annotations
 
@@ -12,36 +12,40 @@ from typing import Protocol
 from rich.console import Console
 
 from generation.collection.failures import FAILED, FailureLog
-from generation.collection.job import CollectionError, Job, Outcome
-from generation.collection.options import Options
-from generation.collection.task_folder import is_finished, last_timing
+from generation.collection.job import CollectionError, CollectionJob, TaskOutcome
+from generation.collection.options import CollectOptions
+from generation.collection.task_folder import is_task_finished, last_timing
 from generation.profiles import Profile
-from generation.progress import Board
+from generation.progress import ProgressBoard
 from icrl4aht_data.benchmark.tasks import Task
 
 
-class Execute(Protocol):
-    """Does tasks in any order; closing the generator calls off those that are not done."""
+class Executor(Protocol):
+    """Runs tasks in any order; closing the generator cancels those that are not done."""
 
-    def __call__(self, job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]: ...
+    def __call__(
+        self, job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+    ) -> Generator[TaskOutcome]: ...
 
 
-def in_process(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
-    """One task after the other."""
+def run_in_process(
+    job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+) -> Generator[TaskOutcome]:
+    """Runs one task after the other."""
     for task in tasks:
         yield _attempt(job, task, board, options.retries + 1)
 
 
-def _attempt(job: Job, task: Task, board: Board, attempts: int) -> Outcome:
-    def report(update: int, metrics: dict[str, float]) -> None:
-        board.running(task.task_id, update + 1, metrics["steps_per_second"])
+def _attempt(job: CollectionJob, task: Task, board: ProgressBoard, attempts: int) -> TaskOutcome:
+    def on_update(update: int, metrics: dict[str, float]) -> None:
+        board.show_running(task.task_id, update + 1, metrics["steps_per_second"])
 
-    outcome = Outcome(task, "failed")
+    outcome = TaskOutcome(task, "failed")
     for attempt in range(1, attempts + 1):
         try:
-            return Outcome(task, job(task, report), attempt)
-        except Exception as error:  # whatever it is, the other tasks go on
-            outcome = Outcome(task, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
+            return TaskOutcome(task, job(task, on_update), attempt)
+        except Exception as error:  # whatever it is, the other tasks continue
+            outcome = TaskOutcome(task, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
     return outcome
 
 
@@ -50,35 +54,44 @@ def collect_tasks(
     profile: Profile,
     out: Path,
     console: Console,
-    options: Options,
+    options: CollectOptions,
     suite: Path | None = None,
 ) -> None:
-    """Make every task's artefact under out/artefacts. Tasks that another collector is at are left to it, then checked.
+    """Make every task's artefact under out/artefacts.
+
+    Tasks that another collector works on are left to it, and waited for at the end.
 
     Args:
-        suite: the folder of the learned teammates, where the tasks have any.
+        tasks: the tasks.
+        profile: their profile.
+        out: folder of the rebuild.
+        console: where progress is printed.
+        options: how to collect.
+        suite: folder of the learned teammates, if the tasks have any.
 
     Raises:
-        CollectionError: if an artefact is missing at the end; out/failed.jsonl says why.
+        CollectionError: if an artefact is missing at the end; out/failed.jsonl has the reasons.
     """
-    artefacts = out / "artefacts"
+    job = CollectionJob(profile, out / "artefacts", suite, wait=False)
     todo = []
     for task in tasks:
-        if is_finished(artefacts / task.task_id, task, profile):
+        if is_task_finished(job.folder(task), task, profile):
             console.print(f"{_label(task, tasks)}: finished before")
         else:
             todo.append(task)
     missing = {task.task_id for task in todo}
     failures = FailureLog(out / FAILED)
-    job = Job(profile, artefacts, suite, wait=False)
-    with Board(console, len(todo), profile.ego.updates) as board, closing(_outcomes(job, todo, board, options)) as ends:
-        for outcome in ends:
+    with (
+        ProgressBoard(console, len(todo), profile.ego.updates) as board,
+        closing(_run_all(job, todo, board, options)) as outcomes,
+    ):
+        for outcome in outcomes:
             label = _label(outcome.task, tasks)
             if outcome.status == "busy":
-                console.print(f"{label}: another collector is at it")
+                console.print(f"{label}: another collector works on it")
                 continue
-            board.ended(outcome.task.task_id)
-            console.print(f"{label}: {_in_words(outcome, job.folder(outcome.task))}")
+            board.show_ended(outcome.task.task_id)
+            console.print(f"{label}: {_describe(outcome, job.folder(outcome.task))}")
             if outcome.status == "done":
                 missing.remove(outcome.task.task_id)
                 failures.forget([outcome.task.task_id])
@@ -90,12 +103,14 @@ def collect_tasks(
     if missing:
         raise CollectionError(
             f"{len(missing)} of {len(tasks)} tasks have no artefact: {', '.join(sorted(missing))}; "
-            f"{failures.path} says why, and the same command tries them again"
+            f"{failures.path} has the reasons, and the same command tries them again"
         )
 
 
-def _outcomes(job: Job, tasks: Sequence[Task], board: Board, options: Options) -> Generator[Outcome]:
-    """Of every task; those that another collector is at come again at the end, when it has been waited for."""
+def _run_all(
+    job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+) -> Generator[TaskOutcome]:
+    """Runs every task, then again, waiting, those that another collector worked on."""
     execute = _executor(options)
     for wait in (False, True):
         busy: list[Task] = []
@@ -107,19 +122,19 @@ def _outcomes(job: Job, tasks: Sequence[Task], board: Board, options: Options) -
         tasks = busy
 
 
-def _executor(options: Options) -> Execute:
+def _executor(options: CollectOptions) -> Executor:
     if options.executor == "local":
-        return in_process
-    from generation.collection.ray_executor import on_ray
+        return run_in_process
+    from generation.collection.ray_executor import run_on_ray
 
-    return on_ray
+    return run_on_ray
 
 
 def _label(task: Task, tasks: Sequence[Task]) -> str:
     return f"task {tasks.index(task) + 1}/{len(tasks)} {task.layout.name} with {task.teammate_kind}"
 
 
-def _in_words(outcome: Outcome, folder: Path) -> str:
+def _describe(outcome: TaskOutcome, folder: Path) -> str:
     if outcome.status == "failed":
         times = "once" if outcome.attempts == 1 else f"{outcome.attempts} times"
         return f"failed {times}: {outcome.error}"

@@ -1,13 +1,13 @@
-"""A task's artefact on disk: what is in the folder, when it counts as finished, and how it fills.
+"""A task's artefact on disk: its files, when it counts as finished, and how it is filled.
 
-<task_id>/            finished: its hashes hold
+<task_id>/            finished: its hashes match
   metadata.json       task, settings, versions, SHA-256 of the files below
   state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
   metrics.jsonl       one line per update
   policy.safetensors policy.json   the final ego
-  timing.jsonl        wall-clock figures, and therefore no part of what is hashed
-<task_id>.partial/    the same while it fills, and `learner.safetensors`: the state after its last saved update
-.<task_id>.lock       held by the collector that is at it
+  timing.jsonl        wall-clock figures, not hashed
+<task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
+.<task_id>.lock       held by the collector that works on it
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from generation.collection import record
-from generation.learners.ppo import PPOConfig
+from generation.collection.record import HistoryArrays, array_shapes, record_rollout
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS
+from generation.learners.config import PPOConfig
 from generation.learners.resume import METRICS, TIMING, RunLog, software_versions
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
@@ -36,38 +37,38 @@ from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
 FILTER_CURVES = "filter.png"
 
-_HASHED = {f"{name}.npy" for name in record.Histories._fields} | {METRICS, "policy.safetensors", "policy.json"}
+_HASHED = {f"{name}.npy" for name in HistoryArrays._fields} | {METRICS, POLICY_WEIGHTS, POLICY_CARD}
 
 
 def partial_folder(folder: Path) -> Path:
-    """Where an unfinished artefact is."""
+    """Path of an artefact that is not finished."""
     return folder.with_name(f"{folder.name}.partial")
 
 
-def settings(task: Task, profile: Profile) -> dict[str, Any]:
-    """What an artefact is made of: a change of any of it makes the artefact anew."""
+def artefact_settings(task: Task, profile: Profile) -> dict[str, Any]:
+    """What an artefact depends on: if any of it changes, the artefact is made again."""
     return {"task": asdict(task), "ego_hash": profile.ego_hash, "code_version": version("icrl4aht-data")}
 
 
 def resumable_settings(task: Task, profile: Profile) -> dict[str, Any]:
-    """What must be the same for a resumed task to give the same bits as an uninterrupted one."""
-    return settings(task, profile) | software_versions()
+    """What must agree for a resumed task to give the bits of an uninterrupted one."""
+    return artefact_settings(task, profile) | software_versions()
 
 
-def is_finished(folder: Path, task: Task, profile: Profile) -> bool:
-    """Whether the folder holds this task's artefact under these settings, every file as it was written."""
+def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
+    """Whether the folder holds this task's artefact under these settings, with all its files unchanged."""
     try:
         metadata = parse_json(read_text(folder / METADATA))
-        wanted = settings(task, profile)
+        wanted = artefact_settings(task, profile)
         same = {name: metadata[name] for name in wanted} == wanted and set(metadata["files"]) == _HASHED
         return same and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
 
-def finish(partial: Path, task: Task, profile: Profile) -> None:
-    """Write the metadata: from here on the artefact only waits for its name."""
-    metadata = settings(task, profile) | {
+def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
+    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it."""
+    metadata = artefact_settings(task, profile) | {
         "profile": profile.name,
         "ego": asdict(profile.ego),
         "jax_version": jax.__version__,
@@ -78,30 +79,32 @@ def finish(partial: Path, task: Task, profile: Profile) -> None:
         write_json(unnamed, metadata)
 
 
-def publish(partial: Path, folder: Path) -> None:
-    """Give a complete artefact its name."""
+def publish_artefact(partial: Path, folder: Path) -> None:
+    """Rename a complete artefact to its final name."""
     (partial / LEARNER).unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     partial.rename(folder)
 
 
-class Writer:
+class ArtefactWriter:
     """Fills an artefact's histories, metrics and timing, update by update.
 
-    The arrays are memory maps of files that have their full size from the start; `sync` writes them out and maps them
-    anew, so that what is in memory is what came since the last `sync`.
+    The arrays are memory maps of files that have their full size from the start. `sync` writes them out and maps them
+    again, so that memory holds only what came since the last `sync`.
 
     Args:
         partial: an existing folder.
-        first: the update to go on with; 0 begins the files anew, otherwise whatever came after it is cut off.
+        task: the task.
+        config: the ego's hyper-parameters.
+        first: the first update to write; 0 creates the files, otherwise the log is cut at that update.
     """
 
     def __init__(self, partial: Path, task: Task, config: PPOConfig, first: int) -> None:
         self._partial, self._config, self._first = partial, config, first
         self._started = time.perf_counter()
-        self._busy = 0.0
+        self._recording = 0.0
         if not first:
-            for name, (shape, dtype) in record.shapes(task.layout, config).items():
+            for name, (shape, dtype) in array_shapes(task.layout, config).items():
                 np.lib.format.open_memmap(self._array(name), "w+", dtype, shape)
         self._log = RunLog(partial, keep=lambda line: line["update"] < first)
         self._histories = self._mapped()
@@ -109,54 +112,59 @@ class Writer:
     def _array(self, name: str) -> Path:
         return self._partial / f"{name}.npy"
 
-    def _mapped(self) -> record.Histories:
-        return record.Histories(
-            **{name: np.lib.format.open_memmap(self._array(name), "r+") for name in record.Histories._fields}
+    def _mapped(self) -> HistoryArrays:
+        return HistoryArrays(
+            **{name: np.lib.format.open_memmap(self._array(name), "r+") for name in HistoryArrays._fields}
         )
 
     def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> dict[str, float]:
-        """Keep one update; returns its metrics and timing.
+        """Record one update; returns its metrics and timing.
 
-        Timing counts from the end of this writer's first update: `steps_per_second`, `seconds`, and how many of these
-        went into `recording`.
+        Timing counts from the end of this writer's first update, which includes compiling: `steps_per_second`,
+        `seconds`, and how many of these were spent on `recording`.
         """
         jax.block_until_ready((rollout, metrics))
         began = time.perf_counter()
-        record.keep(self._histories, number, rollout)
-        line = {"update": number, "step": (number + 1) * self._config.steps_per_update} | _metrics(metrics)
+        record_rollout(self._histories, number, rollout)
+        line = {"update": number, "step": (number + 1) * self._config.steps_per_update} | _finite(metrics)
         now = time.perf_counter()
-        self._busy += now - began
+        self._recording += now - began
         seconds = now - self._started
         speed = max(1, number - self._first) * self._config.steps_per_update / seconds
-        if number == self._first:  # the time until here was spent on compiling
-            self._started, self._busy = now, 0.0
-        timing = {"steps_per_second": round(speed, 1), "seconds": round(seconds, 3), "recording": round(self._busy, 3)}
+        if number == self._first:
+            self._started, self._recording = now, 0.0
+        timing = {
+            "steps_per_second": round(speed, 1),
+            "seconds": round(seconds, 3),
+            "recording": round(self._recording, 3),
+        }
         self._log.write(line, timing={"update": number} | timing)
         return line | timing
 
     def sync(self) -> None:
-        """Everything written so far is on the disk when this returns, and out of memory."""
+        """Force everything written so far to the disk, and out of memory."""
         began = time.perf_counter()
         for array in self._histories:
             array.flush()  # type: ignore[attr-defined]
         self._histories = self._mapped()
         self._log.sync()
-        self._busy += time.perf_counter() - began
+        self._recording += time.perf_counter() - began
 
-    def count(self, seconds: float) -> None:
+    def add_recording_time(self, seconds: float) -> None:
         """Add time to what `timing` calls recording."""
-        self._busy += seconds
+        self._recording += seconds
 
     def close(self) -> None:
+        """Close the log and unmap the arrays."""
         self._log.close()
         del self._histories
 
 
 def last_timing(folder: Path) -> dict[str, float] | None:
-    """The newest line of an artefact's timing, finished or not; None where there is none yet."""
-    for place in (partial_folder(folder), folder):
+    """The last line of an artefact's timing, finished or not; None if there is none yet."""
+    for path in (partial_folder(folder) / TIMING, folder / TIMING):
         try:
-            with (place / TIMING).open("rb") as stream:
+            with path.open("rb") as stream:
                 stream.seek(0, os.SEEK_END)
                 stream.seek(max(0, stream.tell() - 1000))
                 lines = [line for line in stream.read().split(b"\n")[:-1] if line.endswith(b"}")]
@@ -166,8 +174,8 @@ def last_timing(folder: Path) -> dict[str, float] | None:
     return None
 
 
-def _metrics(metrics: dict[str, Any]) -> dict[str, float]:
+def _finite(metrics: dict[str, Any]) -> dict[str, float]:
     values = {name: float(value) for name, value in metrics.items()}
     if not values.get("episodes", 1):
-        values.pop("return", None)  # no episode ended, so there is no mean of any
+        values.pop("return", None)  # no episode ended, so there is no mean return
     return values

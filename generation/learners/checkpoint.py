@@ -1,4 +1,4 @@
-"""Policies on disk: weights as safetensors, beside them a JSON card that says what they are."""
+"""Policies on disk: a folder with the weights as safetensors and a JSON card that describes them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file, save_file
 
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.checkpoints import CHECKPOINT_BYTES
 from icrl4aht_data.utils.files import parse_json, plain_size, read_text
 
-WEIGHTS, CARD = "policy.safetensors", "policy.json"
+POLICY_WEIGHTS, POLICY_CARD = "policy.safetensors", "policy.json"
 
 
 def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
-    """Write policy.safetensors and policy.json into a folder, which appears whole or not at all."""
+    """Write policy.safetensors and policy.json into a folder, which is replaced atomically."""
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -33,43 +34,47 @@ def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str,
 def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
     """Write policy.safetensors and policy.json into an existing folder."""
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
-    save_file(weights, folder / WEIGHTS)
+    save_file(weights, folder / POLICY_WEIGHTS)
     shapes = {name: list(w.shape) for name, w in weights.items()}
     content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
-    (folder / CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    (folder / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def load_card(folder: Path) -> dict[str, Any]:
-    """A checkpoint's card alone.
+    """Returns a policy's card.
 
     Raises:
-        OptionError: if it is missing or not JSON.
+        OptionError: if it is missing or not a JSON object.
     """
     try:
-        card = parse_json(read_text(folder / CARD))
+        card = parse_json(read_text(folder / POLICY_CARD))
     except IndexFormatError as error:
-        raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
+        raise _no_checkpoint(folder, repr(error)) from error
     if not isinstance(card, dict):
-        raise OptionError(f"{folder}: not a checkpoint; expected an object in {CARD}")
+        raise _no_checkpoint(folder, f"{POLICY_CARD} is not an object")
     return card
 
 
 def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
-    """The network, its weights, and the card.
+    """Returns a policy's network, its parameters, and its card.
 
     Raises:
-        OptionError: if the files are missing or not readable, or the weights have not the shapes that the card states.
+        OptionError: if the files are missing or unreadable, or the weights' shapes are not those of the card.
     """
     card = load_card(folder)
     try:
-        plain_size(folder / WEIGHTS, CHECKPOINT_BYTES)
-        weights = load_file(folder / WEIGHTS)
-        network = ActorCritic(Widths.from_table(card["widths"]), card["partners"])
-        stated = card["shapes"]
+        plain_size(folder / POLICY_WEIGHTS, CHECKPOINT_BYTES)
+        weights = load_file(folder / POLICY_WEIGHTS)
+        network = ActorCritic(Widths.from_json(card["widths"]), card["partners"])
+        expected = card["shapes"]
         tree = unflatten_dict(weights, sep="/")
-    except Exception as error:  # of three libraries, and whatever a name that is also a folder makes of them
-        raise OptionError(f"{folder}: not a checkpoint ({error!r}); expected {WEIGHTS} and {CARD}") from error
+    except Exception as error:  # three libraries read what may be any bytes, and each has errors of its own
+        raise _no_checkpoint(folder, repr(error)) from error
     shapes = {name: list(w.shape) for name, w in weights.items()}
-    if shapes != stated or "params" not in tree:
-        raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {stated}")
+    if shapes != expected or "params" not in tree:
+        raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {expected}")
     return network, tree, card
+
+
+def _no_checkpoint(folder: Path, problem: str) -> OptionError:
+    return OptionError(f"{folder}: not a checkpoint ({problem}); expected {POLICY_WEIGHTS} and {POLICY_CARD}")

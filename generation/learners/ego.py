@@ -1,4 +1,4 @@
-"""An ego in seat 0 that learns from scratch beside a fixed teammate in seat 1 (paper, App. C.2)."""
+"""An ego that learns from scratch with a fixed teammate (paper, App. C.2)."""
 
 from __future__ import annotations
 
@@ -14,27 +14,52 @@ import optax
 from jaxtyping import Array, Int, Key
 
 from generation.env import Environment
+from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
-from generation.learners.ppo import PPO, PPOConfig, episode_metrics, sequences
-from generation.learners.rollout import Player, Rollout, Seats, init_rollout, network_player, policy_player, roll_out
+from generation.learners.ppo import PPO, episode_metrics, make_optimizer, sequences, shaping_weight
+from generation.learners.rollout import (
+    Player,
+    Rollout,
+    RolloutCarry,
+    init_rollout,
+    network_player,
+    policy_player,
+    roll_out,
+)
 from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
 
 class LearnerState(NamedTuple):
-    """What an update maps to the next one; all that a resume needs."""
+    """State of a `Learner`: an update maps it to the next one, and a resume needs nothing else.
+
+    Attributes:
+        params: the ego's parameters, a pytree of float32.
+        optimizer: state of the optimiser.
+        carry: environments and memories before the next roll-out.
+        teammate: the teammate's parameters. In the state, not in the compiled update, so that all teammates of one
+            family share one compilation.
+        key: typed key, scalar, constant; every update folds its number into it.
+        update: int32 scalar, number of updates so far.
+    """
 
     params: Any
     optimizer: optax.OptState
-    seats: Seats
-    teammate: Any  # the teammate's parameters
+    carry: RolloutCarry
+    teammate: Any
     key: Key[Array, ""]
     update: Int[Array, ""]
 
 
 @dataclass(frozen=True, eq=False)
 class Learner:
-    """An ego beside one teammate."""
+    """Trains an ego, agent 0, with one teammate, agent 1.
+
+    Attributes:
+        env: the environment.
+        teammate: the teammate's policy.
+        config: hyper-parameters.
+    """
 
     env: Environment
     teammate: Policy
@@ -42,53 +67,62 @@ class Learner:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps, over all tables."""
+        """Environment steps of an update, over all environments."""
         return self.config.steps_per_update
 
     @property
     def network(self) -> ActorCritic:
+        """The ego's network."""
         return ActorCritic(self.config.widths)
 
     @cached_property
     def ppo(self) -> PPO:
+        """The algorithm of the updates."""
         return PPO(self.env.layout, self.network, self.config)
 
     def init(self, key: Key[Array, ""]) -> LearnerState:
-        """An untrained ego at fresh tables."""
-        weights, tables, running = jax.random.split(key, 3)
-        n = self.config.environments
-        params = self.network.untrained(weights, self.env.layout.channels)
-        seats = init_rollout(self.env, self.players(params, self.teammate.params), jax.random.split(tables, n))
-        return LearnerState(
-            params, self.config.optimizer.init(params), seats, self.teammate.params, running, jnp.int32(0)
-        )
+        """Returns the state of an untrained ego before the first step."""
+        params_key, env_key, running_key = jax.random.split(key, 3)
+        params = self.network.untrained(params_key, self.env.layout.channels)
+        env_keys = jax.random.split(env_key, self.config.environments)
+        carry = init_rollout(self.env, self.players(params, self.teammate.params), env_keys)
+        optimizer = make_optimizer(self.config).init(params)
+        return LearnerState(params, optimizer, carry, self.teammate.params, running_key, jnp.int32(0))
 
     def update(self, state: LearnerState) -> tuple[LearnerState, Rollout, dict[str, Array]]:
-        """One roll-out and the epochs over it: a pure function of the state, see `compiled_update`."""
-        rolling, learning = jax.random.split(jax.random.fold_in(state.key, state.update))
+        """Plays one roll-out and learns from it; a pure function of the state.
+
+        Returns:
+            The next state, the roll-out, and scalar metrics.
+        """
+        play_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.update))
         players = self.players(state.params, state.teammate)
-        seats, rollout = roll_out(self.env, players, state.seats, self.config.rollout, rolling)
+        carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key)
         ego = players[EGO]
-        after, _ = ego.act(seats.memories[EGO], seats.env, rolling)
-        shaping = self.config.shaping(state.update)
-        played = sequences(rollout, EGO, ego.places, state.seats.memories[EGO], after.value, shaping)
-        params, optimizer, losses = self.ppo.learn(state.params, state.optimizer, played, learning)
+        # Only for the value of the observation after the roll-out: the action is drawn again in the next one.
+        after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
+        shaping = shaping_weight(self.config, state.update)
+        played = sequences(rollout, EGO, ego.agent_slots, state.carry.memories[EGO], after.value, shaping)
+        params, optimizer, losses = self.ppo.learn(state.params, state.optimizer, played, learn_key)
         metrics = losses | episode_metrics(rollout) | {"shaping": shaping}
         return (
-            state._replace(params=params, optimizer=optimizer, seats=seats, update=state.update + 1),
+            state._replace(params=params, optimizer=optimizer, carry=carry, update=state.update + 1),
             rollout,
             metrics,
         )
 
     def players(self, params: Any, teammate_params: Any) -> tuple[Player, Player]:
+        """Returns the ego and the teammate as players of all environments."""
         n = self.config.environments
         ego = network_player(self.env, self.network, params, np.arange(n), jnp.zeros(n, jnp.int32))
         return ego, policy_player(self.env, self.teammate, teammate_params, TEAMMATE, n)
 
 
 def compiled_update(learner: Learner) -> Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str, Array]]]:
-    """The learner's update, compiled once for all teammates of one family on one layout; it takes its argument's
-    memory."""
+    """Returns the learner's compiled update, which reuses the memory of its argument.
+
+    It is compiled once for all teammates of one family on one layout.
+    """
     teammate = learner.teammate
     return _compiled(learner.env.layout, learner.env.max_steps, teammate._replace(params=()), learner.config)
 

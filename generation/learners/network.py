@@ -1,13 +1,12 @@
 """The CNN-GRU actor-critic of teammates and egos (paper, App. B.1 and C.2.1), in a form that is fast on a CPU.
 
-Same parameters and outputs as the plain form (1 x 1 and 3 x 3 SAME convolutions, a GRU cell), other arithmetic: a 1 x 1
-convolution is a matrix product; a 3 x 3 one on a 5 x 5 patch is one dense matrix built from its kernel; the GRU's input
-products are taken for all steps at once, outside the scan.
+B denotes the batch dimension, N sequences, T steps. Parameters and outputs are those of the plain form (1 x 1 and 3 x 3
+SAME convolutions, a GRU cell); the arithmetic differs: a 1 x 1 convolution is a matrix product; a 3 x 3 one on a 5 x 5
+patch is one dense matrix built from its kernel; the GRU's input products are computed for all steps outside the scan.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import flax.linen as nn
@@ -16,36 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
+from generation.learners.config import Widths
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import WINDOW
 
 _CELLS = WINDOW * WINDOW
-_WIDEST, _LAYERS = 2**13, 16  # beyond, a table is a mistake, or meant to exhaust us
-
-
-@dataclass(frozen=True)
-class Widths:
-    """Layer widths; the defaults are the paper's (273,375 parameters at C = 40)."""
-
-    pointwise: tuple[int, ...] = (128, 128, 8)  # 1 x 1 convolutions
-    spatial: tuple[int, ...] = (16, 32, 32)  # 3 x 3 convolutions
-    dense: int = 128
-    gru: int = 128
-    head: int = 128
-
-    @classmethod
-    def from_table(cls, table: dict[str, Any]) -> Widths:
-        """From JSON or TOML, where tuples are lists.
-
-        Raises:
-            TypeError: for unknown names or other values than positive whole numbers.
-        """
-        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
-        for name, value in values.items():
-            numbers = value if isinstance(value, tuple) else (value,)
-            if not 0 < len(numbers) <= _LAYERS or not all(type(n) is int and 0 < n <= _WIDEST for n in numbers):
-                raise TypeError(f"widths.{name} = {value!r:.200}: expected positive whole numbers up to {_WIDEST}")
-        return cls(**values)
 
 
 class Conv3x3(nn.Module):
@@ -64,7 +38,7 @@ class Conv3x3(nn.Module):
 
 
 def _tap_of_cells() -> np.ndarray:
-    """int (25, 25): which of the 9 kernel taps carries an input cell to an output cell; 9 for none."""
+    """int (25, 25): number of the kernel tap, 0..8, between an input and an output cell; 9 if they are not adjacent."""
     cell = np.arange(_CELLS)
     dy = cell[:, None] // WINDOW - cell // WINDOW + 1
     dx = cell[:, None] % WINDOW - cell % WINDOW + 1
@@ -72,8 +46,8 @@ def _tap_of_cells() -> np.ndarray:
     return np.where(near, dy * 3 + dx, 9)
 
 
-class Encoder(nn.Module):
-    """One observation -> features."""
+class ObservationEncoder(nn.Module):
+    """Maps observations, each by itself, to features."""
 
     widths: Widths
 
@@ -120,9 +94,9 @@ class ActorCritic(nn.Module):
     """Observations over time -> action logits and values.
 
     Args:
-        widths: of the layers.
-        partners: how many policies may sit opposite, for a critic that is told which one does (BRDiv, Rahman et al.
-            2023, Sec. 5); 0 for one that is not. The actor is never told.
+        widths: layer widths.
+        partners: number of policies among which the critic distinguishes the partner (BRDiv, Rahman et al. 2023,
+            Sec. 5); 0 for a critic without that input. The actor never has it.
         critic: False for policies that only act; their values are 0.
     """
 
@@ -138,30 +112,38 @@ class ActorCritic(nn.Module):
         reset: Bool[Array, "T N"],
         partner: Integer[Array, " N"] | None = None,
     ) -> tuple[Float[Array, "N H"], Float[Array, "T N 6"], Float[Array, "T N"]]:
-        """Args: the hidden state before the first step, observations, where an episode starts, who sits opposite.
+        """Applies the network to T steps of N sequences.
 
-        Returns: the hidden state after the last step, logits, values.
+        Args:
+            hidden: recurrent state before the first step.
+            obs: observations.
+            reset: whether an episode starts at a step; the recurrent state is zero there.
+            partner: number of the partner's policy, for a critic with `partners`.
+
+        Returns:
+            The recurrent state after the last step, action logits, values.
         """
-        features = Encoder(self.widths, name="encoder")(obs)
+        features = ObservationEncoder(self.widths, name="encoder")(obs)
         hidden, states = GRU(self.widths.gru, name="gru")(hidden, features, reset)
         actor = nn.relu(_dense(self.widths.head, 2.0, "actor_hidden")(states))
         logits = _dense(len(ACTIONS), 0.01, "actor")(actor)
         if not self.critic:
             return hidden, logits, jnp.zeros(logits.shape[:2])
         if self.partners:
-            told = jnp.zeros(hidden.shape[0], int) if partner is None else partner
-            told = jnp.broadcast_to(jax.nn.one_hot(told, self.partners), (*states.shape[:2], self.partners))
-            states = jnp.concatenate([states, told], axis=-1)
+            number = jnp.zeros(hidden.shape[0], int) if partner is None else partner
+            one_hot = jnp.broadcast_to(jax.nn.one_hot(number, self.partners), (*states.shape[:2], self.partners))
+            states = jnp.concatenate([states, one_hot], axis=-1)
         critic = nn.relu(_dense(self.widths.head, 2.0, "critic_hidden")(states))
         value = _dense(1, 1.0, "critic")(critic)
         return hidden, logits, value[..., 0]
 
     def untrained(self, key: Array, channels: int) -> Any:
-        """Fresh parameters for observations 5 x 5 x channels."""
+        """Returns initial parameters for observations 5 x 5 x channels."""
         obs = jnp.zeros((1, 1, WINDOW, WINDOW, channels), jnp.uint8)
         return self.init(key, self.initial_hidden(1), obs, jnp.ones((1, 1), bool))
 
     def initial_hidden(self, batch: int) -> Float[Array, "N H"]:
+        """Returns the recurrent state at the start of an episode: zeros."""
         return jnp.zeros((batch, self.widths.gru), jnp.float32)
 
 

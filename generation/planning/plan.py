@@ -1,4 +1,4 @@
-"""What a rebuild costs, before it starts."""
+"""Cost of a rebuild, estimated before it starts."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import jax
 import numpy as np
 from rich import filesize
 
-from generation.collection import record
+from generation.collection.record import array_shapes
 from generation.env import Environment
+from generation.learners.config import PPOConfig
 from generation.learners.ego import Learner
 from generation.learners.population.fcp import FCP
 from generation.learners.population.population import Population
-from generation.learners.ppo import PPOConfig
-from generation.populations.build import runs
+from generation.populations.build import population_runs
 from generation.profiles import Profile
-from generation.teammates import learned
-from generation.teammates.registry import build
+from generation.teammates.learned import build_untrained
+from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
@@ -34,23 +34,32 @@ from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 _WORTH_MEASURING = 20.0
-"""Seconds: a whole update that should take less is measured itself, not only a share of it."""
+"""Seconds: a complete update that should take less is measured itself, not only a share of it."""
 
 
-class Speed(NamedTuple):
-    """Of a learner on this machine."""
+class LearnerSpeed(NamedTuple):
+    """Speed of a learner on this machine.
 
-    steps_per_second: float  # of all its environments
+    Attributes:
+        steps_per_second: environment steps of all its environments.
+        compile_seconds: time to compile `init` and `update`.
+    """
+
+    steps_per_second: float
     compile_seconds: float
 
     def seconds(self, steps: int) -> float:
+        """Time for so many environment steps, with compiling."""
         return steps / self.steps_per_second + self.compile_seconds
 
 
 @dataclass(frozen=True)
-class Cost:
-    """Of a whole profile. Hours are of learning and recording; N devices take the tasks in turn, after one process has
-    trained the populations, one after the other."""
+class RebuildCost:
+    """Cost of a profile.
+
+    Hours are of learning and recording: one process trains the populations one after the other, then `devices` devices
+    share the tasks, one task at a time each. Rates are per second, sizes in bytes; `compile_seconds` are per task.
+    """
 
     profile: str
     populations: int
@@ -65,17 +74,18 @@ class Cost:
     device: str
     teammate_steps_per_second: float | None
     steps_per_second: float
-    compile_seconds: float  # of each task
+    compile_seconds: float
     teammate_hours_on_one: float
-    hours_on_one: float  # of everything
+    hours_on_one: float
     devices: int
     hours_on_devices: float
 
     def to_json(self) -> dict[str, Any]:
+        """The fields."""
         return asdict(self)
 
-    def in_words(self) -> Iterator[tuple[str, str]]:
-        """(what, how much) in the order to be printed."""
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Yields (quantity, value) in the order to be printed."""
         yield "profile", self.profile
         if self.teammate_steps_per_second:
             yield "populations of teammates", f"{self.populations:,}"
@@ -96,22 +106,23 @@ class Cost:
         yield f"hours on {self.devices} of them", f"{self.hours_on_devices:,.1f}"
 
 
-def cost(profile: Profile, devices: int) -> Cost:
-    """Reckoned from the profile, short calibration runs, and a history of the bundled release.
+def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
+    """Estimate a rebuild's cost from the profile, short calibration runs, and histories of the bundled release.
 
     Args:
-        devices: the N of `hours_on_devices`; each does one task at a time.
+        profile: the profile.
+        devices: number of devices that share the tasks.
     """
     ego, tasks = profile.ego, len(profile.task_layouts)
     learning = calibrate(ego, partial(task_learner, profile))
     task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
-    populations = [run.steps for run in runs(profile, profile.algorithms, 0)]
-    playing = calibrate(profile.teammates.ppo, partial(population, profile)) if populations else None
+    populations = [run.steps for run in population_runs(profile, profile.algorithms, 0)]
+    playing = calibrate(profile.teammates.ppo, partial(calibration_population, profile)) if populations else None
     population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
     in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
     kept = tasks * profile.keep * ego.episodes * KEPT_STEPS
     device = jax.devices()[0]
-    return Cost(
+    return RebuildCost(
         profile=profile.name,
         populations=len(populations),
         teammate_steps=sum(populations),
@@ -133,25 +144,25 @@ def cost(profile: Profile, devices: int) -> Cost:
 
 
 def task_learner(profile: Profile, ego: PPOConfig) -> Learner:
-    """The ego of a task of the profile's first layout, beside a teammate of the kind that most tasks have."""
+    """The ego of a task on the profile's first layout, with a teammate of the kind that most tasks have."""
     layout = get_layout(profile.layouts[0])
     if profile.algorithms:
-        mate = learned.untrained(layout, profile.teammates.ppo.widths)
+        teammate = build_untrained(layout, profile.teammates.ppo.widths)
     else:
-        mate = build(layout, profile.heuristic_tasks()[0].teammate)
-    return Learner(Environment(layout), mate, ego)
+        teammate = build_teammate(layout, profile.heuristic_tasks()[0].teammate)
+    return Learner(Environment(layout), teammate, ego)
 
 
-def population(profile: Profile, config: PPOConfig) -> Population:
-    """A population of the profile's first layout."""
+def calibration_population(profile: Profile, config: PPOConfig) -> Population:
+    """A population on the profile's first layout."""
     return Population(Environment(get_layout(profile.layouts[0])), FCP(profile.teammates.members), config)
 
 
-def calibrate(config: PPOConfig, make: Callable[[PPOConfig], Learner | Population]) -> Speed:
-    """The speed of what `make` gives for a configuration.
+def calibrate(config: PPOConfig, make: Callable[[PPOConfig], Learner | Population]) -> LearnerSpeed:
+    """Measure the learner that `make` returns for a configuration.
 
-    First an update with the environments of one minibatch, which costs as much a step where the device is kept busy
-    by that many; where a whole update should then be short, that is measured instead.
+    An update with the environments of one minibatch costs as much per step if it keeps the device busy; if the complete
+    update should then be short, it is measured instead.
     """
     share = replace(config, environments=config.environments // config.minibatches, minibatches=1)
     speed, steps = _measure(make(share))
@@ -160,8 +171,8 @@ def calibrate(config: PPOConfig, make: Callable[[PPOConfig], Learner | Populatio
     return speed
 
 
-def _measure(learner: Learner | Population) -> tuple[Speed, int]:
-    """Speed, and the steps of an update."""
+def _measure(learner: Learner | Population) -> tuple[LearnerSpeed, int]:
+    """Speed, and the environment steps of an update."""
     began = time.perf_counter()
     state: Any = jax.jit(learner.init)(jax.random.key(0))
     update = jax.jit(learner.update, donate_argnums=0).lower(state).compile()
@@ -170,17 +181,17 @@ def _measure(learner: Learner | Population) -> tuple[Speed, int]:
     began = time.perf_counter()
     jax.block_until_ready(update(state))
     steps = learner.steps_per_update
-    return Speed(steps / (time.perf_counter() - began), compiling), steps
+    return LearnerSpeed(steps / (time.perf_counter() - began), compiling), steps
 
 
 def artefact_bytes(layouts: Sequence[str], ego: PPOConfig) -> int:
-    """What the histories of one task on each of these layouts take, uncompressed."""
-    arrays = (record.shapes(get_layout(layout), ego).values() for layout in layouts)
+    """Uncompressed size of the histories of one task on each of these layouts."""
+    arrays = (array_shapes(get_layout(layout), ego).values() for layout in layouts)
     return sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for task in arrays for shape, dtype in task)
 
 
 def bytes_per_transition(kind: Kind) -> float:
-    """Of the bundled release's data, one history of each of its tasks, if packed so."""
+    """Size per transition of a release of this kind, measured on one history of each task of the bundled release."""
     dataset = load_icrl4aht()
     with tempfile.TemporaryDirectory() as folder:
         new = [

@@ -1,4 +1,4 @@
-"""Where a learner's time goes: environment and teammate, the ego's forward pass, the update."""
+"""Profile of a learner's update: environment and teammate, the ego's forward pass, learning."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ _ROUNDS = 3
 
 
 def learner_speed(learner: Learner, seed: int = 0) -> dict[str, float]:
-    """Measured steps/s of whole updates, and the share of each part, in this process after compiling.
+    """Measure steps/s of complete updates, and the share of each part, after compiling.
 
-    The parts are timed as roll-outs of the environment with the teammate and a random ego, then roll-outs with the
-    ego's network, then whole updates; each share is the difference to the one before.
+    Three programs are timed: roll-outs of the environment with the teammate and a random ego, roll-outs with the ego's
+    network, complete updates; each share is the difference to the program before.
     """
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(seed))
     key = jax.random.key(seed + 1)
     players = learner.players(state.params, state.teammate)
-    by_chance = [random_player(EGO, config.environments), players[TEAMMATE]]
-    tables = init_rollout(learner.env, by_chance, jax.random.split(key, config.environments))
-    bare = _seconds(jax.jit(lambda seats: roll_out(learner.env, by_chance, seats, config.rollout, key)[0]), tables)
-    forward = _seconds(jax.jit(lambda seats: roll_out(learner.env, players, seats, config.rollout, key)), state.seats)
-    whole = _seconds(jax.jit(learner.update), state)
+    random_players = [random_player(EGO, config.environments), players[TEAMMATE]]
+    start = init_rollout(learner.env, random_players, jax.random.split(key, config.environments))
+    env_only = jax.jit(lambda carry: roll_out(learner.env, random_players, carry, config.rollout, key)[0])
+    with_forward = jax.jit(lambda carry: roll_out(learner.env, players, carry, config.rollout, key))
+    environment = _seconds(env_only, start)
+    forward = _seconds(with_forward, state.carry)
+    update = _seconds(jax.jit(learner.update), state)
     return {
-        "steps_per_second": round(config.steps_per_update / whole, 1),
-        "environment_share": round(bare / whole, 4),
-        "forward_share": round((forward - bare) / whole, 4),
-        "update_share": round((whole - forward) / whole, 4),
+        "steps_per_second": round(config.steps_per_update / update, 1),
+        "environment_share": round(environment / update, 4),
+        "forward_share": round((forward - environment) / update, 4),
+        "update_share": round((update - forward) / update, 4),
     }
 
 
 def _seconds(function: Any, *arguments: Any) -> float:
-    """The fastest of a few calls, after one to compile."""
+    """Time of the fastest of a few calls, after one to compile."""
     jax.block_until_ready(function(*arguments))
-    best = float("inf")
+    times = []
     for _ in range(_ROUNDS):
         started = time.perf_counter()
         jax.block_until_ready(function(*arguments))
-        best = min(best, time.perf_counter() - started)
-    return best
+        times.append(time.perf_counter() - started)
+    return min(times)

@@ -1,4 +1,4 @@
-"""A whole suite of learned teammates, and what it looks like."""
+"""Builds a suite of learned teammates, and reports how they differ."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from rich.console import Console
 from rich.table import Table
 
 from generation.learners.resume import BusyError
-from generation.populations.cross_play import EPISODES
-from generation.populations.diversity import actions_on_common_states, between_families, hamming
-from generation.populations.figures import plot_matrix
-from generation.populations.select import Selection, layout_number, select, write_manifests
-from generation.populations.train import Run, checkpoints, is_trained, play_matrix, train
+from generation.plotting import plot_matrix
+from generation.populations.cross_play import EPISODES_PER_PAIR
+from generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
+from generation.populations.select import TeammateSelection, layout_number, select_teammates, write_manifests
+from generation.populations.train import PopulationRun, is_trained, play_matrix, suite_checkpoints, train_population
 from generation.profiles import Profile
-from generation.progress import progress
-from generation.teammates import learned
+from generation.progress import progress_bars
 from generation.teammates.instances import published_thetas
-from generation.teammates.registry import build
+from generation.teammates.learned import build_learned
+from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -32,41 +32,47 @@ def build_suite(
     algorithms: Mapping[str, Sequence[str]],
     seed: int,
     console: Console,
-) -> list[Selection]:
+) -> list[TeammateSelection]:
     """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
 
-    `algorithms` has those of each layout. Populations that another process trains are left to it until nothing else is
-    to do, then waited for.
+    Populations that another process trains are left to it, and waited for at the end.
+
+    Args:
+        profile: sizes of the populations.
+        suite: the suite's folder.
+        algorithms: layout -> algorithms.
+        seed: seed of the suite.
+        console: where progress is printed.
 
     Returns:
-        What the filter left of each population that was asked for.
+        The selected teammates of each population in `algorithms`.
     """
     for name in chain(*algorithms.values()):
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
-    todo = runs(profile, algorithms, seed)
+    todo = population_runs(profile, algorithms, seed)
     wanted = [(run.layout.name, run.algorithm) for run in todo]
     for wait in (False, True):
         todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
     selections = [
-        select(suite, name, algorithm, config.train, config.heldout, seed)
+        select_teammates(suite, name, algorithm, config.train, config.heldout, seed)
         for name in training_layouts()
         for algorithm in ALGORITHMS
         if is_trained(suite, name, algorithm)
     ]
     for selection in selections:
-        console.print(_in_words(selection, config.train))
+        console.print(_describe(selection, config.train))
     for path in write_manifests(suite, selections):
         console.print(f"wrote {path}")
     return [selection for selection in selections if (selection.layout, selection.algorithm) in wanted]
 
 
-def runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], seed: int) -> list[Run]:
+def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], seed: int) -> list[PopulationRun]:
     """The populations by these algorithms of each layout, each with a seed of its own."""
     config = profile.teammates
     return [
-        Run(
+        PopulationRun(
             get_layout(name),
             algorithm,
             config.members,
@@ -83,41 +89,33 @@ def training_layouts() -> list[str]:
     return list(dict.fromkeys(name for splits in TRACKS.values() for name in splits["train"]))
 
 
-def _names(layouts: Sequence[str]) -> list[str]:
-    return list(dict.fromkeys(get_layout(name).name for name in layouts))
-
-
-def _complete(suite: Path, layout: str) -> bool:
-    return all(is_trained(suite, layout, algorithm) for algorithm in ALGORITHMS)
-
-
-def _train(run: Run, folder: Path, wait: bool, console: Console) -> bool:
-    """Whether the population is finished now; False if another process is at it."""
+def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bool:
+    """Whether the population is finished now; False if another process trains it."""
     label = f"{run.algorithm} on {run.layout.name}"
     last: dict[str, float] = {}
-    with progress(console) as bars:
+    with progress_bars(console) as bars:
         bar = bars.add_task(label, total=run.updates, note="compiling")
 
-        def report(update: int, updates: int, metrics: dict[str, float]) -> None:
+        def on_update(update: int, updates: int, metrics: dict[str, float]) -> None:
             last.update(metrics)
             note = f"{metrics['steps_per_second']:,.0f} steps/s, self-play {last.get('self_play', 0.0):.1f}"
             bars.update(bar, completed=update, note=note)
 
         try:
-            if not train(run, folder, report, wait=wait):
+            if not train_population(run, folder, on_update, wait=wait):
                 console.print(f"{label}: finished before")
                 return True
         except BusyError:
             console.print(f"{label}: another process is training it")
             return False
     console.print(
-        f"{label}: {last['step']:,} steps a member at {last['steps_per_second']:,.0f} steps/s (all tables), "
+        f"{label}: {last['step']:,} steps a member at {last['steps_per_second']:,.0f} steps/s (all environments), "
         f"last self-play return {last.get('self_play', 0.0):.1f} (400 steps)"
     )
     return True
 
 
-def _in_words(selection: Selection, wanted: int) -> str:
+def _describe(selection: TeammateSelection, wanted: int) -> str:
     few = f"; only {len(selection.train)} of {wanted}" if len(selection.train) < wanted else ""
     return (
         f"{selection.algorithm} on {selection.layout}: {selection.good} of {selection.candidates} checkpoints exceed "
@@ -130,10 +128,19 @@ def report_diversity(
 ) -> None:
     """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
 
+    Args:
+        suite: the suite's folder.
+        layouts: names; by default the layouts that have all their populations.
+        algorithms: the populations.
+        greedy: whether teammates take their most probable actions.
+        console: where to print.
+
     Raises:
-        OptionError: if a population was not finished, or no layout has all of them.
+        OptionError: if a population is not finished, or no layout has all of them.
     """
-    names = _names(layouts) or [name for name in training_layouts() if _complete(suite, name)]
+    names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
+        name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
+    ]
     if not names:
         raise OptionError(
             f"{suite}: no layout has all its populations finished; `python -m generation teammates --suite {suite}` "
@@ -149,38 +156,37 @@ def report_diversity(
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
     returns = play_matrix(suite, layout, algorithm, greedy)
     members = [f"m{k}" for k in range(len(returns))]
-    own = np.eye(len(returns), dtype=bool)
-    title = f"{algorithm} on {layout.name}: mean return of {EPISODES} episodes of {EPISODE_STEPS} steps"
-    console.print(_table(title, "seat 0 \\ seat 1", members, returns, ".1f"))
-    across = returns[~own].mean() if len(returns) > 1 else float("nan")
-    console.print(
-        f"self-play {returns[own].mean():.1f}, cross-play {across:.1f}, gap {returns[own].mean() - across:.1f}"
-    )
+    diagonal = np.eye(len(returns), dtype=bool)
+    title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
+    console.print(_matrix_table(title, "ego \\ teammate", members, returns, ".1f"))
+    self_play = returns[diagonal].mean()
+    cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
+    console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
     path = suite / layout.name / algorithm / "cross_play.png"
-    plot_matrix(returns, members, members, path, f"{algorithm}, {layout.name}: return", ("seat 0", "seat 1"))
+    plot_matrix(returns, members, path, f"{algorithm}, {layout.name}: return", ("ego", "teammate"))
     console.print(f"wrote {path}")
 
 
 def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], console: Console) -> None:
     policies, families = [], {}
     for algorithm in algorithms:
-        points = list(checkpoints(suite, layout.name, algorithm))
+        points = list(suite_checkpoints(suite, layout.name, algorithm))
         families[algorithm] = range(len(policies), len(policies) + len(points))
-        policies += [learned.build(layout, suite / point.path) for point in points]
+        policies += [build_learned(layout, suite / point.path) for point in points]
     for kind, short in HEURISTIC_KINDS.items():
         thetas = published_thetas(layout.name, kind)
         families[short] = range(len(policies), len(policies) + len(thetas))
-        policies += [build(layout, {"family": kind, "theta": theta}) for theta in thetas]
-    distances = between_families(hamming(actions_on_common_states(layout, policies)), families)
+        policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
+    distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     labels = list(families)
-    console.print(_table(f"{layout.name}: mean Hamming distance of families", "", labels, distances, ".2f"))
+    console.print(_matrix_table(f"{layout.name}: mean Hamming distance of families", "", labels, distances, ".2f"))
     path = suite / layout.name / "distances.png"
-    plot_matrix(distances, labels, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
+    plot_matrix(distances, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
     console.print(f"wrote {path} ({track_of(layout.name)} track)")
 
 
-def _table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:
-    """A square matrix, rows and columns by the same names."""
+def _matrix_table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:
+    """A square matrix with the same names for rows and columns."""
     table = Table(title=title)
     table.add_column(corner)
     for name in names:

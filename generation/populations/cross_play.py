@@ -1,4 +1,4 @@
-"""What policies earn together: learned policies in both seats, whole training episodes, by one compiled roll-out."""
+"""Returns of learned policies with each other, over complete training episodes, by one compiled roll-out."""
 
 from __future__ import annotations
 
@@ -11,72 +11,81 @@ import jax.numpy as jnp
 import numpy as np
 
 from generation.env import Environment
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from generation.learners.rollout import Player, init_rollout, network_player, roll_out
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
-EPISODES = 20
-"""Episodes of each pair (paper, App. B.1)."""
+EPISODES_PER_PAIR = 20
+"""Paper, App. B.1."""
 
 
-def matrix(
-    layout: Layout, network: ActorCritic, left: Any, right: Any, seed: int = 0, episodes: int = EPISODES, greedy=False
+def cross_play_returns(
+    layout: Layout,
+    network: ActorCritic,
+    egos: Any,
+    teammates: Any,
+    seed: int = 0,
+    episodes: int = EPISODES_PER_PAIR,
+    greedy: bool = False,
 ) -> np.ndarray:
     """Mean returns of all pairs over episodes of 400 steps.
 
     Args:
-        layout: the kitchen.
-        network: of all policies.
-        left: parameters of A policies for seat 0, stacked on a leading axis.
-        right: of B policies for seat 1.
-        seed: of the episodes and the draws.
-        episodes: of each pair.
-        greedy: whether the policy in seat 1 takes its likeliest actions, as teammates do. All others draw theirs, as in
-            training; two greedy players can stand in each other's way for ever.
+        layout: the layout.
+        network: the network of all policies.
+        egos: parameters of A policies, stacked on a leading axis.
+        teammates: parameters of B policies.
+        seed: seed of the episodes and the actions.
+        episodes: episodes of each pair.
+        greedy: whether teammates take their most probable actions, as in the dataset. All other policies draw theirs,
+            as in training, since two greedy policies can block each other for ever.
 
     Returns:
         float64 (A, B).
     """
-    a, b = (jax.tree.leaves(params)[0].shape[0] for params in (left, right))
+    a, b = (jax.tree.leaves(params)[0].shape[0] for params in (egos, teammates))
     first, second = np.divmod(np.arange(a * b), b)
-    returns = _play(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)(
-        left, right, jax.random.key(seed)
-    )
-    return np.asarray(returns, np.float64).reshape(a, b)
+    play = _compiled(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)
+    return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64).reshape(a, b)
 
 
-def together(
-    layout: Layout, network: ActorCritic, left: Any, right: Any, seed: int = 0, episodes: int = EPISODES, greedy=False
+def paired_returns(
+    layout: Layout,
+    network: ActorCritic,
+    egos: Any,
+    teammates: Any,
+    seed: int = 0,
+    episodes: int = EPISODES_PER_PAIR,
+    greedy: bool = False,
 ) -> np.ndarray:
-    """Mean returns float64 (A,) of left policy i with right policy i; arguments as in `matrix`."""
-    pairs = tuple(range(jax.tree.leaves(left)[0].shape[0]))
-    returns = _play(layout, network.widths, network.partners, pairs, pairs, episodes, greedy)(
-        left, right, jax.random.key(seed)
-    )
-    return np.asarray(returns, np.float64)
+    """Mean returns float64 (A,) of ego i with teammate i; arguments as in `cross_play_returns`."""
+    pairs = tuple(range(jax.tree.leaves(egos)[0].shape[0]))
+    play = _compiled(layout, network.widths, network.partners, pairs, pairs, episodes, greedy)
+    return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
 
 
 @lru_cache(maxsize=32)
-def _play(
+def _compiled(
     layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
 ) -> Callable[[Any, Any, jax.Array], jax.Array]:
-    """A function of both stacks and a key that gives the mean return of each pair (first[k], second[k])."""
+    """A function of both stacks and a key that returns the mean return of each pair (first[k], second[k])."""
     env, network = Environment(layout), ActorCritic(widths, partners)
     n = len(first) * episodes
-    sides = [np.repeat(np.array(side), episodes) for side in (first, second)]
+    policies = [np.repeat(np.array(side), episodes) for side in (first, second)]
 
-    def player(params: Any, seat: int, greedy: bool) -> Player:
-        policies = range(max(sides[seat]) + 1)
-        places = np.stack([(sides[seat] == policy).nonzero()[0] for policy in policies]) + seat * n
-        return network_player(env, network, params, places, jnp.zeros(places.shape, jnp.int32), greedy)
+    def player(params: Any, agent: int, greedy: bool) -> Player:
+        numbers = range(max(policies[agent]) + 1)
+        slots = np.stack([(policies[agent] == number).nonzero()[0] for number in numbers]) + agent * n
+        return network_player(env, network, params, slots, jnp.zeros(slots.shape, jnp.int32), greedy)
 
     @jax.jit
-    def play(left, right, key):
-        players = [player(left, EGO, False), player(right, TEAMMATE, greedy)]
-        seats = init_rollout(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
-        _, rollout = roll_out(env, players, seats, EPISODE_STEPS, jax.random.fold_in(key, 1))
+    def play(egos, teammates, key):
+        players = [player(egos, EGO, False), player(teammates, TEAMMATE, greedy)]
+        carry = init_rollout(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
+        _, rollout = roll_out(env, players, carry, EPISODE_STEPS, jax.random.fold_in(key, 1))
         return rollout.reward.sum(axis=0).reshape(len(first), episodes).mean(axis=1)
 
     return play

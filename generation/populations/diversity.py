@@ -1,4 +1,4 @@
-"""How differently policies act: pairwise Hamming distance on common states (paper, App. "Teammate Policy Diversity
+"""How differently policies act: pairwise Hamming distances on common states (paper, App. "Teammate Policy Diversity
 Analysis")."""
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _EPISODES = 2
 def actions_on_common_states(
     layout: Layout, policies: Sequence[Policy], seed: int = 0, steps: int = EPISODE_STEPS
 ) -> np.ndarray:
-    """What every policy does in seat 1 on the same states.
+    """Actions of every policy, as the teammate, on the same states.
 
-    The states are those of roll-outs with a uniformly random agent 0 and each policy in turn as agent 1, two episodes
-    each. Every policy is asked at every step; its memory follows the episode that it watches.
+    The states are those of roll-outs with a uniformly random ego and each policy in turn as the teammate, two episodes
+    each. Every policy acts on every state; its memory follows the episode that it observes.
 
     Returns:
         int8 (policies, states), states = policies x 2 x steps.
@@ -38,23 +38,25 @@ def actions_on_common_states(
     records = jnp.concatenate(played, axis=1)  # (T, episodes, S)
     actions = np.zeros((len(policies), records.shape[0] * records.shape[1]), np.int8)
     for numbers, policy in _families(policies):
-        actions[numbers] = np.asarray(_watch(env, policy, records, key)).reshape(len(numbers), -1)
+        actions[numbers] = np.asarray(_act_along(env, policy, records, key)).reshape(len(numbers), -1)
     return actions
 
 
-def hamming(actions: np.ndarray) -> np.ndarray:
-    """The share of states on which two policies differ: int (P, N) -> float64 (P, P)."""
+def hamming_distances(actions: np.ndarray) -> np.ndarray:
+    """Share of states on which two policies act differently: int (P, N) -> float64 (P, P)."""
     return (actions[:, None] != actions[None]).mean(axis=-1)
 
 
-def between_families(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
-    """Mean distances of families, over all pairs of their policies (within a family, a policy with itself included, as
-    the paper's formula has it): (P, P) -> float64 (F, F)."""
+def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
+    """Mean distances of families, over all pairs of their policies: (P, P) -> float64 (F, F).
+
+    Within a family, pairs of a policy with itself count too, as in the paper's formula.
+    """
     return np.array([[distances[np.ix_(a, b)].mean() for b in families.values()] for a in families.values()])
 
 
 def _families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
-    """Policies that share their functions: their numbers, and one policy with all their parameters stacked."""
+    """Yields policies that share their functions: their numbers, and one policy with stacked parameters."""
     groups: dict[tuple[Callable, Callable, str], list[int]] = defaultdict(list)
     for number, policy in enumerate(policies):
         groups[policy.init, policy.act, policy.sees].append(number)
@@ -63,26 +65,25 @@ def _families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
 
 
 def _play(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:
-    """Records uint8 (T, policies x 2, S)."""
+    """Records uint8 (T, policies x 2, S) of a random ego with each policy of the family."""
     n = len(numbers) * _EPISODES
 
     @jax.jit
     def play(params, key):
         own = jax.tree.map(lambda leaf: jnp.repeat(leaf, _EPISODES, axis=0), params)
         players = [random_player(EGO, n), policy_player(env, family, own, TEAMMATE, n, own_params=True)]
-        seats = init_rollout(env, players, jax.random.split(key, n))
-        return roll_out(env, players, seats, env.max_steps, key)[1].record
+        carry = init_rollout(env, players, jax.random.split(key, n))
+        return roll_out(env, players, carry, env.max_steps, key)[1].record
 
     return play(family.params, jax.random.fold_in(key, numbers[0]))
 
 
-def _watch(env: Environment, family: Policy, records: jax.Array, key: Any) -> jax.Array:
-    """Actions int (policies, T, episodes)."""
-    episodes = records.shape[1]
-    keys = jax.random.split(key, episodes)
+def _act_along(env: Environment, family: Policy, records: jax.Array, key: Any) -> jax.Array:
+    """Actions int8 (policies, T, episodes) of each policy of the family along recorded episodes."""
+    keys = jax.random.split(key, records.shape[1])
 
     @jax.jit
-    def watch(params):
+    def act_along(params):
         def one(params):
             memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
 
@@ -95,4 +96,4 @@ def _watch(env: Environment, family: Policy, records: jax.Array, key: Any) -> ja
 
         return jax.lax.map(one, params)
 
-    return watch(family.params)
+    return act_along(family.params)

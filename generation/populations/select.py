@@ -1,4 +1,4 @@
-"""From a suite's checkpoints to tasks: the quality filter (paper, App. B.1 "Checkpoint Quality Filtering")."""
+"""Selects the teammates of tasks from a suite's checkpoints (paper, App. B.1 "Checkpoint Quality Filtering")."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from generation.learners.checkpoint import WEIGHTS
-from generation.populations.train import Checkpoint, checkpoints
+from generation.learners.checkpoint import POLICY_WEIGHTS
+from generation.populations.train import SuiteCheckpoint, suite_checkpoints
 from icrl4aht_data.benchmark.facts import ALGORITHMS, LAYOUT_NAMES, TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -23,46 +23,67 @@ THRESHOLD = 20.0
 
 
 @dataclass(frozen=True)
-class Selection:
-    """What the filter left of one population."""
+class TeammateSelection:
+    """Teammates selected from one population.
+
+    Attributes:
+        layout: name of the layout.
+        algorithm: the population's algorithm.
+        candidates: number of its checkpoints.
+        good: number of those above the threshold.
+        train: teammates of training tasks.
+        heldout: teammates of held-out tasks.
+    """
 
     layout: str
     algorithm: str
     candidates: int
-    good: int  # above the threshold
-    train: list[Checkpoint]
-    heldout: list[Checkpoint]
+    good: int
+    train: list[SuiteCheckpoint]
+    heldout: list[SuiteCheckpoint]
 
 
-def select(suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0) -> Selection:
+def select_teammates(
+    suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0
+) -> TeammateSelection:
     """Draw teammates from the checkpoints whose return as teammates exceeds the threshold.
 
-    Drawn from the sorted list with a fixed seed. Where there are too few for both, the held-out ones are at most a
-    fifth.
+    They are drawn from the sorted list with a fixed seed. If there are too few for both splits, at most a fifth are
+    held out.
+
+    Args:
+        suite: the suite's folder.
+        layout: name of the layout.
+        algorithm: the population's algorithm.
+        train: largest number of training teammates.
+        heldout: largest number of held-out teammates.
+        seed: seed of the draw.
 
     Raises:
-        OptionError: if the population was not finished.
+        OptionError: if the population is not finished, or was made by a version that did not measure these returns.
     """
-    candidates = list(checkpoints(suite, layout, algorithm))
+    candidates = list(suite_checkpoints(suite, layout, algorithm))
     good = [point for point in candidates if _return_as_teammate(suite, point) > THRESHOLD]
     order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
-    apart = min(heldout, max(len(good) - train, len(good) // 5))
+    held_out = min(heldout, max(len(good) - train, len(good) // 5))
     chosen = [good[k] for k in order]
-    return Selection(layout, algorithm, len(candidates), len(good), chosen[apart : apart + train], chosen[:apart])
+    return TeammateSelection(
+        layout, algorithm, len(candidates), len(good), chosen[held_out : held_out + train], chosen[:held_out]
+    )
 
 
-def _return_as_teammate(suite: Path, point: Checkpoint) -> float:
+def _return_as_teammate(suite: Path, point: SuiteCheckpoint) -> float:
     try:
         return point.card["teammate_return"]
     except KeyError as error:
         raise OptionError(
-            f"{suite / point.path}: its card lacks 'teammate_return', it was made by an earlier version: train the "
-            f"suite anew, in another folder"
+            f"{suite / point.path}: its card has no 'teammate_return', an earlier version made it: train the suite "
+            f"again, in another folder"
         ) from error
 
 
-def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list[Task]:
-    """One task per teammate, each with a seed of its own, whatever else is in the suite."""
+def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str) -> list[Task]:
+    """One task per teammate, each with a seed that does not depend on the rest of the suite."""
     tasks = []
     for selection in selections:
         first = 10_000 * (layout_number(selection.layout) + 1) + 1_000 * ALGORITHMS.index(selection.algorithm)
@@ -75,22 +96,22 @@ def make_tasks(suite: Path, selections: Sequence[Selection], split: str) -> list
 
 
 def layout_number(layout: str) -> int:
-    """A layout's place among all, for seeds."""
+    """Position of a layout among all, for seeds."""
     return LAYOUT_NAMES.index(layout)
 
 
-def _entry(suite: Path, algorithm: str, number: int, point: Checkpoint) -> dict[str, Any]:
+def _entry(suite: Path, algorithm: str, number: int, point: SuiteCheckpoint) -> dict[str, Any]:
     return {
         "kind": "rl",
         "family": algorithm,
         "theta_id": number,
         "base_seed": point.card["seed"],
-        "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / WEIGHTS)},
+        "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / POLICY_WEIGHTS)},
     }
 
 
-def write_manifests(suite: Path, selections: Sequence[Selection]) -> list[Path]:
-    """SUITE/manifests/<track>_train.jsonl and _heldout.jsonl of the tracks that have teammates."""
+def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> list[Path]:
+    """Write SUITE/manifests/<track>_train.jsonl and _heldout.jsonl for the tracks that have teammates; returns them."""
     folder = suite / "manifests"
     folder.mkdir(parents=True, exist_ok=True)
     written = []

@@ -1,11 +1,11 @@
 """The suite of learned teammates: populations trained into folders of checkpoints (paper, App. B.1).
 
     SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
-    SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, where the algorithm trains them
+    SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, if the algorithm trains them
     SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, curves.png, population.json
 
-`population.json` comes last and names every file by its hash. Before it there is `resume.safetensors`, from which a
-stopped run goes on to the same bytes.
+`population.json` is written last and has the hash of every file. Before that, `resume.safetensors` holds the state from
+which a stopped run resumes to the same bytes.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ import jax
 import numpy as np
 
 from generation.env import Environment
-from generation.learners.checkpoint import CARD, WEIGHTS, load_card, load_policy, save_policy
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_card, load_policy, save_policy
+from generation.learners.config import PPOConfig
 from generation.learners.population.brdiv import BRDiv
 from generation.learners.population.comedi import CoMeDi
 from generation.learners.population.fcp import FCP
 from generation.learners.population.lbrdiv import LBRDiv
 from generation.learners.population.population import Population, PopulationState
-from generation.learners.ppo import PPOConfig
 from generation.learners.resume import (
     METRICS,
     RunLog,
@@ -40,35 +40,41 @@ from generation.learners.resume import (
     run_lock,
     software_versions,
 )
+from generation.plotting import plot_training
 from generation.policy import stacked
-from generation.populations import cross_play
-from generation.populations.figures import plot_training
+from generation.populations.cross_play import EPISODES_PER_PAIR, cross_play_returns, paired_returns
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
-CHECKPOINTS = 5
+CHECKPOINTS_PER_MEMBER = 5
 """Evenly spaced over a policy's training (paper, App. B.1)."""
 
-_SELECTIONS = 10  # how often in a member's training CoMeDi looks anew for the member it resembles most
-_SAVE_SECONDS = 60.0
+SAVE_SECONDS = 60.0
+"""Interval of saves: the work that a kill can cost."""
+
+_SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
 _POPULATION, _RESUME = "population.json", "resume.safetensors"
 
-Report = Callable[[int, int, dict[str, float]], None]
+PopulationCallback = Callable[[int, int, dict[str, float]], None]
 """Called after each update with its number, the number of all updates, and the metrics."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """One population of one layout.
+class PopulationRun:
+    """The training of one population on one layout.
 
-    Args:
+    Attributes:
+        layout: the layout.
         algorithm: one of `ALGORITHMS`.
         members: policies for the suite.
-        config: of each policy.
-        seed: of everything.
+        config: hyper-parameters of each policy.
+        seed: seed of everything.
+
+    Raises:
+        OptionError: for an unknown algorithm, and for sizes that do not fit it.
     """
 
     layout: Layout
@@ -80,19 +86,20 @@ class Run:
     def __post_init__(self) -> None:
         if self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, ALGORITHMS)
-        if self.config.updates < CHECKPOINTS:
+        if self.config.updates < CHECKPOINTS_PER_MEMBER:
             raise OptionError(
                 f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "
-                f"{CHECKPOINTS}, one for each checkpoint"
+                f"{CHECKPOINTS_PER_MEMBER}, one for each checkpoint"
             )
         try:
             for stage in self.stages:
-                _ = stage.seating
+                _ = stage.assignment
         except ValueError as error:
             raise OptionError(f"teammates, {self.algorithm} with {self.members} members: {error}") from error
 
     @property
     def settings(self) -> dict[str, Any]:
+        """What the population depends on."""
         return {
             "layout": self.layout.name,
             "algorithm": self.algorithm,
@@ -104,6 +111,7 @@ class Run:
 
     @property
     def settings_hash(self) -> str:
+        """Hash of the settings."""
         return json_hash(self.settings)
 
     @cached_property
@@ -117,22 +125,23 @@ class Run:
         return [Population(env, kinds[self.algorithm](self.members), self.config)]
 
     @property
-    def responds(self) -> bool:
-        """Whether best responses of their own sit opposite the members."""
+    def has_best_responses(self) -> bool:
+        """Whether the members' partners in training are best responses."""
         return self.algorithm in ("brdiv", "lbrdiv")
 
     @property
     def updates(self) -> int:
+        """Updates of all stages."""
         return len(self.stages) * self.config.updates
 
     @property
     def steps(self) -> int:
-        """Environment steps of all tables, over the whole run."""
+        """Environment steps of all environments and stages."""
         return self.config.updates * sum(stage.steps_per_update for stage in self.stages)
 
 
-def is_finished(folder: Path, run: Run) -> bool:
-    """Whether the folder holds this population under these settings, every file as it was written."""
+def is_population_finished(folder: Path, run: PopulationRun) -> bool:
+    """Whether the folder holds this population under these settings, with all its files unchanged."""
     try:
         content = json.loads((folder / _POPULATION).read_text(encoding="utf-8"))
         same = content["settings_hash"] == run.settings_hash
@@ -141,13 +150,22 @@ def is_finished(folder: Path, run: Run) -> bool:
         return False
 
 
-def train(
-    run: Run, folder: Path, report: Report = lambda update, updates, metrics: None, *, wait: bool = False
+def train_population(
+    run: PopulationRun,
+    folder: Path,
+    on_update: PopulationCallback = lambda update, updates, metrics: None,
+    *,
+    wait: bool = False,
+    save_seconds: float = SAVE_SECONDS,
 ) -> bool:
-    """Train a population into `folder`, from where a stopped run of the same settings ended.
+    """Train a population into `folder`, resuming a stopped run of the same settings.
 
     Args:
-        wait: for another process that is at it, rather than leaving it to that.
+        run: the population.
+        folder: its folder.
+        on_update: called after each update.
+        wait: whether to wait for another process that trains it.
+        save_seconds: least time between two saves.
 
     Returns:
         Whether there was anything to do; False if the population was finished before.
@@ -158,35 +176,35 @@ def train(
     """
     with run_lock(folder, wait=wait):
         folder.mkdir(exist_ok=True)
-        if is_finished(folder, run):
+        if is_population_finished(folder, run):
             return False
-        _Training(run, folder, report).run_on()
+        _PopulationTraining(run, folder, on_update, save_seconds).train()
         return True
 
 
-class _Training:
-    """A run in its folder."""
+class _PopulationTraining:
+    """A run in its folder, whose lock is held."""
 
-    def __init__(self, run: Run, folder: Path, report: Report) -> None:
-        self.run, self.folder, self.report = run, folder, report
+    def __init__(self, run: PopulationRun, folder: Path, on_update: PopulationCallback, save_seconds: float) -> None:
+        self.run, self.folder, self.on_update = run, folder, on_update
         self.saved = StateFile(folder / _RESUME, run.settings | software_versions())
+        self.interval = SaveInterval(run.updates, seconds=save_seconds)
 
-    def run_on(self) -> None:
+    def train(self) -> None:
         if (self.folder / _POPULATION).exists():
             raise OptionError(
                 f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
             )
         done, state = self._resume()
-        interval = SaveInterval(self.run.updates, seconds=_SAVE_SECONDS)
         updates = self.run.config.updates
         with RunLog(self.folder, lambda line: line["stage"] * updates + line["update"] < done) as log:
             for stage in range(max(0, done - 1) // updates, len(self.run.stages)):
-                self._train_stage(stage, state, log, interval)
+                self._train_stage(stage, state, log)
                 state = None
         self._finish()
 
     def _resume(self) -> tuple[int, PopulationState | None]:
-        """Number of updates done over all stages, and the state after them."""
+        """Number of updates done over all stages, and the state after them; None at the start."""
         done = self.saved.progress
         if done is None:  # remove the checkpoints of a run that was killed before its first save
             for folder in (*self.folder.glob("m[0-9]*"), self.folder / "responses"):
@@ -207,33 +225,35 @@ class _Training:
     def _key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
 
-    def _train_stage(self, stage: int, resumed: PopulationState | None, log: RunLog, interval: SaveInterval) -> None:
+    def _train_stage(self, stage: int, resumed: PopulationState | None, log: RunLog) -> None:
         population, updates = self.run.stages[stage], self.run.config.updates
         state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
         update = jax.jit(population.update, donate_argnums=0)
-        marks = {-(-updates * (c + 1) // CHECKPOINTS): c for c in range(CHECKPOINTS)}
-        started, before = time.perf_counter(), int(state.update)
-        for number in range(before, updates):
+        count = CHECKPOINTS_PER_MEMBER
+        checkpoint_after = {-(-updates * (number + 1) // count): number for number in range(count)}
+        started, first = time.perf_counter(), int(state.update)
+        for number in range(first, updates):
             if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
-                state = state._replace(params=self._meet_the_nearest(state.params, stage, number))
+                state = state._replace(params=self._with_nearest_member(state.params, stage, number))
             state, metrics = update(state)
             seconds = time.perf_counter() - started
             line = self._line(stage, number, metrics)
-            speed = {"steps_per_second": round((number + 1 - before) * population.steps_per_update / seconds, 1)}
+            speed = {"steps_per_second": round((number + 1 - first) * population.steps_per_update / seconds, 1)}
             log.write(line, timing={"stage": stage, "update": number} | speed)
             done = stage * updates + number + 1
-            self.report(done, self.run.updates, line | speed)
-            if number + 1 in marks:
-                self._save_checkpoints(stage, marks[number + 1], number + 1, state.params)
-            if interval.due(done):
+            self.on_update(done, self.run.updates, line | speed)
+            if number + 1 in checkpoint_after:
+                self._save_checkpoints(stage, checkpoint_after[number + 1], number + 1, state.params)
+            if self.interval.due(done):
                 log.sync()
                 self.saved.save(state, done)
 
     def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
+        """A line of the log; means over no episodes are left out."""
         values = {name: float(value) for name, value in metrics.items()}
         if not values["episodes"]:
             del values["self_play"], values["cross_play"]
-        elif self.run.stages[stage].seating.self_play.all():
+        elif self.run.stages[stage].assignment.self_play.all():
             del values["cross_play"]
         return {
             "stage": stage,
@@ -242,14 +262,15 @@ class _Training:
             **values,
         }
 
-    def _meet_the_nearest(self, params: Any, stage: int, number: int) -> Any:
-        """Put the former member with which the new one plays best in the frozen one's place (paper, App. B.1,
-        "Partner Selection")."""
-        network = self.run.stages[stage].network
-        former = stacked([load_policy(self.folder / f"m{m}" / f"c{CHECKPOINTS - 1}")[1] for m in range(stage)])
+    def _with_nearest_member(self, params: Any, stage: int, number: int) -> Any:
+        """The parameters with the former member that plays best with the new one as the frozen policy (paper, App.
+        B.1, "Partner Selection")."""
+        network, layout = self.run.stages[stage].network, self.run.layout
+        last = CHECKPOINTS_PER_MEMBER - 1
+        former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
-        returns = cross_play.matrix(self.run.layout, network, new, former, seed=number)[0]
-        returns = returns + cross_play.matrix(self.run.layout, network, former, new, seed=number)[:, 0]
+        returns = cross_play_returns(layout, network, new, former, seed=number)[0]
+        returns = returns + cross_play_returns(layout, network, former, new, seed=number)[:, 0]
         nearest = int(np.argmax(returns))
         return jax.tree.map(lambda leaf, old: leaf.at[1].set(old[nearest]), params, former)
 
@@ -257,10 +278,9 @@ class _Training:
         run, population = self.run, self.run.stages[stage]
         count = 1 if run.algorithm == "comedi" else run.members
         members = jax.tree.map(lambda leaf: leaf[:count], params)
-        opposite = jax.tree.map(lambda leaf: leaf[count : 2 * count], params) if run.responds else members
+        partners = jax.tree.map(lambda leaf: leaf[count : 2 * count], params) if run.has_best_responses else members
         returns, as_teammate = (
-            cross_play.together(run.layout, population.network, opposite, members, greedy=greedy)
-            for greedy in (False, True)
+            paired_returns(run.layout, population.network, partners, members, greedy=greedy) for greedy in (False, True)
         )
         for k in range(count):
             card = {
@@ -271,26 +291,25 @@ class _Training:
                 "step": update * run.config.steps_per_update,
                 "seed": run.seed,
                 "code_version": version("icrl4aht-data"),
-                "seats": [1] if run.responds else [0, 1],
+                "seats": [1] if run.has_best_responses else [0, 1],
                 "return": float(returns[k]),
                 "teammate_return": float(as_teammate[k]),
-                "return_of": f"{cross_play.EPISODES} episodes of 400 steps with its best response or itself, both "
+                "return_of": f"{EPISODES_PER_PAIR} episodes of 400 steps with its best response or itself, both "
                 "drawing their actions; as a teammate it acts greedily, in seat 1",
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
-            if run.responds and checkpoint == CHECKPOINTS - 1:
-                response = jax.tree.map(lambda leaf, k=k: leaf[k], opposite)
-                where = self.folder / "responses" / f"m{k}"
-                save_policy(where, population.network, response, card | {"role": "best response", "seats": [0]})
+            if run.has_best_responses and checkpoint == CHECKPOINTS_PER_MEMBER - 1:
+                response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
+                path = self.folder / "responses" / f"m{k}"
+                save_policy(path, population.network, response, card | {"role": "best response", "seats": [0]})
 
     def _finish(self) -> None:
-        plot_training(
-            self.folder / METRICS, self.folder / "curves.png", f"{self.run.algorithm}, {self.run.layout.name}"
-        )
+        title = f"{self.run.algorithm}, {self.run.layout.name}"
+        plot_training(self.folder / METRICS, self.folder / "curves.png", title)
         files = {
             str(path.relative_to(self.folder)): file_hash(path)
-            for name in (WEIGHTS, CARD)
+            for name in (POLICY_WEIGHTS, POLICY_CARD)
             for path in sorted(self.folder.rglob(name))
         }
         content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
@@ -300,8 +319,13 @@ class _Training:
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint of a suite. `path` is relative to the suite's folder."""
+class SuiteCheckpoint:
+    """A checkpoint of a suite.
+
+    Attributes:
+        path: relative to the suite's folder.
+        card: its card.
+    """
 
     path: str
     card: dict[str, Any]
@@ -312,32 +336,42 @@ def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
     return (suite / layout / algorithm / _POPULATION).is_file()
 
 
-def checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Checkpoint]:
-    """A population's checkpoints, by member and checkpoint.
+def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
+    """Yields a population's checkpoints, by member and checkpoint.
 
     Raises:
-        OptionError: if the population was not finished.
+        OptionError: if the population is not finished.
     """
     folder = suite / layout / algorithm
     if not is_trained(suite, layout, algorithm):
         raise OptionError(f"{folder}: no finished population; run `python -m generation teammates --layout {layout}`")
-    found = [path.parent for path in folder.glob(f"m*/c*/{WEIGHTS}")]
+    found = [path.parent for path in folder.glob(f"m*/c*/{POLICY_WEIGHTS}")]
     for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
-        yield Checkpoint(str(path.relative_to(suite)), load_card(path))
+        yield SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
 
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
-    """Mean returns float64 (K, K) of the final policies: row the one in seat 0 (the best response, where the algorithm
-    trains them), column the member in seat 1; the diagonal is self-play. `greedy` members act as teammates do.
+    """Mean returns float64 (K, K) of a population's final policies with each other.
+
+    Args:
+        suite: the suite's folder.
+        layout: the layout.
+        algorithm: the population's algorithm.
+        greedy: whether teammates take their most probable actions.
+
+    Returns:
+        Rows are egos (best responses, if the algorithm trains them), columns members as teammates; the diagonal is
+        self-play.
 
     Raises:
-        OptionError: if the population was not finished.
+        OptionError: if the population is not finished.
     """
-    last = [point for point in checkpoints(suite, layout.name, algorithm) if point.path.endswith(f"c{CHECKPOINTS - 1}")]
+    final = f"c{CHECKPOINTS_PER_MEMBER - 1}"
+    last = [point for point in suite_checkpoints(suite, layout.name, algorithm) if point.path.endswith(final)]
     loaded = [load_policy(suite / point.path) for point in last]
     members = stacked([params for _, params, _ in loaded])
     folder = suite / layout.name / algorithm / "responses"
-    left = members
+    egos = members
     if folder.is_dir():
-        left = stacked([load_policy(folder / f"m{point.card['member']}")[1] for point in last])
-    return cross_play.matrix(layout, loaded[0][0], left, members, greedy=greedy)
+        egos = stacked([load_policy(folder / f"m{point.card['member']}")[1] for point in last])
+    return cross_play_returns(layout, loaded[0][0], egos, members, greedy=greedy)

@@ -1,55 +1,101 @@
-"""Profiles: everything that sizes a rebuild, in TOML. Unknown keys fail."""
+"""Profiles: everything that sizes a rebuild, in TOML. Unknown keys are errors."""
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from math import inf
 from pathlib import Path
 from typing import Any
 
-from generation.learners.network import Widths
-from generation.learners.ppo import PPOConfig
+from generation.learners.config import PPOConfig, Widths
 from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, PAPER_TEAMMATE_STEPS, PAPER_TEAMMATES, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.commands.dataclass_options import replace_given
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
+from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 FOLDER = Path(__file__).parent
 
-_FROM_ZERO_TO: dict[str, float] = {"entropy": inf, "value": inf, "warmup": 1, "discount": 1, "gae_lambda": 1}
-"""The largest value of what may be zero; everything else is positive."""
+_LEAST_EPISODES = 5
+"""Episodes of a stream: its start and its end are means over five."""
 
 
 @dataclass(frozen=True)
 class TeammateConfig:
-    """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1)."""
+    """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1).
 
-    members: int = 10  # of each algorithm's population
-    train: int = PAPER_TEAMMATES  # teammates of each algorithm for the training tasks
-    heldout: int = 5  # others, for the in-distribution check
+    Attributes:
+        members: policies of each algorithm's population.
+        train: teammates of each algorithm for the training tasks.
+        heldout: further ones, for the in-distribution check.
+        ppo: hyper-parameters of every policy.
+    """
+
+    members: int = option_field(10, "Policies of each population.", at_least=1)
+    train: int = option_field(PAPER_TEAMMATES, "Teammates of each algorithm for training tasks.", at_least=1)
+    heldout: int = option_field(5, "Held-out teammates of each algorithm.", at_least=0)
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000
         )
     )
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True)
 class Profile:
-    """How large a rebuild is."""
+    """The size of a rebuild.
+
+    Attributes:
+        name: of the profile's file.
+        ego: hyper-parameters of the egos.
+        teammates: the learned teammates.
+        data_version: version of the release, SemVer.
+        keep: streams of each task that the release keeps, best first.
+        layouts: names of the layouts.
+        presets: teammates by the heuristic H4 `utility_greedy`, on every layout.
+        algorithms: layout -> algorithms of its learned teammates.
+
+    Raises:
+        OptionError: if there is no task, or the ego's sizes do not fit.
+    """
 
     name: str
     ego: PPOConfig
     teammates: TeammateConfig
-    data_version: str  # of the release, SemVer
-    keep: int  # streams of each task that the release keeps, best first
+    data_version: str
+    keep: int
     layouts: tuple[str, ...]
-    presets: tuple[str, ...] = ()  # teammates that are the heuristic H4 utility_greedy
-    algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of a layout's teammates that learned
+    presets: tuple[str, ...] = ()
+    algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.task_layouts:
+            raise OptionError("expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms")
+        if not 0 < self.keep <= self.ego.environments:
+            raise OptionError(f"release.keep = {self.keep}: expected 1..{self.ego.environments}")
+        if self.ego.episodes < _LEAST_EPISODES:
+            raise OptionError(
+                f"ego.total_steps gives {self.ego.episodes} episodes a stream, expected at least {_LEAST_EPISODES}"
+            )
+
+    def with_ego(self, given: Mapping[str, Any]) -> Profile:
+        """Returns the profile with some of the ego's hyper-parameters replaced, at any depth.
+
+        Raises:
+            OptionError: if they do not fit.
+        """
+        try:
+            return replace(self, ego=replace_given(self.ego, given))
+        except ValueError as error:
+            raise OptionError(f"profile {self.name} with the given options: {error}") from error
 
     def heuristic_tasks(self) -> list[Task]:
         """One training task per layout and preset, each with a seed of its own."""
@@ -61,7 +107,7 @@ class Profile:
 
     @property
     def task_layouts(self) -> tuple[str, ...]:
-        """The layout of each training task, if the populations have teammates enough."""
+        """The layout of each training task, if every population has enough good teammates."""
         learned = [
             layout for layout, names in self.algorithms.items() for _ in range(len(names) * self.teammates.train)
         ]
@@ -69,16 +115,17 @@ class Profile:
 
     @property
     def ego_hash(self) -> str:
-        """Of what decides an artefact beyond its task; a change makes artefacts anew."""
+        """Hash of the ego's hyper-parameters, which with the task decide an artefact."""
         return json_hash(asdict(self.ego))
 
     @property
     def hash(self) -> str:
-        """Of all of it."""
+        """Hash of the profile."""
         return json_hash(asdict(self))
 
 
-def names() -> list[str]:
+def profile_names() -> list[str]:
+    """Names of the shipped profiles."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
@@ -91,80 +138,64 @@ def load_profile(name: str) -> Profile:
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
-        raise unknown("profile", name, names())
+        raise unknown("profile", name, profile_names())
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-        _only(content, "", {"ego", "teammates", "release", "tasks"})
-        _only(content["release"], "release.", {"keep", "data_version"})
-        _only(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
-        tasks = content["tasks"]
-        layouts = _layouts("tasks.layouts", tasks["layouts"])
-        profile = Profile(
-            name=path.stem,
-            ego=_ppo("ego", content["ego"], PPOConfig()),
-            teammates=_teammates(content.get("teammates", {})),
-            data_version=check_version(_typed("release.data_version", content["release"]["data_version"], str)),
-            keep=_typed("release.keep", content["release"]["keep"], int),
-            layouts=layouts,
-            presets=_names("tasks.presets", tasks.get("presets", [])),
-            algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
-        )
-        profile.heuristic_tasks()
+        profile = _profile(path.stem, tomllib.loads(path.read_text(encoding="utf-8")))
+        profile.heuristic_tasks()  # raises for unknown presets
     except tomllib.TOMLDecodeError as error:
         raise OptionError(f"{path}: not TOML: {error}") from error
     except KeyError as error:
         raise OptionError(f"{path}: missing key {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise OptionError(f"{path}: {error}") from error
-    if not profile.task_layouts:
-        raise OptionError(
-            f"{path}: expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms"
-        )
-    if not 0 < profile.keep <= profile.ego.environments:
-        raise OptionError(f"{path}: release.keep = {profile.keep}: expected 1..{profile.ego.environments}")
-    if profile.ego.episodes < 5:
-        raise OptionError(
-            f"{path}: ego.total_steps gives {profile.ego.episodes} episodes a stream, expected at least 5"
-        )
     return profile
 
 
-def _teammates(table: dict[str, Any]) -> TeammateConfig:
-    sizes = ("members", "train", "heldout")
-    rest = {name: value for name, value in table.items() if name not in sizes}
-    counts = {name: _typed(f"teammates.{name}", table[name], int) for name in sizes if name in table}
-    for name, count in counts.items():
-        if count < (name != "heldout"):
-            raise OptionError(f"teammates.{name} = {count}: expected a positive number")
-    return TeammateConfig(**counts, ppo=_ppo("teammates", rest, TeammateConfig().ppo))
+def _profile(name: str, content: dict[str, Any]) -> Profile:
+    _check_keys(content, "", {"ego", "teammates", "release", "tasks"})
+    _check_keys(content["release"], "release.", {"keep", "data_version"})
+    _check_keys(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
+    tasks = content["tasks"]
+    layouts = _layouts("tasks.layouts", tasks["layouts"])
+    return Profile(
+        name=name,
+        ego=_options(PPOConfig(), "ego", content["ego"]),
+        teammates=_teammates(content.get("teammates", {})),
+        data_version=check_version(_typed("release.data_version", content["release"]["data_version"], str)),
+        keep=_typed("release.keep", content["release"]["keep"], int),
+        layouts=layouts,
+        presets=_names("tasks.presets", tasks.get("presets", [])),
+        algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
+    )
 
 
-def _ppo(section: str, table: dict[str, Any], defaults: PPOConfig) -> PPOConfig:
-    table = dict(table)
-    _only(table, f"{section}.", {field.name for field in fields(PPOConfig)})
-    if "widths" in table:
-        _only(table["widths"], f"{section}.widths.", {field.name for field in fields(Widths)})
-        table["widths"] = Widths.from_table(table["widths"])
-    for known in fields(PPOConfig):
-        if known.name in table and known.name != "widths":
-            key = f"{section}.{known.name}"
-            value = _typed(key, table[known.name], int if known.type == "int" else float)
-            _check_range(key, value, _FROM_ZERO_TO.get(known.name))
-    return replace(defaults, **table)
+def _teammates(values: dict[str, Any]) -> TeammateConfig:
+    """[teammates] holds the sizes of the suite next to the hyper-parameters of its policies."""
+    sizes = {name: values[name] for name in ("members", "train", "heldout") if name in values}
+    rest = {name: value for name, value in values.items() if name not in sizes}
+    defaults = TeammateConfig()
+    return replace(_options(defaults, "teammates", sizes), ppo=_options(defaults.ppo, "teammates", rest))
 
 
-def _check_range(key: str, value: float, most: float | None) -> None:
-    """`most` is the largest value of what may be zero; None of what may not."""
-    if most is None:
-        fits, expected = value > 0, "a positive number"
-    else:
-        fits, expected = 0 <= value <= most, "0 or more" if most == inf else f"0 to {most}"
-    if not fits:
-        raise OptionError(f"{key} = {value}: expected {expected}")
+def _options(defaults: Any, section: str, values: dict[str, Any]) -> Any:
+    """Hyper-parameters with the values of a TOML section, whose checks name the key."""
+    known = {known.name for known in fields(defaults)}
+    _check_keys(values, f"{section}.", known)
+    values = dict(values)
+    if "widths" in values:
+        _check_keys(values["widths"], f"{section}.widths.", {known.name for known in fields(Widths)})
+        try:
+            values["widths"] = Widths.from_json(values["widths"])
+        except OptionError as error:
+            raise OptionError(f"{section}.widths.{error}") from error
+    try:
+        return replace(defaults, **values)
+    except OptionError as error:
+        raise OptionError(f"{section}.{error}") from error
 
 
 def _names(key: str, value: Any) -> tuple[str, ...]:
-    """A list of names, none twice."""
+    """A list of different names."""
     names = _typed(key, value, list)
     if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
         raise OptionError(f"{key} = {names!r}: expected names, none twice")
@@ -172,7 +203,7 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
 
 
 def _algorithms(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """By layout, in the order of the layouts; a list is for all of them."""
+    """Layout -> algorithms, in the order of the layouts; a list applies to all of them."""
     if isinstance(value, dict):
         names_of = dict(zip(_layouts(key, list(value)), value, strict=True))
         found = {name: _names(f"{key}.{typed}", value[typed]) for name, typed in names_of.items()}
@@ -193,13 +224,12 @@ def _layouts(key: str, value: Any) -> tuple[str, ...]:
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
-    """The value, if it is of that type; a whole number will do where a float is expected."""
-    if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
+    if isinstance(value, bool) or not isinstance(value, kind):
         raise OptionError(f"{key} = {value!r}: expected {kind.__name__}")
     return value
 
 
-def _only(table: dict[str, Any], prefix: str, known: set[str]) -> None:
-    for key in table:
+def _check_keys(section: dict[str, Any], prefix: str, known: set[str]) -> None:
+    for key in section:
         if key not in known:
             raise unknown("key", prefix + key, [prefix + name for name in sorted(known)])

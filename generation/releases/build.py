@@ -1,4 +1,4 @@
-"""A whole rebuild: every task of a profile collected, then packed."""
+"""A complete rebuild: the teammates trained, every task of a profile collected, then packed."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from filelock import FileLock
 from rich.console import Console
 
 from generation.collection.job import CollectionError
-from generation.collection.options import Options
+from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
 from generation.populations.build import build_suite
 from generation.populations.select import THRESHOLD, make_tasks
-from generation.profiles import Profile, load_profile
-from generation.progress import progress
-from generation.releases.package import package
+from generation.profiles import Profile
+from generation.progress import progress_bars
+from generation.releases.package import package_release
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import Kind
@@ -24,36 +24,50 @@ from icrl4aht_data.writing.release_folder import check_replaceable
 from icrl4aht_data.writing.statistics import print_statistics
 
 SUITE = "suite"
-"""Where a rebuild keeps its learned teammates, unless told another place."""
+"""Name of the suite's folder in a rebuild."""
 
 
 def build_releases(
-    profile_name: str,
+    profile: Profile,
     out: Path,
     kinds: Sequence[Kind],
     console: Console,
-    options: Options | None = None,
+    options: CollectOptions | None = None,
     suite: Path | None = None,
     seed: int = 0,
 ) -> list[Path]:
     """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
 
     Args:
-        out: tasks are collected under out/artefacts.
-        suite: the folder of the learned teammates; by default out/suite.
-        seed: of the suite.
+        profile: the profile.
+        out: folder of the rebuild; tasks are collected under out/artefacts.
+        kinds: kinds of releases.
+        console: where progress is printed.
+        options: how tasks are collected.
+        suite: folder of the learned teammates; by default out/suite.
+        seed: seed of the suite.
+
+    Returns:
+        The release folders.
 
     Raises:
         CollectionError: if a task could not be collected; nothing is packed then.
     """
-    profile = load_profile(profile_name)
     for kind in kinds:
         check_replaceable(out / kind)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
     tasks = train_teammates(profile, suite, seed, console)
-    collect_tasks(tasks, profile, out, console, options or Options(), suite)
-    with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same, before or after
-        releases = [_pack(out / "artefacts", out / kind, tasks, profile, suite, kind, console) for kind in kinds]
+    collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)
+    releases = []
+    with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same releases
+        for kind in kinds:
+            with progress_bars(console) as bars:
+                bar = bars.add_task(f"packing {kind}", total=len(tasks), note="")
+
+                def advance(task: Task, bars=bars, bar=bar) -> None:
+                    bars.advance(bar)
+
+                releases.append(package_release(out / "artefacts", out / kind, tasks, profile, suite, kind, advance))
         for release in releases:
             print_statistics(read_info(release), console)
     return releases
@@ -77,17 +91,3 @@ def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) 
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
     return tasks
-
-
-def _pack(
-    artefacts: Path,
-    target: Path,
-    tasks: list[Task],
-    profile: Profile,
-    suite: Path,
-    kind: Kind,
-    console: Console,
-) -> Path:
-    with progress(console) as bars:
-        bar = bars.add_task(f"packing {kind}", total=len(tasks), note="")
-        return package(artefacts, target, tasks, profile, suite, kind, lambda task: bars.advance(bar))

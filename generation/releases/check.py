@@ -1,4 +1,4 @@
-"""Two rebuilds, bit for bit: the same files with the same bytes, or what differs."""
+"""Compares two rebuilds bit for bit."""
 
 from __future__ import annotations
 
@@ -9,32 +9,39 @@ from typing import Any
 import numpy as np
 
 from generation.collection.failures import FAILED
-from generation.collection.task_folder import FILTER_CURVES, TIMING
+from generation.collection.task_folder import FILTER_CURVES
+from generation.learners.resume import TIMING
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.hashes import file_hash
 
-_APART = {TIMING, FAILED, FILTER_CURVES}
-"""Files that say how a rebuild went, and pictures of what it made."""
+_IGNORED = {TIMING, FAILED, FILTER_CURVES}
+"""Files about the course of a rebuild, and pictures of its results."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
 
 @dataclass
 class Comparison:
-    """How many files there are in one or the other, and what is the matter with those that differ."""
+    """Result of a comparison.
+
+    Attributes:
+        files: number of files in either folder.
+        differences: file -> how it differs.
+    """
 
     files: int = 0
     differences: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
+        """The fields, and whether the folders are equal."""
         return {"equal": not self.differences, **asdict(self)}
 
 
-def compare(a: Path, b: Path) -> Comparison:
-    """Compare two folders. Wall-clock figures, failures, pictures and hidden files are left out.
+def compare_rebuilds(a: Path, b: Path) -> Comparison:
+    """Compare two folders by the hashes of their files, except wall-clock figures, failures, pictures and hidden files.
 
     Raises:
-        OptionError: if one is no folder, or there is nothing to compare.
+        OptionError: if one is not a folder, or there is nothing to compare.
     """
     for folder in (a, b):
         if not folder.is_dir():
@@ -49,22 +56,20 @@ def compare(a: Path, b: Path) -> Comparison:
         elif name not in ours:
             result.differences[name] = f"only in {b}"
         elif file_hash(a / name) != file_hash(b / name):
-            result.differences[name] = _how(a / name, b / name)
+            result.differences[name] = _describe_difference(a / name, b / name)
     return result
 
 
 def _files(root: Path) -> set[str]:
-    paths = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
-    return {
-        path.as_posix() for path in paths if path.name not in _APART and not any(p.startswith(".") for p in path.parts)
-    }
+    paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file() and path.name not in _IGNORED]
+    return {path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)}
 
 
-def _how(a: Path, b: Path) -> str:
+def _describe_difference(a: Path, b: Path) -> str:
     if a.suffix == ".npy":
         try:
-            return _how_arrays(np.load(a, mmap_mode="r"), np.load(b, mmap_mode="r"))
-        except ValueError:  # one of them is no array
+            return _describe_arrays(np.load(a, mmap_mode="r"), np.load(b, mmap_mode="r"))
+        except ValueError:  # one of them is not an array
             pass
     sizes = a.stat().st_size, b.stat().st_size
     ours, theirs = np.memmap(a, np.uint8, "r") if sizes[0] else (), np.memmap(b, np.uint8, "r") if sizes[1] else ()
@@ -76,11 +81,11 @@ def _how(a: Path, b: Path) -> str:
     return f"{size}, the first difference at byte {first}{line}"
 
 
-def _how_arrays(a: np.ndarray, b: np.ndarray) -> str:
+def _describe_arrays(a: np.ndarray, b: np.ndarray) -> str:
     if (a.shape, a.dtype) != (b.shape, b.dtype):
         return f"{a.dtype} {a.shape} and {b.dtype} {b.shape}"
     wrong = np.argwhere(np.asarray(a != b))
     if not len(wrong):
-        return "the same array, stored in another way"
+        return "equal arrays, stored differently"
     at = tuple(wrong[0].tolist())
     return f"{len(wrong)} of {a.size} values, the first at {at}: {a[at]} and {b[at]}"

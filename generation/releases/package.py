@@ -1,4 +1,4 @@
-"""Artefacts -> a release folder: the best streams of each task, labelled."""
+"""Artefacts -> a release folder: the best streams of each task, with expert actions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from generation.collection import record
 from generation.collection.curate import best_streams, filter_report, plot_filter, relabel
+from generation.collection.record import HistoryArrays
 from generation.collection.task import TEAMMATE_NOISE
 from generation.collection.task_folder import FILTER_CURVES, METADATA
 from generation.learners.checkpoint import load_policy
@@ -27,7 +27,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder
 
 
-def package(
+def package_release(
     artefacts: Path,
     target: Path,
     tasks: Sequence[Task],
@@ -36,13 +36,23 @@ def package(
     kind: Kind,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
-    """Write a release of these tasks' artefacts, with the checkpoints of learned teammates; see `write_release`."""
+    """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
+
+    Args:
+        artefacts: folder of the tasks' finished artefacts.
+        target: the release folder, replaced atomically.
+        tasks: the tasks, in the release's order.
+        profile: their profile.
+        suite: folder of the learned teammates.
+        kind: kind of the release.
+        done: called after each task.
+    """
     new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
     return write_release(target, kind, new, data_version=profile.data_version, done=done)
 
 
 def bundle_release(release: Path) -> Path:
-    """Put a copy of a release in the place of the one that the package bundles."""
+    """Replace the release that the package bundles by a copy of this one."""
     with atomic_folder(MINI) as copy:
         shutil.copytree(release, copy, dirs_exist_ok=True)
     return MINI
@@ -81,9 +91,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
 
 
 def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHistory]:
-    arrays = record.Histories(
-        **{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in record.Histories._fields}
-    )
+    arrays = HistoryArrays(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields})
     network, params, _ = load_policy(folder)
     labels = relabel(task.layout, network, params, (arrays.state[stream] for stream in streams))
     dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)

@@ -15,10 +15,10 @@ from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import get_layout
 
-Table = dict[str, tuple[float, ...]]
-"""parameter -> its value in t0..t4, parameters in declaration order."""
+ParameterSets = dict[str, tuple[float, ...]]
+"""Parameter -> values in t0..t4, parameters in order of declaration."""
 
-_H1: Table = {
+_H1: ParameterSets = {
     "press_L_when_unknown": (0.8, 0.1, 0.3, 0.02, 0.7),
     "refresh_interval": (100, 300, 200, 1000, 100),
     "cost_sensitivity": (0.1, 0.9, 0.5, 0.98, 0.2),
@@ -33,7 +33,7 @@ _H1: Table = {
     "idle_prob": (0.1, 0.75, 0.6, 0.7, 0.15),
     "path_blocking": (0.0, 0.4, 0.85, 0.6, 0.3),
 }
-_H1_CRAMPED: Table = {
+_H1_CRAMPED: ParameterSets = {
     "press_L_when_unknown": (0.9, 0.5, 0.3, 0.2, 0.7),
     "refresh_interval": (80, 120, 200, 250, 100),
     "cost_sensitivity": (0.1, 0.4, 0.7, 0.8, 0.2),
@@ -48,7 +48,7 @@ _H1_CRAMPED: Table = {
     "idle_prob": (0.2, 0.3, 0.6, 0.15, 0.2),
     "path_blocking": (0.1, 0.8, 0.3, 0.2, 0.15),
 }
-_H2: Table = {
+_H2: ParameterSets = {
     "split_mode": (0, 0, 1, 0, 0),
     "strictness": (0.5, 0.3, 0.2, 0.4, 0.8),
     "shared_margin": (1, 2, 1, 1, 0),
@@ -57,7 +57,7 @@ _H2: Table = {
     "behavior_mode": (1, 2, 3, 4, 5),
     "action_probability": (1.0, 1.0, 0.15, 1.0, 1.0),
 }
-_H2_CRAMPED: Table = {
+_H2_CRAMPED: ParameterSets = {
     "split_mode": (0, 0, 1, 0, 0),
     "strictness": (0.7, 0.6, 0.5, 0.65, 0.9),
     "shared_margin": (0, 1, 1, 1, 0),
@@ -66,7 +66,7 @@ _H2_CRAMPED: Table = {
     "behavior_mode": (1, 2, 3, 4, 5),
     "action_probability": (1.0, 1.0, 0.1, 1.0, 1.0),
 }
-_H3: Table = {
+_H3: ParameterSets = {
     "role_mode": (2, 2, 0, 2, 1),
     "handoff_style": (0, 1, 2, 0, 1),
     "plate_urgency": (0.5, 0.4, 0.2, 0.6, 0.3),
@@ -78,7 +78,7 @@ _H3: Table = {
     "stubbornness": (0.0, 0.0, 0.5, 0.0, 0.2),
     "timing_mismatch": (0.3, 0.0, 0.2, 0.1, 0.5),
 }
-_H4: Table = {
+_H4: ParameterSets = {
     "w_deliver": (18.0, 6.0, 10.0, 10.0, 9.0),
     "w_pickup_cooked": (15.0, 4.0, 8.0, 9.0, 7.0),
     "w_get_plate": (10.0, 3.0, 6.0, 6.0, 6.0),
@@ -92,33 +92,33 @@ _H4: Table = {
     "counter_preference": (0.3, 0.7, 0.5, 0.5, 0.9),
 }
 
-_TABLES = {"recipe_aware_button": _H1, "territory": _H2, "assembly_line": _H3, "utility_greedy": _H4}
-_CRAMPED = _TABLES | {"recipe_aware_button": _H1_CRAMPED, "territory": _H2_CRAMPED}
+_FAMILIES = {"recipe_aware_button": _H1, "territory": _H2, "assembly_line": _H3, "utility_greedy": _H4}
+_CRAMPED = _FAMILIES | {"recipe_aware_button": _H1_CRAMPED, "territory": _H2_CRAMPED}
 
 INSTANCES = 5
 
 
 def published_thetas(layout: str, family: str) -> list[dict[str, Any]]:
     """The published parameter sets t0..t4 of a family on a layout (short name)."""
-    table = (_CRAMPED if layout == "cramped_down" else _TABLES)[family]
-    return [{name: _published(values[t], family) for name, values in table.items()} for t in range(INSTANCES)]
+    sets = (_CRAMPED if layout == "cramped_down" else _FAMILIES)[family]
+    return [{name: _published(values[t], family) for name, values in sets.items()} for t in range(INSTANCES)]
 
 
 def _published(value: float, family: str) -> float:
-    """As the manifests have it: whole numbers as they are; H1 to H3 rounded to float32, H4 plain decimals."""
+    """A value as in the manifests: integers unchanged, other numbers of H1 to H3 rounded to float32, of H4 not."""
     if isinstance(value, int) or family == "utility_greedy":
         return value
     return float(np.float32(value))
 
 
 def named_task(layout: str, teammate: str) -> Task:
-    """The test task of a layout and of a teammate such as "H3/t1", on the layouts of the test and training splits.
+    """The test task of a layout, of the test or the training split, with a teammate such as "H3/t1".
 
     Raises:
         UnknownNameError: for an unknown layout, family or instance.
     """
     name = get_layout(layout).name
-    names = {f"{HEURISTIC_KINDS[family]}/t{t}": (family, t) for family in _TABLES for t in range(INSTANCES)}
+    names = {f"{HEURISTIC_KINDS[family]}/t{t}": (family, t) for family in _FAMILIES for t in range(INSTANCES)}
     if teammate not in names:
         raise unknown("teammate", teammate, names)
     family, number = names[teammate]
@@ -139,6 +139,6 @@ def published_tasks(track: str) -> list[Task]:
             seed=0,
         )
         for layout in TRACKS[track]["test"]
-        for family in _TABLES
+        for family in _FAMILIES
         for number, theta in enumerate(published_thetas(layout, family))
     ]

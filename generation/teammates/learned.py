@@ -1,4 +1,4 @@
-"""Teammates that learned: checkpoints of the one network, frozen (paper, App. B.1)."""
+"""Learned teammates: frozen checkpoints of the actor-critic (paper, App. B.1)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Key, UInt8
 
-from generation.learners.checkpoint import WEIGHTS, load_policy
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from generation.policy import Policy
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.format.checkpoints import checkpoint_folder
@@ -20,16 +21,21 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.hashes import file_hash
 
 Action = Literal["greedy", "sampled"]
-"""How a checkpoint acts: its likeliest action, as teammates of the dataset do, or a draw from its distribution."""
+"""How a checkpoint acts: its most probable action, as the dataset's teammates do, or a draw from its distribution."""
 
 _CRITIC = ("critic", "critic_hidden")
 
 
-def build(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
-    """A checkpoint as a policy for either seat; its GRU is carried through the episode.
+def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
+    """A checkpoint as a policy for either agent; its recurrent state is reset at each episode.
+
+    Args:
+        layout: the layout.
+        folder: the checkpoint, see `learners.checkpoint`.
+        action: how it acts.
 
     Raises:
-        OptionError: if it is no checkpoint, or its shapes do not fit the layout's observations.
+        OptionError: if it is not a checkpoint, or its shapes do not fit the layout's observations.
     """
     network, params, _ = load_policy(folder)
     weights = {name: part for name, part in params["params"].items() if name not in _CRITIC}
@@ -45,41 +51,46 @@ def build(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
     return Policy({"params": jax.tree.map(jnp.asarray, weights)}, init, act, "observation")
 
 
-def untrained(layout: Layout, widths: Widths) -> Policy:
-    """A checkpoint that has learned nothing, for measuring."""
+def build_untrained(layout: Layout, widths: Widths) -> Policy:
+    """A policy with initial parameters, for measuring speed."""
     init, act = _functions(widths, "greedy")
     params = ActorCritic(widths, critic=False).untrained(jax.random.key(0), layout.channels)
     return Policy(params, init, act, "observation")
 
 
-def build_entry(layout: Layout, teammate: dict[str, Any], suite: Path | None, action: Action = "greedy") -> Policy:
+def build_learned_entry(
+    layout: Layout, teammate: dict[str, Any], suite: Path | None, action: Action = "greedy"
+) -> Policy:
     """The policy of a task's teammate entry of kind "rl".
 
     Args:
-        suite: a suite, or TEAMMATES of a release.
+        layout: the layout.
+        teammate: the entry.
+        suite: a suite's folder, or the folder TEAMMATES of a release.
+        action: how it acts.
 
     Raises:
         OptionError: without a suite, or if the checkpoint is missing or does not fit.
-        TaskFormatError: if its weights are not those that the entry names by their hash.
+        TaskFormatError: if the SHA-256 of its weights is not the entry's.
     """
     if suite is None:
         raise OptionError(
-            f"teammate {teammate['theta']['checkpoint']} is a checkpoint: say in which folder the suite of teammates is"
+            f"teammate {teammate['theta']['checkpoint']} is a checkpoint: give the folder of the suite of teammates"
         )
     folder = checkpoint_folder(suite, teammate)
-    policy = build(layout, folder, action)
-    digest = file_hash(folder / WEIGHTS)
+    policy = build_learned(layout, folder, action)
+    digest = file_hash(folder / POLICY_WEIGHTS)
     if digest != teammate["theta"]["sha256"]:
         raise TaskFormatError(
-            f"{folder / WEIGHTS}: sha256 {digest}, expected {teammate['theta']['sha256']} as the task says; "
-            f"restore the checkpoint, or make the manifest anew"
+            f"{folder / POLICY_WEIGHTS}: sha256 {digest}, expected {teammate['theta']['sha256']} as in the task; "
+            f"restore the checkpoint, or write the manifest again"
         )
     return policy
 
 
 @lru_cache(maxsize=16)
 def _functions(widths: Widths, action: Action):
-    """The same functions for all checkpoints of one shape, so that they share compilations."""
+    """`init` and `act`, one pair for all checkpoints of one shape, so that they share compilations."""
     network = ActorCritic(widths, critic=False)
 
     def init(params, key: Key[Array, ""]) -> Array:
@@ -100,6 +111,6 @@ def _shapes(network: ActorCritic, layout: Layout) -> dict[str, Any]:
 
 
 def _differing(one: Any, other: Any) -> dict[str, Any]:
-    """The shapes of one tree that the other has not."""
-    there = flatten_dict(other, sep="/")
-    return {name: shape for name, shape in flatten_dict(one, sep="/").items() if there.get(name) != shape}
+    """The shapes in one tree that differ from the other's, by path."""
+    others = flatten_dict(other, sep="/")
+    return {name: shape for name, shape in flatten_dict(one, sep="/").items() if others.get(name) != shape}

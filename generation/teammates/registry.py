@@ -3,88 +3,96 @@
 from __future__ import annotations
 
 import hashlib
-import math
-from functools import lru_cache
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from generation.policy import Noise, Policy, as_params
+from generation.policy import Noise, Policy
 from generation.teammates import learned
-from generation.teammates.heuristics import assembly_line, recipe_aware_button, territory, utility_greedy
+from generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
+from generation.teammates.heuristics.heuristic import Heuristic
+from generation.teammates.heuristics.recipe_aware_button import RECIPE_AWARE_BUTTON
+from generation.teammates.heuristics.territory import TERRITORY
+from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
-_FAMILIES = {module.KIND: module for module in (recipe_aware_button, territory, assembly_line, utility_greedy)}
+HEURISTIC_FAMILIES = {
+    heuristic.kind: heuristic for heuristic in (RECIPE_AWARE_BUTTON, TERRITORY, ASSEMBLY_LINE, UTILITY_GREEDY)
+}
 
 _JITTER = 0.2
-"""How far a sampled parameter strays from its preset, as a share of its full range."""
+"""Largest distance of a sampled parameter from its preset, as a share of its full range."""
 
 
 def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any]:
-    """The teammate entry of a heuristic's preset, every parameter explicit."""
-    module = _module(family)
-    if preset not in module.PRESETS:
-        raise unknown(f"preset of {family}", preset, module.PRESETS)
-    theta = module.DEFAULTS | module.PRESETS[preset]
+    """The teammate entry of a heuristic's preset, every parameter explicit.
+
+    Raises:
+        UnknownNameError: for a family or preset that does not exist.
+    """
+    heuristic = _family(family)
+    if preset not in heuristic.presets:
+        raise unknown(f"preset of {family}", preset, heuristic.presets)
+    theta = heuristic.defaults | heuristic.presets[preset]
     return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": 0, "theta": theta}
 
 
-def sample(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[str, Any]:
-    """The teammate entry whose preset and parameters are drawn by the string `family:theta_id:split:base_seed`.
+def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[str, Any]:
+    """A teammate entry with preset and parameters drawn by the string `family:theta_id:split:base_seed`.
 
-    No published task comes from here: their manifests give every parameter (paper, App. B.2, train and test ranges).
+    Published tasks do not come from here: their manifests state every parameter (paper, App. B.2, train and test
+    ranges).
 
     Args:
         family: a heuristic's name.
-        theta_id: any number that tells the draws apart.
+        theta_id: any number that distinguishes the draws.
         split: "train" or "test", which have ranges of their own.
         base_seed: shared by the draws of one run.
 
     Returns:
-        The entry, every parameter explicit: float32 values as floats, whole numbers as ints.
+        The entry, every parameter explicit: float32 values as floats, integers as ints.
 
     Raises:
         UnknownNameError: for a family or split that does not exist.
     """
-    module = _module(family)
-    samplings = {"train": module.TRAIN, "test": module.TEST}
+    heuristic = _family(family)
+    samplings = {"train": heuristic.train, "test": heuristic.test}
     if split not in samplings:
         raise unknown("split", split, samplings)
     presets, ranges = samplings[split]
     digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
-    theta = module.DEFAULTS | module.PRESETS[presets[_below(own, len(presets))]]
+    theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
         key, own = jax.random.split(key)
         if isinstance(ranges.get(name), list):
-            theta[name] = ranges[name][_below(own, len(ranges[name]))]
+            theta[name] = ranges[name][_randint(own, len(ranges[name]))]
         elif name in ranges:
-            theta[name] = _between(own, *ranges[name])
-        elif name in module.SPANS:
-            low, high = module.SPANS[name]
-            away = _JITTER * (high - low)
-            theta[name] = _between(own, max(value - away, low), min(value + away, high))
+            theta[name] = _uniform(own, *ranges[name])
+        elif name in heuristic.spans:
+            low, high = heuristic.spans[name]
+            distance = _JITTER * (high - low)
+            theta[name] = _uniform(own, max(value - distance, low), min(value + distance, high))
         elif isinstance(value, float):
             theta[name] = float(np.float32(value))
     return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": base_seed, "theta": theta}
 
 
-def _below(key: jax.Array, n: int) -> int:
+def _randint(key: jax.Array, n: int) -> int:
     return int(jax.random.randint(key, (), 0, n))
 
 
-def _between(key: jax.Array, low: float, high: float) -> float:
+def _uniform(key: jax.Array, low: float, high: float) -> float:
     return float(jax.random.uniform(key, (), minval=low, maxval=high))
 
 
-def build(
+def build_teammate(
     layout: Layout,
     teammate: dict[str, Any],
     slot: int = TEAMMATE,
@@ -94,11 +102,11 @@ def build(
     """The policy of a task's teammate entry; learned ones act greedily.
 
     Args:
-        layout: the kitchen.
+        layout: the layout.
         teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.benchmark.tasks.Task`.
         slot: 0 or 1, the agent it plays.
-        noise: of heuristics, see `base.Noise`.
-        suite: the folder that checkpoints are in: a suite, or TEAMMATES of a release.
+        noise: source of a heuristic's randomness, see `generation.policy.Noise`.
+        suite: folder of the checkpoints: a suite, or the folder TEAMMATES of a release.
 
     Raises:
         UnknownNameError: for a family that does not exist.
@@ -108,10 +116,9 @@ def build(
     if slot not in (EGO, TEAMMATE):
         raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
     if teammate.get("kind") == "rl":
-        return learned.build_entry(layout, teammate, suite)
+        return learned.build_learned_entry(layout, teammate, suite)
     check_theta(teammate)
-    module = _module(teammate["family"])
-    return _default(module, layout, slot, noise)._replace(params=as_params(teammate["theta"], module.DEFAULTS))
+    return _family(teammate["family"]).build(layout, teammate["theta"], slot, noise)
 
 
 def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
@@ -123,61 +130,38 @@ def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
     entry = dataset.recover_teammate(history_id)
     if entry["kind"] == "rl" and not dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
         raise OptionError(
-            f"{dataset.root / TEAMMATES}: lacks checkpoint {entry['theta']['sha256']}, the teammate of history "
-            f"{history_id}: this release came without it; take it from the release that it was made of"
+            f"{dataset.root / TEAMMATES}: checkpoint {entry['theta']['sha256']} is missing, the teammate of history "
+            f"{history_id}: this release was made without it; copy it from the release that it was made of"
         )
     layout = get_layout(dataset.index.entry(history_id).layout)
-    return build(layout, entry, entry.get("slot", TEAMMATE), entry.get("noise", "seeded"), dataset.root / TEAMMATES)
-
-
-@lru_cache(maxsize=64)
-def _default(module, layout: Layout, slot: int, noise: Noise) -> Policy:
-    """The family's default; its functions serve all teammates of the family, so that they share compilations."""
-    return module.build(layout, module.DEFAULTS, slot, noise)
+    slot, noise = entry.get("slot", TEAMMATE), entry.get("noise", "seeded")
+    return build_teammate(layout, entry, slot, noise, dataset.root / TEAMMATES)
 
 
 def check_theta(teammate: dict[str, Any]) -> None:
-    """Whether a heuristic's entry has every parameter, no other, and each within its range.
+    """Validate a heuristic's entry: every parameter, no other, and each within its range.
 
     Raises:
         UnknownNameError: for a family that does not exist.
         TaskFormatError: names the parameters, what was found and what was expected.
     """
-    module, theta = _module(teammate["family"]), teammate["theta"]
-    if set(theta) != set(module.DEFAULTS):
+    heuristic, theta = _family(teammate["family"]), teammate["theta"]
+    names = set(heuristic.defaults)
+    if set(theta) != names:
         raise TaskFormatError(
-            f"teammate {teammate['family']}: missing parameters {sorted(set(module.DEFAULTS) - set(theta))}, "
-            f"unknown parameters {sorted(set(theta) - set(module.DEFAULTS))}"
+            f"teammate {teammate['family']}: missing parameters {sorted(names - set(theta))}, "
+            f"unknown parameters {sorted(set(theta) - names)}"
         )
     wrong = [
-        f"{name} = {value!r} (expected {_expected(module, name)})"
+        f"{name} = {value!r} (expected {heuristic.describe(name)})"
         for name, value in theta.items()
-        if not _possible(module, name, value)
+        if not heuristic.is_valid(name, value)
     ]
     if wrong:
         raise TaskFormatError(f"teammate {teammate['family']}: out of range: {', '.join(wrong)}")
 
 
-def _possible(module, name: str, value: Any) -> bool:
-    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-        return False
-    whole = isinstance(module.DEFAULTS[name], float) or float(value).is_integer()
-    return whole and 0 <= float(value) <= _highest(module, name)
-
-
-def _highest(module, name: str) -> float:
-    if name in module.CHOICES:
-        return module.CHOICES[name] - 1
-    return math.inf if name in module.UNBOUNDED else 1.0
-
-
-def _expected(module, name: str) -> str:
-    kind = "a whole number" if isinstance(module.DEFAULTS[name], int) else "a number"
-    highest = _highest(module, name)
-    return f"{kind} from 0" if math.isinf(highest) else f"{kind} in 0..{highest:g}"
-
-
-def _module(family: str):
-    if family not in _FAMILIES:
-        raise unknown("teammate family", family, _FAMILIES)
-    return _FAMILIES[family]
+def _family(name: str) -> Heuristic:
+    if name not in HEURISTIC_FAMILIES:
+        raise unknown("teammate family", name, HEURISTIC_FAMILIES)
+    return HEURISTIC_FAMILIES[name]

@@ -29,8 +29,9 @@ from baselines.experiments import (
 from baselines.report.episode_gifs import family_gifs
 from baselines.report.results import TEST_LAYOUTS, read_run
 from baselines.training.run_folder import CHECKPOINTS
-from generation.learners.checkpoint import WEIGHTS, save_policy
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
@@ -235,7 +236,7 @@ def suite(tmp_path_factory) -> Path:
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # without compiling the initialisation
     save_policy(root / where, network, zeros, {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
-    entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / WEIGHTS)}
+    entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / POLICY_WEIGHTS)}
     (root / "manifests").mkdir()
     write_tasks(root / "manifests" / "layout_heldout.jsonl", [make_task("layout", "heldout", "cramped_up", entry, 1)])
     return root

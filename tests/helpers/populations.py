@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from generation.env import Environment
-from generation.learners.network import Widths
+from generation.learners.config import PPOConfig, Widths
 from generation.learners.population.lbrdiv import Multipliers
 from generation.learners.population.population import Algorithm, Population
-from generation.learners.ppo import PPOConfig
 from icrl4aht_data.overcooked.layouts import get_layout
 
 LAYOUT = get_layout("cramped_up")

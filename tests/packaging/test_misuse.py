@@ -13,7 +13,7 @@ import pytest
 from baselines.commands.cli import cli as baselines_cli
 from generation.cli import cli as generation_cli
 from generation.collection import ray_executor as on_ray
-from generation.collection.options import Options
+from generation.collection.options import CollectOptions
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run
@@ -185,7 +185,7 @@ def test_bugs_are_raised(monkeypatch):
 def test_unreachable_ray_is_reported():
     with (
         pytest.raises(OptionError, match=r"Ray at 127\.0\.0\.1:1 cannot be reached: .*; check the address"),
-        on_ray._connected(Options("ray", "127.0.0.1:1")),
+        on_ray._connected(CollectOptions("ray", "127.0.0.1:1")),
     ):
         pass
 

@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 from safetensors.numpy import save_file
 
-from generation.learners.checkpoint import CARD, WEIGHTS, load_policy
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
@@ -91,8 +91,8 @@ def card(**changes: Any) -> str:
     ],
 )
 def test_a_hostile_checkpoint(tmp_path, policy, weights, message):
-    (tmp_path / CARD).write_text(policy)
-    path = tmp_path / WEIGHTS
+    (tmp_path / POLICY_CARD).write_text(policy)
+    path = tmp_path / POLICY_WEIGHTS
     if isinstance(weights, bytes):
         path.write_bytes(weights)
     elif isinstance(weights, int):
@@ -105,7 +105,7 @@ def test_a_hostile_checkpoint(tmp_path, policy, weights, message):
 
 
 def test_a_pipe_for_a_checkpoint(tmp_path):
-    os.mkfifo(tmp_path / CARD)
+    os.mkfifo(tmp_path / POLICY_CARD)
     with pytest.raises(OptionError, match="not a plain file"):
         load_policy(tmp_path)
 

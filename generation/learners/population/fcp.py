@@ -1,6 +1,6 @@
 """FCP: independent self-play learners that differ by their seeds (Strouse et al. 2021; paper, App. B.1).
 
-With one member this is IPPO, one policy in both seats (paper, App. B.1 "Independent PPO").
+With one member this is IPPO, one policy as both agents (paper, App. B.1 "Independent PPO").
 """
 
 from __future__ import annotations
@@ -11,21 +11,26 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from generation.learners.population.population import Seating
+from generation.learners.population.population import Assignment
 
 
 @dataclass(frozen=True)
 class FCP:
-    """Each member plays with itself."""
+    """Fictitious co-play: each member plays with itself.
+
+    Attributes:
+        members: number of policies.
+    """
 
     members: int
 
-    def seating(self, environments: int) -> Seating:
+    def assignment(self, environments: int) -> Assignment:
+        """One term per member: its own return."""
         member = np.repeat(np.arange(self.members), environments)
         both = np.stack([member, member])
-        return Seating(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
+        return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 
-    def begin(self) -> Any:
+    def init(self) -> Any:
         return ()
 
     def weights(self, memory: Any):

@@ -1,4 +1,4 @@
-"""LBRDiv: BRDiv as a constrained problem, its weights Lagrange multipliers (Rahman et al. 2024; paper, App. B.1)."""
+"""LBRDiv: BRDiv as a constrained problem, weighted by Lagrange multipliers (Rahman et al. 2024; paper, App. B.1)."""
 
 from __future__ import annotations
 
@@ -8,38 +8,55 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from generation.learners.population.brdiv import pairs_seating
-from generation.learners.population.population import Seating
+from generation.learners.population.brdiv import pairs_assignment
+from generation.learners.population.population import Assignment
 
-_OWN = 0.5
+_SELF_PLAY = 0.5  # fixed multiplier on the diagonals: a member's own self-play has the weight 1 in all
 
 
 class Multipliers(NamedTuple):
-    """[i, j] holds J(pi_i, BR_i) above ... by the tolerance; the diagonals weigh self-play, 1 in all."""
+    """Lagrange multipliers of K members and the returns that they follow.
 
-    vertical: Float[Array, "K K"]  # J(pi_j, BR_i): another confederate with i's best response
-    horizontal: Float[Array, "K K"]  # J(pi_i, BR_j): confederate i with another's best response
-    returns: Float[Array, "K K"]  # the last known J(pi_i, BR_j)
+    J(pi_i, BR_j) denotes the return of confederate i with best response j. Multiplier [i, j] belongs to the constraint
+    that J(pi_i, BR_i) exceeds the return below by the tolerance.
+
+    Attributes:
+        vertical: float32 (K, K), for J(pi_j, BR_i): another confederate with i's best response.
+        horizontal: float32 (K, K), for J(pi_i, BR_j): confederate i with another's best response.
+        returns: float32 (K, K), the last known J(pi_i, BR_j).
+        known: bool (K, K), whether an episode of that pair has ended yet.
+    """
+
+    vertical: Float[Array, "K K"]
+    horizontal: Float[Array, "K K"]
+    returns: Float[Array, "K K"]
     known: Bool[Array, "K K"]
 
 
 @dataclass(frozen=True)
 class LBRDiv:
     """Maximise sum_i J(pi_i, BR_i) under J(pi_i, BR_i) >= J(pi_j, BR_i) + eps and J(pi_i, BR_i) >= J(pi_i, BR_j) + eps
-    (paper, App. B.1, LBRDiv). In the Lagrangian the return of confederate i with its own best response has the weight
+    (paper, App. B.1, LBRDiv).
+
+    In the Lagrangian, the return of confederate i with its own best response has the weight
     sum_j (vertical_ij + horizontal_ij), and with best response j the weight -(horizontal_ij + vertical_ji); both
-    players of a pair share it. Multipliers follow the returns of the episodes that the population itself plays.
+    policies of a pair share it. Multipliers follow the returns of the episodes that the population itself plays.
+
+    Attributes:
+        members: K.
+        tolerance: eps, in units of return.
+        learning_rate: step size of the multipliers.
     """
 
     members: int
     tolerance: float = 0.1
     learning_rate: float = 0.01
 
-    def seating(self, environments: int) -> Seating:
-        return pairs_seating(self.members, environments)
+    def assignment(self, environments: int) -> Assignment:
+        return pairs_assignment(self.members, environments)
 
-    def begin(self) -> Multipliers:
-        own = _OWN * jnp.eye(self.members)
+    def init(self) -> Multipliers:
+        own = _SELF_PLAY * jnp.eye(self.members)
         nothing = jnp.zeros((self.members, self.members))
         return Multipliers(own, own, nothing, nothing > 0)
 
@@ -50,18 +67,19 @@ class LBRDiv:
         return jnp.concatenate([pairs.ravel(), pairs.ravel()])
 
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
-        """Lambda <- max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0.5 on the diagonal, else 0)."""
+        """Lambda <- max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0); the diagonal stays."""
         k = self.members
-        known = memory.known | seen[k:, :k].T  # seat 0 holds the best responses
+        # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.
+        known = memory.known | seen[k:, :k].T
         latest = jnp.where(seen[k:, :k].T, returns[k:, :k].T, memory.returns)
-        fresh = jnp.any(seen)
         own = jnp.diag(latest)[:, None]
-        both = jnp.diag(known)[:, None]
+        own_known = jnp.diag(known)[:, None]
+        fresh = jnp.any(seen)  # without new episodes nothing was measured, so nothing moves
 
         def moved(multipliers, other, other_known):
             step = self.learning_rate * (own - other - self.tolerance)
-            changed = jnp.maximum(multipliers - jnp.where(both & other_known & fresh, step, 0.0), 0.0)
-            return jnp.where(jnp.eye(k) > 0, _OWN, changed)
+            changed = jnp.maximum(multipliers - jnp.where(own_known & other_known & fresh, step, 0.0), 0.0)
+            return jnp.where(jnp.eye(k) > 0, _SELF_PLAY, changed)
 
         vertical = moved(memory.vertical, latest.T, known.T)
         horizontal = moved(memory.horizontal, latest, known)

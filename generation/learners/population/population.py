@@ -1,6 +1,8 @@
-"""Policies that learn together: a fixed seating of policies at tables, one PPO for each, all at once by vmap.
+"""Policies that learn together: a fixed assignment of policies to agents, one PPO for each policy, all at once by vmap.
 
-An algorithm says who sits where, and how much each expected return counts: `fcp`, `brdiv`, `lbrdiv`, `comedi`.
+N denotes environments, P policies, of which the first L learn, G policies of one group, M agent slots of a policy, T
+steps. An algorithm (`fcp`, `brdiv`, `lbrdiv`, `comedi`) states which policies play together and how much each expected
+return counts. Agent slots are numbered as in `learners.rollout`: a * N + e for agent a of environment e.
 """
 
 from __future__ import annotations
@@ -19,107 +21,145 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.env import Environment, EnvState
+from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
-from generation.learners.ppo import PPO, PPOConfig, sequences
-from generation.learners.rollout import Player, Rollout, Seats, init_rollout, network_player, roll_out
+from generation.learners.ppo import PPO, make_optimizer, sequences, shaping_weight
+from generation.learners.rollout import Player, Rollout, RolloutCarry, init_rollout, network_player, roll_out
 
 
-class Seating(NamedTuple):
-    """Who sits at which of N tables, for good; P policies, of which the first L learn.
+class Assignment(NamedTuple):
+    """Fixed assignment of policies to both agents of N environments.
 
-    A *term* is an expected return that a learning policy raises or brings down; each place that counts for its policy
-    is a sample of one term.
+    The objective is a weighted sum of expected returns, its *terms*. Each slot that a policy learns from is a sample of
+    one term: of the return that this policy raises or lowers there.
+
+    Attributes:
+        policy: int (2, N), the policy that plays each agent of each environment.
+        term: int (2, N), the term that a slot is a sample of; -1 for slots that nothing is learned from.
+        group: int (P,); a pair of policies with the same number is self-play, any other pair is cross-play.
+        learning: L.
+        starts_from: int (N,), the environment whose visited states an environment's episodes start from; -1 for the
+            usual start.
     """
 
-    policy: np.ndarray  # int (2, N), the policy in each seat of each table
-    term: np.ndarray  # int (2, N), which term a place is a sample of; -1 for none
-    kin: np.ndarray  # int (P,), policies of one number are meant to play together: self-play
-    learning: int  # L
-    starts_from: np.ndarray  # int (N,), the table whose visited states a table's episodes start from; -1 for none
+    policy: np.ndarray
+    term: np.ndarray
+    group: np.ndarray
+    learning: int
+    starts_from: np.ndarray
 
-    def places(self, policy: int) -> tuple[np.ndarray, np.ndarray]:
-        """A policy's places: those that it learns from, and the others."""
-        mine = self.policy.ravel() == policy
+    def agent_slots(self, policy: int) -> tuple[np.ndarray, np.ndarray]:
+        """Slots of a policy, int: those that it learns from, and the others."""
+        own = self.policy.ravel() == policy
         counts = self.term.ravel() >= 0
-        return (mine & counts).nonzero()[0], (mine & ~counts).nonzero()[0]
+        return (own & counts).nonzero()[0], (own & ~counts).nonzero()[0]
 
     @property
-    def tables(self) -> int:
+    def envs(self) -> int:
+        """N."""
         return self.policy.shape[1]
 
     @property
     def policies(self) -> int:
-        return len(self.kin)
+        """P."""
+        return len(self.group)
 
     @property
-    def opposite(self) -> np.ndarray:
-        """int (2 N,): the policy opposite each place."""
+    def partner(self) -> np.ndarray:
+        """int (2 N,): the policy of the other agent in each slot's environment."""
         return self.policy[::-1].ravel()
 
     @property
     def self_play(self) -> np.ndarray:
-        """bool (N,): tables where kin play."""
-        return self.kin[self.policy[0]] == self.kin[self.policy[1]]
+        """bool (N,): environments in which two policies of one group play."""
+        return self.group[self.policy[0]] == self.group[self.policy[1]]
 
 
 class Algorithm(Protocol):
-    """What tells the algorithms apart. `memory` is a pytree of its own: multipliers, say."""
+    """The part in which the algorithms differ. `memory` is a pytree of the algorithm, such as multipliers."""
 
-    def seating(self, environments: int) -> Seating:
-        """Who sits where, if each member has so many tables."""
+    def assignment(self, environments: int) -> Assignment:
+        """Returns who plays with whom, with so many environments per member."""
         ...
 
-    def begin(self) -> Any:
-        """The memory before the first update."""
+    def init(self) -> Any:
+        """Returns the memory before the first update."""
         ...
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
-        """The weight of each term in the objective that every policy maximises; negative to bring a return down."""
+        """Returns the weight of each term in the objective that is maximised; negative to lower a return."""
         ...
 
     def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:
-        """The memory after an update.
+        """Returns the memory after an update.
 
         Args:
-            returns: [i, j] is the mean return of the episodes that ended in the update with i in seat 0, j in seat 1.
-            seen: whether there was one.
+            memory: the memory before it.
+            returns: [i, j] is the mean return of the episodes that ended in the update with policy i as the ego and j
+                as the teammate.
+            seen: whether there was such an episode.
         """
         ...
 
 
-class Group(NamedTuple):
-    """Successive policies with equally many places, so that one vmap serves them all."""
+class PolicyGroup(NamedTuple):
+    """Successive policies with equally many slots, so that one vmap serves them all.
+
+    Attributes:
+        first: number of the first policy.
+        agent_slots: int (G, M), those that the policies learn from first.
+        counting: how many of the M slots the policies learn from.
+    """
 
     first: int
-    places: np.ndarray  # int (G, M), those that count first
-    counting: int  # how many count
+    agent_slots: np.ndarray
+    counting: int
 
-    def of(self, tree: Any) -> Any:
-        """Its part of leaves (P, ...)."""
-        return jax.tree.map(lambda leaf: leaf[self.first : self.first + len(self.places)], tree)
+    @property
+    def _rows(self) -> slice:
+        return slice(self.first, self.first + len(self.agent_slots))
+
+    def take(self, tree: Any) -> Any:
+        """Returns the group's rows of leaves (P, ...)."""
+        return jax.tree.map(lambda leaf: leaf[self._rows], tree)
+
+    def put(self, tree: Any, rows: Any) -> Any:
+        """Returns a tree of leaves (P, ...) with the group's rows replaced."""
+        return jax.tree.map(lambda leaf, new: leaf.at[self._rows].set(new), tree, rows)
 
 
 class PopulationState(NamedTuple):
-    """What an update maps to the next one; all that a resume needs."""
+    """State of a `Population`: an update maps it to the next one, and a resume needs nothing else.
 
-    params: Any  # leaves (P, ...)
-    optimizer: optax.OptState  # leaves (L, ...)
-    seats: Seats
-    memory: Any  # the algorithm's
-    visited: UInt8[Array, "N S"]  # one of the states that each table went through in its last roll-out
+    Attributes:
+        params: parameters of all policies, leaves (P, ...).
+        optimizer: optimiser states of the learning policies, leaves (L, ...).
+        carry: environments and memories before the next roll-out.
+        memory: the algorithm's memory.
+        visited: uint8 (N, S), for each environment one of the states of its last roll-out.
+        key: typed key, scalar, constant; every update folds its number into it.
+        update: int32 scalar, number of updates so far.
+    """
+
+    params: Any
+    optimizer: optax.OptState
+    carry: RolloutCarry
+    memory: Any
+    visited: UInt8[Array, "N S"]
     key: Key[Array, ""]
     update: Int[Array, ""]
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Policies that learn together in one layout; their learning, nearly all of the work, uses every device.
+    """Trains policies together on one layout; their learning, nearly all of the work, uses every device.
 
     Args:
         env: the layout's environment.
         algorithm: see `Algorithm`.
-        config: of every policy; `environments` are the tables of one member.
-        partners: how many policies the critics are told apart; as many as there are, if they meet different ones.
+        config: hyper-parameters of every policy; `environments` are those of one member.
+        partners: number of policies among which the critics distinguish the partner. By default all of them if some
+            policy meets different partners, else none.
     """
 
     env: Environment
@@ -128,161 +168,179 @@ class Population:
     partners: int | None = None
 
     @cached_property
-    def seating(self) -> Seating:
-        return self.algorithm.seating(self.config.environments)
+    def assignment(self) -> Assignment:
+        """Who plays with whom."""
+        return self.algorithm.assignment(self.config.environments)
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps, over all tables."""
-        return self.seating.tables * self.config.rollout
+        """Environment steps of an update, over all environments."""
+        return self.assignment.envs * self.config.rollout
 
     @cached_property
     def network(self) -> ActorCritic:
-        """With a critic that is told who sits opposite, if that varies."""
-        if self.partners is not None:
-            return ActorCritic(self.config.widths, self.partners)
-        pairs = {(p, q) for p, q in zip(self.seating.policy.ravel(), self.seating.opposite, strict=True)}
-        return ActorCritic(self.config.widths, self.seating.policies if len(pairs) > self.seating.policies else 0)
+        """The network of all policies."""
+        policies = self.assignment.policies
+        pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
+        partners = policies if len(pairs) > policies else 0
+        return ActorCritic(self.config.widths, partners if self.partners is None else self.partners)
 
     @cached_property
     def ppo(self) -> PPO:
+        """The algorithm of each policy's updates."""
         return PPO(self.env.layout, self.network, self.config)
 
     @cached_property
-    def groups(self) -> list[Group]:
-        seating, found = self.seating, []
-        places = [seating.places(policy) for policy in range(seating.policies)]
-        shape = [(policy < seating.learning, len(a), len(b)) for policy, (a, b) in enumerate(places)]
-        for (_, counting, _), members in groupby(range(seating.policies), key=shape.__getitem__):
-            group = list(members)
-            found.append(Group(group[0], np.stack([np.concatenate(places[p]) for p in group]), counting))
-        return found
+    def groups(self) -> list[PolicyGroup]:
+        """All policies, in groups that one vmap can serve."""
+        slots = [self.assignment.agent_slots(policy) for policy in range(self.assignment.policies)]
+        shapes = [(p < self.assignment.learning, len(own), len(others)) for p, (own, others) in enumerate(slots)]
+        groups = []
+        for (_, counting, _), members in groupby(range(len(slots)), key=shapes.__getitem__):
+            numbers = list(members)
+            groups.append(PolicyGroup(numbers[0], np.stack([np.concatenate(slots[p]) for p in numbers]), counting))
+        return groups
 
     def init(self, key: Key[Array, ""]) -> PopulationState:
-        """Untrained policies, each from a seed of its own, at fresh tables."""
-        weights, tables, running = jax.random.split(key, 3)
-        # Not by vmap: orthogonal initialisers deadlock under it on a CPU.
+        """Returns the state of untrained policies, each from a seed of its own, before the first step."""
+        params_key, env_key, running_key = jax.random.split(key, 3)
+        # By `map`, not by `vmap`, under which the orthogonal initialisers deadlock on a CPU.
         channels = self.env.layout.channels
-        seeds = jax.random.split(weights, self.seating.policies)
+        seeds = jax.random.split(params_key, self.assignment.policies)
         params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
-        seats = init_rollout(self.env, self._players(params), jax.random.split(tables, self.seating.tables))
-        learning = jax.tree.map(lambda leaf: leaf[: self.seating.learning], params)
+        carry = init_rollout(self.env, self._players(params), jax.random.split(env_key, self.assignment.envs))
+        learning = jax.tree.map(lambda leaf: leaf[: self.assignment.learning], params)
         return PopulationState(
             params=params,
-            optimizer=jax.vmap(self.config.optimizer.init)(learning),
-            seats=seats,
-            memory=self.algorithm.begin(),
-            visited=seats.env.record,
-            key=running,
+            optimizer=jax.vmap(make_optimizer(self.config).init)(learning),
+            carry=carry,
+            memory=self.algorithm.init(),
+            visited=carry.env.record,
+            key=running_key,
             update=jnp.int32(0),
         )
 
-    def _learn_apart(self, group: Group) -> Callable[..., Any]:
-        """The PPO of each policy of a group, the policies shared out over as many devices as divide them evenly."""
+    def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
+        """Plays one roll-out, then every policy learns from its slots and the algorithm adapts its memory.
+
+        A pure function of the state.
+
+        Returns:
+            The next state, and scalar metrics.
+        """
+        play_key, learn_key, visit_key = jax.random.split(jax.random.fold_in(state.key, state.update), 3)
+        players = self._players(state.params)
+        restart = self._restart(state.visited)
+        carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key, restart)
+        params, optimizer, losses = self._learn(state, players, carry, rollout, learn_key)
+        returns, seen = self._returns(rollout)
+        steps = jax.random.randint(visit_key, (self.assignment.envs,), 0, self.config.rollout)
+        after = PopulationState(
+            params=params,
+            optimizer=optimizer,
+            carry=carry,
+            memory=self.algorithm.adapt(state.memory, returns, seen),
+            visited=jnp.take_along_axis(rollout.record, steps[None, :, None], axis=0)[0],
+            key=state.key,
+            update=state.update + 1,
+        )
+        metrics = self._metrics(rollout) | {"shaping": shaping_weight(self.config, state.update)}
+        return after, losses | metrics
+
+    def _players(self, params: Any) -> list[Player]:
+        """One player per group."""
+        return [
+            network_player(
+                self.env,
+                self.network,
+                group.take(params),
+                group.agent_slots,
+                jnp.asarray(self.assignment.partner[group.agent_slots]),
+            )
+            for group in self.groups
+        ]
+
+    def _restart(self, visited: UInt8[Array, "N S"]) -> Callable[[EnvState, Array], EnvState]:
+        """The `restart` of `roll_out`: new episodes of some environments start from states that others visited."""
+        source = self.assignment.starts_from
+
+        def restart(state: EnvState, done: Bool[Array, " N"]) -> EnvState:
+            replaced = (done & (source >= 0))[:, None]
+            return state._replace(record=jnp.where(replaced, visited[source], state.record))
+
+        return restart if (source >= 0).any() else lambda state, done: state
+
+    def _learn(self, state: PopulationState, players: list[Player], carry: RolloutCarry, rollout: Rollout, key: Array):
+        """Parameters and optimiser states of all policies after learning from the roll-out, and mean losses."""
+        weight = self._slot_weights(state.memory)
+        shaping = shaping_weight(self.config, state.update)
+        params, optimizer, losses = state.params, state.optimizer, []
+        for number, (group, player) in enumerate(zip(self.groups, players, strict=True)):
+            if group.first >= self.assignment.learning:
+                continue
+            slots = player.agent_slots
+            last, _ = player.act(carry.memories[number], carry.env, key)
+            # A policy that lowers a return must not be paid, nor charged, for the shaped rewards on the way.
+            own_shaping = shaping * (weight[slots] >= 0)
+            played = sequences(rollout, number, slots, state.carry.memories[number], last.value, own_shaping)
+            partner = jnp.asarray(self.assignment.partner[slots])[None]
+            played = played._replace(partner=partner, weight=weight[slots][None])
+
+            def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
+                """(T, G * M, ...) -> (G, T, counting, ...)."""
+                return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
+
+            keys = jax.random.split(jax.random.fold_in(key, number), len(group.agent_slots))
+            own = (group.take(state.params), group.take(state.optimizer), jax.tree.map(by_policy, played), keys)
+            new_params, new_optimizer, loss = self._learn_by_policy(group)(*own)
+            params, optimizer = group.put(params, new_params), group.put(optimizer, new_optimizer)
+            losses.append(loss)
+        return params, optimizer, jax.tree.map(lambda *parts: jnp.concatenate(parts).mean(), *losses)
+
+    def _learn_by_policy(self, group: PolicyGroup) -> Callable[..., Any]:
+        """`PPO.learn` with a leading axis of policies, sharded over as many devices as divide them evenly."""
         learn, devices = jax.vmap(self.ppo.learn), jax.devices()
-        count = max(n for n in range(1, len(devices) + 1) if len(group.places) % n == 0)
+        count = max(n for n in range(1, len(devices) + 1) if len(group.agent_slots) % n == 0)
         if count == 1:
             return learn
         mesh = Mesh(np.array(devices[:count]), ("policy",))
         each = PartitionSpec("policy")
         return jax.shard_map(learn, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
 
-    def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
-        """One roll-out, the epochs of every learning policy over its part of it, the algorithm's own step.
+    def _slot_weights(self, memory: Any) -> Float[Array, " 2N"]:
+        """The weight of each slot's advantage.
 
-        A pure function of the state.
+        A term's weight is shared equally among its slots, then every policy's weights are scaled to 1 on average, so
+        that the learning rate means the same for all policies and algorithms.
         """
-        rolling, learning, visiting = jax.random.split(jax.random.fold_in(state.key, state.update), 3)
-        players = self._players(state.params)
-        restart = self._restart(state.visited)
-        seats, rollout = roll_out(self.env, players, state.seats, self.config.rollout, rolling, restart)
-        params, optimizer, losses = self._learn(state, players, seats, rollout, learning)
-        returns, seen = self._returns(rollout)
-        steps = jax.random.randint(visiting, (self.seating.tables,), 0, self.config.rollout)
-        after = PopulationState(
-            params=params,
-            optimizer=optimizer,
-            seats=seats,
-            memory=self.algorithm.adapt(state.memory, returns, seen),
-            visited=jnp.take_along_axis(rollout.record, steps[None, :, None], axis=0)[0],
-            key=state.key,
-            update=state.update + 1,
-        )
-        return after, losses | self._metrics(rollout) | {"shaping": self.config.shaping(state.update)}
-
-    def _players(self, params: Any) -> list[Player]:
-        return [
-            network_player(
-                self.env, self.network, group.of(params), group.places, jnp.asarray(self.seating.opposite[group.places])
-            )
-            for group in self.groups
-        ]
-
-    def _restart(self, visited: Array) -> Callable[[EnvState, Array], EnvState]:
-        source = self.seating.starts_from
-
-        def restart(state: EnvState, done: Bool[Array, " N"]) -> EnvState:
-            moved = (done & (source >= 0))[:, None]
-            return state._replace(record=jnp.where(moved, visited[source], state.record))
-
-        return restart if (source >= 0).any() else lambda state, done: state
-
-    def _learn(self, state: PopulationState, players: list[Player], seats: Seats, rollout: Rollout, key: Array):
-        weight = self._place_weights(state.memory)
-        shaping = self.config.shaping(state.update)
-        params, optimizer, losses = state.params, state.optimizer, []
-        for number, (group, player) in enumerate(zip(self.groups, players, strict=True)):
-            if group.first >= self.seating.learning:
-                continue
-            last, _ = player.act(seats.memories[number], seats.env, key)
-            raised = shaping * (weight[player.places] >= 0)  # shaping shows the way up, and nothing else
-            played = sequences(rollout, number, player.places, state.seats.memories[number], last.value, raised)
-            played = played._replace(
-                partner=jnp.asarray(self.seating.opposite[player.places])[None], weight=weight[player.places][None]
-            )
-
-            def by_policy(leaf, shape=group.places.shape, counting=group.counting):
-                return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
-
-            keys = jax.random.split(jax.random.fold_in(key, number), len(group.places))
-            own = (group.of(state.params), group.of(state.optimizer), jax.tree.map(by_policy, played), keys)
-            new_params, new_optimizer, loss = self._learn_apart(group)(*own)
-            params, optimizer = _put(params, new_params, group), _put(optimizer, new_optimizer, group)
-            losses.append(loss)
-        return params, optimizer, jax.tree.map(lambda *parts: jnp.concatenate(parts).mean(), *losses)
-
-    def _place_weights(self, memory: Any) -> Float[Array, " 2N"]:
-        """The weight of each place's advantage: its term's, shared among the term's places, 1 on a policy's average."""
-        term, policy = self.seating.term.ravel(), self.seating.policy.ravel()
+        term, policy = self.assignment.term.ravel(), self.assignment.policy.ravel()
         counts = np.bincount(term[term >= 0])
         raw = jnp.where(term >= 0, self.algorithm.weights(memory)[term] / np.maximum(counts, 1)[term], 0.0)
-        total = jnp.zeros(self.seating.policies).at[policy].add(jnp.abs(raw))
-        samples = np.bincount(policy[term >= 0], minlength=self.seating.policies)
+        total = jnp.zeros(self.assignment.policies).at[policy].add(jnp.abs(raw))
+        samples = np.bincount(policy[term >= 0], minlength=self.assignment.policies)
         return raw * (samples / jnp.maximum(total, 1e-8))[policy]
 
     def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
-        size = (self.seating.policies,) * 2
-        pairs = tuple(self.seating.policy)
+        """Mean return of the episodes that ended, by ego and teammate, and whether there was one."""
+        size = (self.assignment.policies,) * 2
+        pairs = tuple(self.assignment.policy)
         ended = jnp.zeros(size).at[pairs].add(rollout.done.sum(axis=0))
         total = jnp.zeros(size).at[pairs].add(jnp.where(rollout.done, rollout.returns, 0.0).sum(axis=0))
         return total / jnp.maximum(ended, 1), ended > 0
 
     def _metrics(self, rollout: Rollout) -> dict[str, Array]:
-        """Mean returns of the episodes that ended, in self-play and in cross-play; 0 where none did."""
+        """Mean returns of the episodes that ended, in self-play and in cross-play; 0 if none did."""
 
-        def mean(tables: np.ndarray) -> Array:
-            done = rollout.done & tables
+        def mean_return(envs: np.ndarray) -> Array:
+            done = rollout.done & envs
             return jnp.sum(jnp.where(done, rollout.returns, 0.0)) / jnp.maximum(jnp.sum(done), 1)
 
-        fresh = self.seating.starts_from < 0
-        kin = self.seating.self_play
+        # Episodes that start from visited states are shorter tasks: their returns do not compare.
+        usual_start = self.assignment.starts_from < 0
+        self_play = self.assignment.self_play
         return {
             "episodes": jnp.sum(rollout.done),
-            "self_play": mean(kin & fresh),
-            "cross_play": mean(~kin),
+            "self_play": mean_return(self_play & usual_start),
+            "cross_play": mean_return(~self_play),
             "shaped_per_step": jnp.mean(rollout.shaped),
         }
-
-
-def _put(whole: Any, part: Any, group: Group) -> Any:
-    return jax.tree.map(lambda a, b: a.at[group.first : group.first + len(group.places)].set(b), whole, part)

@@ -7,113 +7,53 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Key, UInt8
+from jaxtyping import Array, Bool, Int, Key
 
-from generation.policy import Noise, Policy, Sampling, as_params, draw, extra_split, first_key
-from generation.teammates.heuristics.paths import Paths, Rule, Scene, is_ingredient
+from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, extra_split
+from generation.teammates.heuristics.paths import Rule, Scene, is_ingredient
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.layouts import Layout
-
-KIND = "assembly_line"
 
 RUNNER, PLATER, FLEX = range(3)
 AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
 
-DEFAULTS: dict[str, float] = {
-    "role_mode": FLEX,
-    "handoff_style": AT_POTS,
-    "plate_urgency": 0.5,
-    "prestage_bias": 0.3,  # without effect: read by no rule
-    "start_cook_bias": 0.7,  # without effect: pots start by themselves
-    "hesitation_prob": 0.0,
-    "wrong_action_prob": 0.0,
-    "task_abandon_prob": 0.0,
-    "stubbornness": 0.0,
-    "timing_mismatch": 0.0,
-}
-"""Parameter -> default, in declaration order."""
-
-PRESETS: dict[str, dict[str, float]] = {
-    "default": {},
-    "ingredient_runner": {
-        "role_mode": RUNNER,
-        "plate_urgency": 0.0,
-        "prestage_bias": 0.5,
-        "start_cook_bias": 0.8,
-    },
-    "plater_deliverer": {
-        "role_mode": PLATER,
-        "plate_urgency": 0.8,
-        "prestage_bias": 0.0,
-        "start_cook_bias": 0.3,
-    },
-}
-"""Preset -> what differs from the defaults."""
-
-CHOICES: dict[str, int] = {"role_mode": 3, "handoff_style": 3}
-"""Parameters that are one of 0..n-1."""
-
-UNBOUNDED = frozenset[str]()
-"""Parameters without an upper limit; the others are in 0..1, or one of `CHOICES`."""
-
-TRAIN = Sampling(
-    ("default", "ingredient_runner"),
-    {"role_mode": [0, 2], "plate_urgency": (0.0, 0.6), "prestage_bias": (0.2, 0.6)},
-)
-TEST = Sampling(
-    ("plater_deliverer",),
-    {"role_mode": [1], "plate_urgency": (0.6, 1.0), "prestage_bias": (0.0, 0.3)},
-)
-SPANS: dict[str, tuple[float, float]] = {
-    "plate_urgency": (0.0, 1.0),
-    "prestage_bias": (0.0, 1.0),
-    "start_cook_bias": (0.0, 1.0),
-}
-"""Full ranges of the parameters that a sampler jitters around a preset."""
-
 _MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
 
 
-class Memory(NamedTuple):
+class AssemblyMemory(NamedTuple):
+    """Memory of an H3 teammate.
+
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+    """
+
     key: Key[Array, ""]
 
 
-def build(layout: Layout, theta: dict[str, float], slot: int = 1, noise: Noise = "seeded") -> Policy:
-    """An H3 teammate.
+def begin_assembly_line(key: Key[Array, ""]) -> AssemblyMemory:
+    """Memory at the start of an episode."""
+    return AssemblyMemory(key)
 
-    Args:
-        layout: the kitchen.
-        theta: every parameter of `DEFAULTS`.
-        slot: 0 or 1, the agent it plays.
-        noise: see `base.Noise`.
-    """
-    paths = Paths(layout)
 
-    def init(params, key: Key[Array, ""]) -> Memory:
-        return Memory(first_key(noise, slot, key))
-
-    def act(params, memory: Memory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        scene = Scene(paths, record, slot)
-        link, u = draw(memory.key)
-        idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
-        makes_room = _makes_room(scene)
-        final, action = _decide(scene, params, abandons=u[2] < params["task_abandon_prob"])
-        slips = ~(idles | makes_room | final)
-        action, link = _slip(scene, params, action, slips, u[1], link)
-        action = jnp.where(makes_room, _aside(scene), action)
-        return jnp.where(idles, STAY, action).astype(jnp.int32), Memory(link)
-
-    return Policy(as_params(theta, DEFAULTS), init, act, "state")
+def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int[Array, ""], AssemblyMemory]:
+    """One step of an H3 teammate."""
+    following, u = draw(memory.key)
+    idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
+    makes_room = _makes_room(scene)
+    final, action = _decide(scene, params, abandons=u[2] < params["task_abandon_prob"])
+    slips = ~(idles | makes_room | final)
+    action, following = _slip(scene, params, action, slips, u[1], following)
+    action = jnp.where(makes_room, _step_aside(scene), action)
+    return jnp.where(idles, STAY, action), AssemblyMemory(following)
 
 
 def _off_beat(scene: Scene) -> Array:
-    """float32: how badly timed a step from my cell is, 0 to 0.9."""
+    """float32 scalar, 0 to 0.9: factor of the chance to hesitate, a fixed pattern over the cells."""
     y, x = np.divmod(np.arange(scene.paths.layout.cells), scene.paths.layout.width)
     return jnp.asarray(((7 * x + 13 * y) % 10 / 10).astype(np.float32))[scene.me]
 
 
 def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """The action, and whether it is one that no slip changes."""
+    """Whether the action is exempt from slips, and the action: rules in order of priority."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
@@ -143,7 +83,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
 
 
 def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
-    """The step towards a target; seat 1 stays if it leads onto the partner or beside it."""
+    """The step towards a target; agent 1 stays if it leads onto the partner's cell or an adjacent one."""
     step, _ = scene.approach(target)
     if scene.slot == 0:
         return step
@@ -152,13 +92,13 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
 
 
 def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
-    """The piles of what the recipe lacks over all pots, an ingredient in the partner's hand counting as in the pot."""
-    brought = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
-    return scene.piles_of(scene.needed - brought > 0)
+    """Piles of the recipe's missing ingredients over all pots; one in the partner's hand counts as if in the pot."""
+    carried = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
+    return scene.piles_of(scene.needed - carried > 0)
 
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
-    """Empty counters where an ingredient may wait, by style; every empty one if the style finds none."""
+    """Empty counters for an ingredient that no pot takes, by style; every empty one if the style has none."""
     layout = scene.paths.layout
     y, x = np.divmod(np.arange(layout.cells), layout.width)
     middle_x, middle_y = int(x[layout.walkable].mean()), int(y[layout.walkable].mean())
@@ -177,36 +117,86 @@ def _or_else(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -> Bool[
 
 
 def _makes_room(scene: Scene) -> Bool[Array, ""]:
-    """Whether seat 1, empty-handed, stands beside a partner who carries something."""
+    """Whether agent 1 is empty-handed and adjacent to a partner who carries something."""
     if scene.slot == 0:
         return jnp.asarray(False)
-    beside = jnp.asarray(scene.paths.manhattan)[scene.me, scene.partner] == 1
-    return scene.holds_nothing & (scene.partner_hand > 0) & beside
+    adjacent = jnp.asarray(scene.paths.manhattan)[scene.me, scene.partner] == 1
+    return scene.holds_nothing & (scene.partner_hand > 0) & adjacent
 
 
-def _aside(scene: Scene) -> Int[Array, ""]:
-    """Straight away from the partner beside me; else to a side, right before left, down before up; else stay."""
+def _step_aside(scene: Scene) -> Int[Array, ""]:
+    """Straight away from the adjacent partner; else sideways, right before left, down before up; else stay."""
     from_partner = jnp.asarray(scene.paths.neighbours)[scene.me] == scene.partner  # above, below, left, right
     across = from_partner[2] | from_partner[3]
     # Scores of right, down, left, up.
-    beside_row = jnp.array([2, 0, 1, 0])
-    beside_column = jnp.array([0, 2, 0, 1])
+    sideways_in_row = jnp.array([2, 0, 1, 0])
+    sideways_in_column = jnp.array([0, 2, 0, 1])
     away = 3 * from_partner[jnp.array([2, 0, 3, 1])]
-    score = away + jnp.where(across, beside_column, beside_row)
+    score = away + jnp.where(across, sideways_in_column, sideways_in_row)
     return scene.best_way(scene.free & (score > 0), score)
 
 
-def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, link: Key[Array, ""]):
-    """The action after a wrong move or a walk home, and the key chain's link after what these drew."""
+def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
+    """The action after a wrong move or a walk home, and the key chain after their draws."""
     errs = slips & (u < params["wrong_action_prob"])
-    link, own = extra_split(link, errs)
+    key, own = extra_split(key, errs)
     wrong = jax.random.bits(jax.random.split(own)[1]) & 3
     action = jnp.where(errs, jnp.asarray(_MOVES_BY_DRAW)[wrong.astype(jnp.int32)], action)
 
-    longs = slips & scene.holds_nothing & (params["stubbornness"] > 0)
-    link, own = extra_split(link, longs)
+    may_return = slips & scene.holds_nothing & (params["stubbornness"] > 0)
+    key, own = extra_split(key, may_return)
     layout = scene.paths.layout
+    # The published formula of a teammate's home cell; on some layouts it is a wall, and nobody walks home.
     home = (3 * scene.slot % layout.height) * layout.width + 5 * scene.slot % layout.width
     far = jnp.asarray(scene.paths.manhattan)[scene.me, home] > 2
-    goes = longs & far & (jax.random.uniform(own) < params["stubbornness"]) & bool(layout.walkable[home])
-    return jnp.where(goes, jnp.asarray(scene.paths.first_step)[scene.me, home], action), link
+    goes = may_return & far & (jax.random.uniform(own) < params["stubbornness"]) & bool(layout.walkable[home])
+    return jnp.where(goes, jnp.asarray(scene.paths.first_step)[scene.me, home], action), key
+
+
+ASSEMBLY_LINE = Heuristic(
+    kind="assembly_line",
+    begin=begin_assembly_line,
+    act=act_assembly_line,
+    defaults={
+        "role_mode": FLEX,
+        "handoff_style": AT_POTS,
+        "plate_urgency": 0.5,
+        "prestage_bias": 0.3,  # without effect: read by no rule
+        "start_cook_bias": 0.7,  # without effect: pots start by themselves
+        "hesitation_prob": 0.0,
+        "wrong_action_prob": 0.0,
+        "task_abandon_prob": 0.0,
+        "stubbornness": 0.0,
+        "timing_mismatch": 0.0,
+    },
+    presets={
+        "default": {},
+        "ingredient_runner": {
+            "role_mode": RUNNER,
+            "plate_urgency": 0.0,
+            "prestage_bias": 0.5,
+            "start_cook_bias": 0.8,
+        },
+        "plater_deliverer": {
+            "role_mode": PLATER,
+            "plate_urgency": 0.8,
+            "prestage_bias": 0.0,
+            "start_cook_bias": 0.3,
+        },
+    },
+    train=Sampling(
+        ("default", "ingredient_runner"),
+        {"role_mode": [0, 2], "plate_urgency": (0.0, 0.6), "prestage_bias": (0.2, 0.6)},
+    ),
+    test=Sampling(
+        ("plater_deliverer",),
+        {"role_mode": [1], "plate_urgency": (0.6, 1.0), "prestage_bias": (0.0, 0.3)},
+    ),
+    spans={
+        "plate_urgency": (0.0, 1.0),
+        "prestage_bias": (0.0, 1.0),
+        "start_cook_bias": (0.0, 1.0),
+    },
+    choices={"role_mode": 3, "handoff_style": 3},
+)
+"""The family H3; its parameters' order is that of the published manifests."""

@@ -1,7 +1,8 @@
-"""What every heuristic teammate knows of a kitchen: path tables, masks over cells, and the moves built from them.
+"""What heuristic teammates read from a state: shortest paths of the layout, masks over cells, and moves made of them.
 
-Teammates see the whole state. The partner never blocks a path; ties resolve in the order right, down, left, up
-(first steps) and above, below, left, right (access cells), scanning targets row by row. Source: paper, App. B.2.
+`cells` denotes the cells of the layout, row by row. Teammates see the complete state. The partner never blocks a path;
+ties resolve in the order right, down, left, up (first steps) and above, below, left, right (access cells), scanning
+targets row by row. Source: paper, App. B.2.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _ACTION_OF_FACING = np.argsort(FACING_OF)
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Path tables of one layout, NumPy."""
+    """Distances and first steps of one layout, as NumPy lookup tables that are compiled into the policies."""
 
     layout: Layout
 
@@ -50,16 +51,17 @@ class Paths:
     def neighbours(self) -> np.ndarray:
         """int32 (cells, 4): the cell above, below, left and right of each cell, -1 outside the map."""
         layout = self.layout
-        table = np.full((layout.cells, 4), -1, np.int32)
+        found = np.full((layout.cells, 4), -1, np.int32)
         for cell in range(layout.cells):
             for k, name in enumerate(_ACCESS_ORDER):
                 x, y = cell % layout.width + STEP[name][0], cell // layout.width + STEP[name][1]
                 if 0 <= x < layout.width and 0 <= y < layout.height:
-                    table[cell, k] = y * layout.width + x
-        return table
+                    found[cell, k] = y * layout.width + x
+        return found
 
     @cached_property
     def _search(self) -> tuple[np.ndarray, np.ndarray]:
+        """Breadth-first search from every floor cell: distances, and the first action on the way."""
         cells = self.layout.cells
         distance = np.full((cells, cells), UNREACHABLE, np.int32)
         first = np.full((cells, cells), STAY, np.int32)
@@ -78,7 +80,7 @@ class Paths:
 
     @property
     def distance(self) -> np.ndarray:
-        """int32 (cells, cells): breadth-first distance between floor cells; UNREACHABLE where there is none."""
+        """int32 (cells, cells): shortest distance between floor cells; UNREACHABLE if there is no path."""
         return self._search[0]
 
     @property
@@ -88,7 +90,7 @@ class Paths:
 
     @cached_property
     def access(self) -> np.ndarray:
-        """int32 (cells, 4): the floor cells above, below, left and right of a cell, -1 where there is none."""
+        """int32 (cells, 4): the floor cells above, below, left and right of a cell; -1 for other cells."""
         floor = (self.neighbours >= 0) & self.layout.walkable[self.neighbours]
         return np.where(floor, self.neighbours, -1)
 
@@ -109,18 +111,18 @@ class Paths:
 
     @cached_property
     def manhattan(self) -> np.ndarray:
-        """int32 (cells, cells)."""
+        """int32 (cells, cells): Manhattan distance."""
         cell = np.arange(self.layout.cells)
         x, y = cell % self.layout.width, cell // self.layout.width
         return np.abs(x[:, None] - x) + np.abs(y[:, None] - y)
 
     @cached_property
     def near_pot(self) -> np.ndarray:
-        """bool (cells,): cells that touch a pot."""
+        """bool (cells,): cells adjacent to a pot."""
         return (self.manhattan[:, list(self.layout.pots)] == 1).any(axis=1)
 
     def static(self, kind: int) -> np.ndarray:
-        """bool (cells,): where something of that kind stands."""
+        """bool (cells,): cells of a kind."""
         return self.layout.kinds == kind
 
 
@@ -135,25 +137,44 @@ def is_ingredient(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
 
 
 class Rule(NamedTuple):
-    """Where a condition holds and one of the targets can be reached: go to the nearest of them."""
+    """If a condition holds and one of the targets can be reached, go to the nearest of them.
+
+    Attributes:
+        when: bool scalar, the condition.
+        targets: bool (cells,).
+        waits: next to the target, face it and wait instead of interacting.
+    """
 
     when: Bool[Array, ""]
     targets: Bool[Array, " cells"]
-    waits: bool = False  # beside the target, face it and wait, instead of interacting
+    waits: bool = False
 
 
 class Chosen(NamedTuple):
-    """The first rule that applies. Undefined but for `found` if none does."""
+    """The first rule that applies. If none does, only `found` is defined.
+
+    Attributes:
+        found: bool scalar, whether a rule applies.
+        number: int32 scalar, the rule's position in the list.
+        target: int32 scalar, the nearest of its targets.
+        waits: bool scalar, the rule's `waits`.
+    """
 
     found: Bool[Array, ""]
     number: Int[Array, ""]
-    target: Int[Array, ""]  # the nearest of its targets
+    target: Int[Array, ""]
     waits: Bool[Array, ""]
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One state as a heuristic in `slot` reads it. All masks are bool (cells,); everything is traced."""
+    """One state as a heuristic reads it. All masks are bool (cells,); everything is traced and computed on first use.
+
+    Attributes:
+        paths: lookup tables of the layout.
+        record: uint8 (S,), the state record.
+        slot: 0 or 1, the agent that reads it, "own" below; the other one is the partner.
+    """
 
     paths: Paths
     record: UInt8[Array, " S"]
@@ -161,25 +182,29 @@ class Scene:
 
     @cached_property
     def state(self):
+        """The record's fields."""
         return unpack(self.paths.layout, self.record)
 
     @cached_property
     def me(self) -> Int[Array, ""]:
+        """The own cell."""
         return self.state.positions[self.slot].astype(jnp.int32)
 
     @cached_property
     def partner(self) -> Int[Array, ""]:
+        """The partner's cell."""
         return self.state.positions[1 - self.slot].astype(jnp.int32)
 
     @cached_property
     def facing_action(self) -> Int[Array, ""]:
-        """The move action of the direction I face."""
+        """The move action of the own facing."""
         return jnp.asarray(_ACTION_OF_FACING)[self.state.facings[self.slot].astype(jnp.int32)]
 
-    # What is in my hand.
+    # What the agents hold.
 
     @cached_property
     def hand(self) -> UInt8[Array, ""]:
+        """The item byte in the own hand."""
         return self.state.hands[self.slot]
 
     @cached_property
@@ -200,15 +225,17 @@ class Scene:
 
     @cached_property
     def partner_hand(self) -> UInt8[Array, ""]:
+        """The item byte in the partner's hand."""
         return self.state.hands[1 - self.slot]
 
     # Masks over cells.
 
     def _at(self, cells: tuple[int, ...], values: Array) -> Bool[Array, " cells"]:
+        """A mask with one value for each of some cells, False elsewhere."""
         number = np.zeros(self.paths.layout.cells, np.int32)
         number[list(cells)] = range(len(cells))
-        there = np.isin(np.arange(self.paths.layout.cells), cells)
-        return values[number] & there if cells else jnp.asarray(there)
+        listed = np.isin(np.arange(self.paths.layout.cells), cells)
+        return values[number] & listed if cells else jnp.asarray(listed)
 
     @cached_property
     def _raw_and_idle(self) -> Bool[Array, " P"]:
@@ -239,12 +266,12 @@ class Scene:
 
     @cached_property
     def staged(self) -> Bool[Array, " cells"]:
-        """Counters on which an ingredient lies."""
+        """Counters with an ingredient."""
         return self._at(self.paths.layout.counters, is_ingredient(self.state.counters))
 
     @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
-        """Walls without an item, also those that nobody can reach."""
+        """Walls without an item, also unreachable ones."""
         taken = self._at(self.paths.layout.counters, self.state.counters > 0)
         return jnp.asarray(self.paths.static(WALL)) & ~taken
 
@@ -254,11 +281,11 @@ class Scene:
 
     @cached_property
     def needed(self) -> Int[Array, " types"]:
-        """How many pieces of each piled ingredient the recipe lacks, over all pots together."""
+        """Missing pieces of each piled ingredient, over all pots together."""
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
     def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B types"]:
-        """How many pieces of each piled ingredient are in an item, ascending id."""
+        """Pieces of each piled ingredient in an item, by ascending id."""
         shift = 2 + 2 * jnp.arange(len(self.paths.layout.ingredients), dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
 
@@ -294,14 +321,14 @@ class Scene:
     def indicators(self) -> Bool[Array, " cells"]:
         return jnp.asarray(self.paths.static(INDICATOR))
 
-    # Where things are, and how to get there.
+    # Distances and moves.
 
     @cached_property
     def _target_distance(self) -> Int[Array, " cells"]:
         return jnp.asarray(self.paths.target_distance)[self.me]
 
     def reach(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
-        """The cells of the mask that touch a cell I can walk to."""
+        """The cells of the mask that are adjacent to a cell that can be walked to."""
         return mask & (self._target_distance < UNREACHABLE)
 
     def nearest_distance(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
@@ -313,10 +340,10 @@ class Scene:
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """Whether I stand beside the target, and what to do then: turn to it, or `when_facing`."""
-        beside = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
+        """Whether the target is adjacent, and what to do then: turn to it, or `when_facing`."""
+        adjacent = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
         direction = jnp.argmax(jnp.asarray(self.paths.neighbours)[self.me] == target)  # up, down, left, right
-        return beside, jnp.where(self.facing_action == direction, when_facing, direction)
+        return adjacent, jnp.where(self.facing_action == direction, when_facing, direction)
 
     def first(self, rules: Sequence[Rule]) -> Chosen:
         """The first rule that applies, with the nearest of its targets."""
@@ -329,8 +356,8 @@ class Scene:
     def approach(
         self, target: Int[Array, ""], extra: np.ndarray | None = None
     ) -> tuple[Int[Array, ""], Int[Array, ""] | Float[Array, ""]]:
-        """The step towards the target's nearest access cell, and that cell's distance plus 100 if the partner
-        stands on it. `extra` (cells,) adds to the distance of each access cell."""
+        """The step towards the target's nearest access cell, and that cell's cost: its distance, plus 100 if the
+        partner is on it, plus `extra` (cells,)."""
         access = jnp.asarray(self.paths.access)[target]
         cost = jnp.asarray(self.paths.access_distance)[self.me, target] + 100 * (access == self.partner)
         if extra is not None:
@@ -345,18 +372,17 @@ class Scene:
         waits: Bool[Array, ""] | bool = False,
         step: Int[Array, ""] | None = None,
     ) -> Int[Array, ""]:
-        """Walk to the target; beside it, turn and interact, or wait. A family with its own way of walking gives the
-        `step` of that way."""
-        beside, action = self._turn_or(target, jnp.where(waits, STAY, INTERACT))
-        return jnp.where(beside, action, self.approach(target)[0] if step is None else step)
+        """Walk to the target; next to it, turn, then interact or wait. `step` replaces the step of `approach`."""
+        adjacent, action = self._turn_or(target, jnp.where(waits, STAY, INTERACT))
+        return jnp.where(adjacent, action, self.approach(target)[0] if step is None else step)
 
     def hover(self, target: Int[Array, ""]) -> Int[Array, ""]:
-        """Walk to the target; beside it, turn and wait."""
+        """Walk to the target; next to it, turn and wait."""
         return self.go_to(target, waits=True)
 
     @cached_property
     def ways(self) -> Int[Array, " 4"]:
-        """The cells to the right, below, left and above; my own where the way is barred."""
+        """The cells to the right, below, left and above; the own cell where the way is blocked."""
         return jnp.asarray(self.paths.layout.moves[:, list(_SEARCH_ORDER)].astype(np.int32))[self.me]
 
     @cached_property
@@ -386,6 +412,6 @@ class Scene:
         return jnp.asarray((*_SEARCH_ORDER, STAY))[best]
 
     def destination(self, action: Int[Array, ""]) -> Int[Array, ""]:
-        """The cell that a move action points at, walls ignored; my own cell for other actions."""
+        """The cell that a move action points at, walls ignored; the own cell for other actions."""
         ahead = jnp.asarray(self.paths.neighbours)[self.me, jnp.minimum(action, 3)]
         return jnp.where(action < 4, ahead, self.me)

@@ -1,5 +1,5 @@
-"""H1 `recipe_aware_button`: cooks what the recipe says, and presses the button where it does not know the recipe
-(paper, App. B.2, table H1)."""
+"""H1 `recipe_aware_button`: cooks by the recipe, and presses the button if it does not know the recipe (paper, App.
+B.2, table H1)."""
 
 from __future__ import annotations
 
@@ -9,124 +9,57 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
-from generation.policy import Noise, Policy, Sampling, as_params, draw, extra_split, first_key
+from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, extra_split
 from generation.teammates.heuristics.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import GOAL, INDICATOR, PLATE, PLATES, POT, Layout
 from icrl4aht_data.overcooked.state import POT_STEPS
 
-KIND = "recipe_aware_button"
-
-DEFAULTS: dict[str, float] = {
-    "press_L_when_unknown": 0.8,
-    "refresh_interval": 100,
-    "cost_sensitivity": 0.2,
-    "strict_recipe": 0.9,
-    "exploration_bias": 0.1,  # without effect: read by no rule
-    "plate_timing": 0.5,
-    "dist_weight": 0.3,  # without effect: the nearest target wins, unweighted
-    "inertia": 0.4,  # without effect: no rule looks at the last intent
-    "task_specialization": 0.0,
-    "stubbornness": 0.0,  # without effect: read, then unused
-    "wrong_ingredient_prob": 0.0,
-    "idle_prob": 0.0,
-    "path_blocking": 0.0,
-}
-"""Parameter -> default, in declaration order. The first four matter only where the recipe is unknown or stale, which
-no layout with a recipe indicator lets happen."""
-
-PRESETS: dict[str, dict[str, float]] = {
-    "default": {},
-    "high_L_priority": {
-        "press_L_when_unknown": 1.0,
-        "refresh_interval": 50,
-        "cost_sensitivity": 0.0,
-        "strict_recipe": 1.0,
-        "exploration_bias": 0.0,
-        "plate_timing": 0.6,
-        "dist_weight": 0.3,
-        "inertia": 0.3,
-    },
-    "lazy_learner": {
-        "press_L_when_unknown": 0.3,
-        "refresh_interval": 200,
-        "cost_sensitivity": 0.8,
-        "strict_recipe": 0.3,
-        "exploration_bias": 0.5,
-        "plate_timing": 0.4,
-        "dist_weight": 0.4,
-        "inertia": 0.5,
-    },
-    "strict_adherent": {
-        "press_L_when_unknown": 0.9,
-        "refresh_interval": 80,
-        "cost_sensitivity": 0.1,
-        "strict_recipe": 1.0,
-        "exploration_bias": 0.0,
-        "plate_timing": 0.7,
-        "dist_weight": 0.25,
-        "inertia": 0.5,
-    },
-}
-"""Preset -> what differs from the defaults."""
-
-CHOICES: dict[str, int] = {}
-UNBOUNDED = frozenset({"refresh_interval"})
-"""Parameters without an upper limit; the others are in 0..1, or one of `CHOICES`."""
-
-TRAIN = Sampling(
-    ("default", "high_L_priority"),
-    {
-        "press_L_when_unknown": (0.6, 1.0),
-        "cost_sensitivity": (0.0, 0.4),
-        "strict_recipe": (0.7, 1.0),
-        "refresh_interval": [50, 80, 100],
-    },
-)
-TEST = Sampling(
-    ("lazy_learner", "strict_adherent"),
-    {
-        "press_L_when_unknown": (0.2, 0.6),
-        "cost_sensitivity": (0.4, 0.9),
-        "strict_recipe": (0.2, 0.6),
-        "refresh_interval": [100, 150, 200],
-    },
-)
-SPANS: dict[str, tuple[float, float]] = {
-    "press_L_when_unknown": (0.0, 1.0),
-    "cost_sensitivity": (0.0, 1.0),
-    "strict_recipe": (0.0, 1.0),
-    "exploration_bias": (0.0, 1.0),
-    "plate_timing": (0.0, 1.0),
-    "dist_weight": (0.1, 1.0),
-    "inertia": (0.0, 1.0),
-}
-"""Full ranges of the parameters that a sampler jitters around a preset."""
-
 _CRAMPED_CELLS = 8
-"""A kitchen with no more floor than this makes chefs give way."""
+"""Largest number of floor cells of a cramped layout."""
 
 _NONE = -1
 _NEVER = -1000
 _URGENCY = np.float32(1) - np.arange(POT_STEPS + 1, dtype=np.float32) / np.float32(POT_STEPS)
 
 
-class Memory(NamedTuple):
+class ButtonMemory(NamedTuple):
+    """Memory of an H1 teammate.
+
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+        clock: int32 scalar, steps taken in the episode.
+        recipe: uint8 scalar, item byte of the last recipe that it knew; 0 for none.
+        seen: int32 scalar, the step at which it knew it.
+    """
+
     key: Key[Array, ""]
-    clock: Int[Array, ""]  # steps taken in the episode
-    recipe: UInt8[Array, ""]  # item byte of the recipe seen last, 0 for none
-    seen: Int[Array, ""]  # when
+    clock: Int[Array, ""]
+    recipe: UInt8[Array, ""]
+    seen: Int[Array, ""]
 
 
 class Role(NamedTuple):
-    """A specialist only cooks in seat 0 and only delivers in seat 1."""
+    """Restrictions of a specialist: agent 0 only cooks, agent 1 only delivers.
+
+    Attributes:
+        cooks_only: bool scalar.
+        delivers_only: bool scalar.
+    """
 
     cooks_only: Bool[Array, ""]
     delivers_only: Bool[Array, ""]
 
 
 class Noises(NamedTuple):
-    """What the step's draws decide."""
+    """Decisions of the step's draws, bool scalars.
+
+    Attributes:
+        idles: it does nothing.
+        presses: it presses the button, if it considers that.
+        errs: it fetches the wrong ingredient.
+        blocks: it walks to a busy cell instead of fetching an ingredient.
+    """
 
     idles: Bool[Array, ""]
     presses: Bool[Array, ""]
@@ -134,42 +67,31 @@ class Noises(NamedTuple):
     blocks: Bool[Array, ""]
 
 
-def build(layout: Layout, theta: dict[str, float], slot: int = 1, noise: Noise = "seeded") -> Policy:
-    """An H1 teammate.
-
-    Args:
-        layout: the kitchen.
-        theta: every parameter of `DEFAULTS`.
-        slot: 0 or 1, the agent it plays.
-        noise: see `base.Noise`.
-    """
-    paths = Paths(layout)
-
-    def init(params, key: Key[Array, ""]) -> Memory:
-        return Memory(first_key(noise, slot, key), jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER))
-
-    def act(params, memory: Memory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        scene = Scene(paths, record, slot)
-        memory = _look(scene, memory)
-        link, u = draw(memory.key)
-        unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
-        # The roll for the button splits the step's own key once more, which draws u1 again.
-        presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
-        noises = Noises(
-            u[0] < params["idle_prob"], presses, u[1] < params["wrong_ingredient_prob"], u[2] < params["path_blocking"]
-        )
-        action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, noises)
-        # Published quirk: where the roll for the button fails, the key stays.
-        key = jnp.where(considered & ~pressed & ~noises.idles, memory.key, link)
-        key, _ = extra_split(key, erred & ~noises.idles)
-        action = jnp.where(noises.idles, STAY, action).astype(jnp.int32)
-        return action, memory._replace(key=key, clock=memory.clock + 1)
-
-    return Policy(as_params(theta, DEFAULTS), init, act, "state")
+def begin_recipe_aware_button(key: Key[Array, ""]) -> ButtonMemory:
+    """Memory at the start of an episode."""
+    return ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER))
 
 
-def _look(scene: Scene, memory: Memory) -> Memory:
-    """Any indicator in the kitchen tells the recipe, seen or not; so does a lit button."""
+def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
+    """One step of an H1 teammate."""
+    memory = _look(scene, memory)
+    following, u = draw(memory.key)
+    unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
+    # The roll for the button splits the step's own key once more, which draws u1 again.
+    presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
+    noises = Noises(
+        u[0] < params["idle_prob"], presses, u[1] < params["wrong_ingredient_prob"], u[2] < params["path_blocking"]
+    )
+    action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, noises)
+    # Published quirk: where the roll for the button fails, the key stays.
+    key = jnp.where(considered & ~pressed & ~noises.idles, memory.key, following)
+    key, _ = extra_split(key, erred & ~noises.idles)
+    action = jnp.where(noises.idles, STAY, action)
+    return action, memory._replace(key=key, clock=memory.clock + 1)
+
+
+def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
+    """The memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
     shown = jnp.any(jnp.asarray(scene.paths.static(INDICATOR))) | scene.button_lit
     return memory._replace(
         recipe=jnp.where(shown, scene.state.recipe, memory.recipe),
@@ -178,8 +100,8 @@ def _look(scene: Scene, memory: Memory) -> Memory:
 
 
 def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], noises: Noises):
-    """The action of a step without idling; whether a press was considered, whether it was taken, and whether the
-    branch of the wrong ingredient was entered."""
+    """The action of a step without idling; whether pressing the button was considered, whether it was chosen, and
+    whether the branch of the wrong ingredient was entered: all three decide how the key chain proceeds."""
     specialist = params["task_specialization"] > 0.5
     role = Role(specialist & (scene.slot == 0), specialist & (scene.slot == 1))
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
@@ -236,35 +158,35 @@ def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
 
 
 def _decoded(scene: Scene) -> np.ndarray:
-    """bool (types,): the piled types that H1 can read from an item. The fourth, id 3, is not among them."""
+    """bool (types,): the piled types that H1 recognises in an item; not the fourth, id 3 (published quirk)."""
     return np.array(scene.paths.layout.ingredients) < 3
 
 
 def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P types"]:
-    """What each pot that takes more lacks of the recipe."""
-    lacks = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
+    """Ingredients of the recipe that are missing in each pot; 0 for pots that take no more."""
+    missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
     takes = scene.nonfull[np.array(scene.paths.layout.pots)]
-    return lacks * takes[:, None] * _decoded(scene)
+    return missing * takes[:, None] * _decoded(scene)
 
 
 def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
-    """The pots that lack the ingredient in my hand; if there is none, every pot that takes one."""
-    mine = scene.counts(scene.hand)
-    lacking = (
-        jnp.zeros_like(scene.nonfull).at[np.array(scene.paths.layout.pots)].set(_missing(scene, recipe) @ mine > 0)
+    """Pots in which the ingredient in the hand is missing; if there is none, every pot that takes an ingredient."""
+    held = scene.counts(scene.hand)
+    wanting = (
+        jnp.zeros_like(scene.nonfull).at[np.array(scene.paths.layout.pots)].set(_missing(scene, recipe) @ held > 0)
     )
-    wanted_everywhere = jnp.any((mine > 0) & ~_decoded(scene))
-    return jnp.where(jnp.any(lacking) & ~wanted_everywhere, lacking, scene.nonfull)
+    wanted_everywhere = jnp.any((held > 0) & ~_decoded(scene))
+    return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.nonfull)
 
 
 def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], cramped: bool) -> Int[Array, ""]:
-    """The id of the ingredient to fetch, -1 for none. Two chefs in a cramped kitchen fetch different ones."""
+    """Id of the ingredient to fetch, -1 for none. In a cramped layout, the agents fetch different ones."""
     ids = jnp.asarray(scene.paths.layout.ingredients)
-    lacking = _missing(scene, recipe).sum(axis=0) > 0
+    missing = _missing(scene, recipe).sum(axis=0) > 0
     second = cramped and scene.slot == 1
-    nth = jnp.cumsum(lacking)
-    wanted = jnp.where(jnp.sum(lacking) > 1, nth == 2, nth == 1) if second else nth == 1
-    known = jnp.where(jnp.any(lacking), ids[jnp.argmax(wanted)], _NONE)
+    nth = jnp.cumsum(missing)
+    wanted = jnp.where(jnp.sum(missing) > 1, nth == 2, nth == 1) if second else nth == 1
+    known = jnp.where(jnp.any(missing), ids[jnp.argmax(wanted)], _NONE)
     guessed = jnp.where(params["strict_recipe"] < 0.5, int(second), _NONE)
     return jnp.where(recipe > 0, known, guessed)
 
@@ -274,7 +196,7 @@ def _piles(scene: Scene, ingredient: Int[Array, ""]) -> Bool[Array, " cells"]:
 
 
 def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether a cell beside a pot or a goal can be reached, and the step to the nearest such cell, or stay on it."""
+    """Whether a cell adjacent to a pot or a goal can be reached, and the step to the nearest one, or stay on it."""
     critical = _access_cells(scene.paths, POT) | _access_cells(scene.paths, GOAL)
     distance = jnp.where(critical, jnp.asarray(scene.paths.distance)[scene.me], UNREACHABLE)
     nearest = jnp.argmin(distance)
@@ -282,20 +204,20 @@ def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
 
 
 def _access_cells(paths: Paths, kind: int) -> np.ndarray:
-    """bool (cells,): the floor beside things of that kind."""
+    """bool (cells,): floor cells adjacent to cells of a kind."""
     return (paths.manhattan[:, paths.static(kind)] == 1).any(axis=1) & paths.layout.walkable
 
 
-# Cramped kitchens only.
+# Cramped layouts only.
 
 
 def is_cramped(layout: Layout) -> bool:
-    """Whether the kitchen is so small that chefs give way to each other."""
+    """Whether a layout is so small that H1 teammates give way to their partner."""
     return int(layout.walkable.sum()) <= _CRAMPED_CELLS
 
 
 def _step(scene: Scene, target: Int[Array, ""], cramped: bool) -> Int[Array, ""]:
-    """The step towards a target. In a cramped kitchen the seats prefer opposite corners and walk around each other."""
+    """The step towards a target. In a cramped layout, agents prefer opposite corners and walk around each other."""
     if not cramped:
         return scene.approach(target)[0]
     layout = scene.paths.layout
@@ -312,7 +234,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: bool) -> Int[Array, ""]
 
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether the partner brings an ingredient to the pot and is about as near, and the way off."""
+    """Whether the partner carries an ingredient and is about as near to the pot, and the step away from the pot."""
     manhattan = jnp.asarray(scene.paths.manhattan)
     access = jnp.asarray(scene.paths.only_access)[pot]
     as_near = manhattan[scene.partner, access] <= manhattan[scene.me, access] + 1
@@ -321,7 +243,7 @@ def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[
 
 
 def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
-    """Whether the only cell before the plates is left to the ego."""
+    """Whether to leave the plates to a partner without one: they are accessible from a single cell."""
     piles = scene.paths.static(PLATES).nonzero()[0]
     single = bool(len(piles)) and bool(scene.paths.only_access[piles[0]] >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
@@ -329,7 +251,7 @@ def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
 
 
 def _clear_the_way(scene: Scene) -> Int[Array, ""]:
-    """Out of the way between the partner, who carries a dish, and the goals."""
+    """The step off the shortest paths between the partner, who carries a dish, and the goals."""
     paths = scene.paths
     manhattan = jnp.asarray(paths.manhattan)
     exits = np.flatnonzero(_access_cells(paths, GOAL))
@@ -346,3 +268,91 @@ def _clear_the_way(scene: Scene) -> Int[Array, ""]:
     nearer = scene.free & (to_refuge < manhattan[scene.me, refuge]) & jnp.any(walkable & ~in_the_way)
     step = scene.best_way(leaves, from_exits[scene.ways], scene.best_way(nearer, -to_refuge))
     return jnp.where(in_the_way[scene.me], step, STAY)
+
+
+RECIPE_AWARE_BUTTON = Heuristic(
+    kind="recipe_aware_button",
+    begin=begin_recipe_aware_button,
+    act=act_recipe_aware_button,
+    defaults={
+        "press_L_when_unknown": 0.8,
+        "refresh_interval": 100,
+        "cost_sensitivity": 0.2,
+        "strict_recipe": 0.9,
+        "exploration_bias": 0.1,  # without effect: read by no rule
+        "plate_timing": 0.5,
+        "dist_weight": 0.3,  # without effect: the nearest target wins, unweighted
+        "inertia": 0.4,  # without effect: no rule looks at the last intent
+        "task_specialization": 0.0,
+        "stubbornness": 0.0,  # without effect: read, then unused
+        "wrong_ingredient_prob": 0.0,
+        "idle_prob": 0.0,
+        "path_blocking": 0.0,
+    },
+    presets={
+        "default": {},
+        "high_L_priority": {
+            "press_L_when_unknown": 1.0,
+            "refresh_interval": 50,
+            "cost_sensitivity": 0.0,
+            "strict_recipe": 1.0,
+            "exploration_bias": 0.0,
+            "plate_timing": 0.6,
+            "dist_weight": 0.3,
+            "inertia": 0.3,
+        },
+        "lazy_learner": {
+            "press_L_when_unknown": 0.3,
+            "refresh_interval": 200,
+            "cost_sensitivity": 0.8,
+            "strict_recipe": 0.3,
+            "exploration_bias": 0.5,
+            "plate_timing": 0.4,
+            "dist_weight": 0.4,
+            "inertia": 0.5,
+        },
+        "strict_adherent": {
+            "press_L_when_unknown": 0.9,
+            "refresh_interval": 80,
+            "cost_sensitivity": 0.1,
+            "strict_recipe": 1.0,
+            "exploration_bias": 0.0,
+            "plate_timing": 0.7,
+            "dist_weight": 0.25,
+            "inertia": 0.5,
+        },
+    },
+    train=Sampling(
+        ("default", "high_L_priority"),
+        {
+            "press_L_when_unknown": (0.6, 1.0),
+            "cost_sensitivity": (0.0, 0.4),
+            "strict_recipe": (0.7, 1.0),
+            "refresh_interval": [50, 80, 100],
+        },
+    ),
+    test=Sampling(
+        ("lazy_learner", "strict_adherent"),
+        {
+            "press_L_when_unknown": (0.2, 0.6),
+            "cost_sensitivity": (0.4, 0.9),
+            "strict_recipe": (0.2, 0.6),
+            "refresh_interval": [100, 150, 200],
+        },
+    ),
+    spans={
+        "press_L_when_unknown": (0.0, 1.0),
+        "cost_sensitivity": (0.0, 1.0),
+        "strict_recipe": (0.0, 1.0),
+        "exploration_bias": (0.0, 1.0),
+        "plate_timing": (0.0, 1.0),
+        "dist_weight": (0.1, 1.0),
+        "inertia": (0.0, 1.0),
+    },
+    unbounded=frozenset({"refresh_interval"}),
+)
+"""The family H1; its parameters' order is that of the published manifests.
+
+The first four parameters matter only while the recipe is unknown or stale, which cannot happen on a layout with a
+recipe indicator.
+"""

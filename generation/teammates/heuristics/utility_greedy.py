@@ -6,139 +6,46 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, UInt8
+from jaxtyping import Array, Float, Int, Key
 
-from generation.policy import Noise, Policy, Sampling, as_params, first_key, next_key
-from generation.teammates.heuristics.paths import UNREACHABLE, Paths, Scene
+from generation.teammates.heuristics.heuristic import Heuristic, Sampling, next_key
+from generation.teammates.heuristics.paths import UNREACHABLE, Scene
 from icrl4aht_data.overcooked.actions import STAY
-from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count
-
-KIND = "utility_greedy"
-
-DEFAULTS: dict[str, float] = {
-    "w_deliver": 10.0,
-    "w_pickup_cooked": 8.0,
-    "w_get_plate": 5.0,
-    "w_add_ingredient": 6.0,
-    "w_fetch_ingredient": 4.0,
-    "w_stage_on_counter": 2.0,
-    "w_start_cooking": 7.0,  # without effect: pots start by themselves
-    "w_press_L": 3.0,
-    "dist_weight": 0.5,
-    "inertia": 0.3,
-    "counter_preference": 0.5,
-}
-"""Parameter -> default, in declaration order."""
-
-PRESETS: dict[str, dict[str, float]] = {
-    "default": {},
-    "delivery_focused": {
-        "w_deliver": 15.0,
-        "w_pickup_cooked": 12.0,
-        "w_get_plate": 8.0,
-        "w_add_ingredient": 3.0,
-        "w_fetch_ingredient": 2.0,
-        "w_stage_on_counter": 1.0,
-        "w_start_cooking": 4.0,
-        "w_press_L": 2.0,
-        "dist_weight": 0.3,
-        "inertia": 0.4,
-        "counter_preference": 0.3,
-    },
-    "prep_focused": {
-        "w_deliver": 8.0,
-        "w_pickup_cooked": 5.0,
-        "w_get_plate": 3.0,
-        "w_add_ingredient": 10.0,
-        "w_fetch_ingredient": 8.0,
-        "w_stage_on_counter": 4.0,
-        "w_start_cooking": 12.0,
-        "w_press_L": 5.0,
-        "dist_weight": 0.4,
-        "inertia": 0.5,
-        "counter_preference": 0.7,
-    },
-    "high_inertia": {"dist_weight": 0.5, "inertia": 0.7, "counter_preference": 0.5},
-    "distance_sensitive": {"dist_weight": 1.0, "inertia": 0.3, "counter_preference": 0.5},
-}
-"""Preset -> what differs from the defaults."""
-
-CHOICES: dict[str, int] = {}
-UNBOUNDED = frozenset(name for name in DEFAULTS if name not in ("inertia", "counter_preference"))
-"""Parameters without an upper limit; the others are in 0..1."""
-
-TRAIN = Sampling(
-    ("default", "delivery_focused"),
-    {
-        "w_deliver": (8.0, 18.0),
-        "w_pickup_cooked": (6.0, 14.0),
-        "w_add_ingredient": (3.0, 8.0),
-        "dist_weight": (0.2, 0.7),
-        "inertia": (0.1, 0.5),
-    },
-)
-TEST = Sampling(
-    ("prep_focused", "high_inertia", "distance_sensitive"),
-    {
-        "w_deliver": (5.0, 12.0),
-        "w_pickup_cooked": (3.0, 8.0),
-        "w_add_ingredient": (7.0, 12.0),
-        "dist_weight": (0.6, 1.2),
-        "inertia": (0.5, 0.9),
-    },
-)
-SPANS: dict[str, tuple[float, float]] = {
-    "w_deliver": (5.0, 20.0),
-    "w_pickup_cooked": (3.0, 15.0),
-    "w_get_plate": (2.0, 10.0),
-    "w_add_ingredient": (3.0, 12.0),
-    "w_fetch_ingredient": (2.0, 10.0),
-    "w_stage_on_counter": (0.5, 5.0),
-    "w_start_cooking": (3.0, 15.0),
-    "w_press_L": (1.0, 8.0),
-    "dist_weight": (0.1, 1.5),
-    "inertia": (0.0, 1.0),
-    "counter_preference": (0.0, 1.0),
-}
-"""Full ranges of the parameters that a sampler jitters around a preset."""
 
 DELIVER, PICK_UP, PLATE_UP, ADD, FETCH, STAGE, START, PRESS = range(8)
 
 
-class Memory(NamedTuple):
-    key: Key[Array, ""]
-    intent: Int[Array, ""]  # the last one, -1 for none
-    wait: Int[Array, ""]  # steps still to stand aside
+class GreedyMemory(NamedTuple):
+    """Memory of an H4 teammate.
 
-
-def build(layout: Layout, theta: dict[str, float], slot: int = 1, noise: Noise = "seeded") -> Policy:
-    """An H4 teammate.
-
-    Args:
-        layout: the kitchen.
-        theta: every parameter of `DEFAULTS`.
-        slot: 0 or 1, the agent it plays.
-        noise: see `base.Noise`.
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+        intent: int32 scalar, the last intent, 0..7; -1 for none.
+        wait: int32 scalar, steps that it still waits for its partner.
     """
-    paths = Paths(layout)
 
-    def init(params, key: Key[Array, ""]) -> Memory:
-        return Memory(first_key(noise, slot, key), jnp.int32(-1), jnp.int32(0))
+    key: Key[Array, ""]
+    intent: Int[Array, ""]
+    wait: Int[Array, ""]
 
-    def act(params, memory: Memory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        scene = Scene(paths, record, slot)
-        intent, action = _decide(scene, params, memory.intent)
-        action, wait = _stand_aside(scene, memory, action, slot)
-        waiting = memory.wait > 0
-        after = Memory(
-            next_key(memory.key),
-            jnp.where(waiting, memory.intent, intent),
-            jnp.where(waiting, memory.wait - 1, wait),
-        )
-        return jnp.where(waiting, STAY, action).astype(jnp.int32), after
 
-    return Policy(as_params(theta, DEFAULTS), init, act, "state")
+def begin_utility_greedy(key: Key[Array, ""]) -> GreedyMemory:
+    """Memory at the start of an episode."""
+    return GreedyMemory(key, jnp.int32(-1), jnp.int32(0))
+
+
+def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
+    """One step of an H4 teammate."""
+    intent, action = _decide(scene, params, memory.intent)
+    action, wait = _yield(scene, memory, action)
+    waiting = memory.wait > 0
+    after = GreedyMemory(
+        next_key(memory.key),
+        jnp.where(waiting, memory.intent, intent),
+        jnp.where(waiting, memory.wait - 1, wait),
+    )
+    return jnp.where(waiting, STAY, action), after
 
 
 def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
@@ -163,7 +70,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     values, allowed = _values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
-    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)
+    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # keeps it from wavering between two intents
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
@@ -173,7 +80,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
 
 
 def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
-    """weight x value of each intent, and whether its conditions other than reach hold."""
+    """float32 (8,): weight x value of each intent; bool (8,): whether its conditions other than reach are met."""
     cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.nonfull))
     can_add = jnp.any(scene.reach(scene.nonfull))
     can_put_down = jnp.any(scene.reach(scene.empty_counters))
@@ -199,16 +106,115 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
             params["w_stage_on_counter"] * (0.5 + 0.1 * nonfull),
             (scene.holds_ingredient & ~can_add) | (scene.holds_plate & no_pot_in_use),
         ),
-        (jnp.float32(0), jnp.asarray(False)),
+        (jnp.float32(0), jnp.asarray(False)),  # START: pots start by themselves
         (params["w_press_L"], (params["w_press_L"] > 0) & scene.holds_nothing & ~scene.button_lit),
     ]
     values, allowed = zip(*rows, strict=True)
     return jnp.stack([jnp.asarray(v, jnp.float32) for v in values]), jnp.stack(allowed)
 
 
-def _stand_aside(scene: Scene, memory: Memory, action: Int[Array, ""], slot: int):
-    """Yields now and then when the next cell touches the partner: the action and the wait that follows."""
+def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
+    """Sometimes waits when the next cell is adjacent to the partner: the action and the wait that follows."""
     distance = jnp.asarray(scene.paths.manhattan)[scene.destination(action), scene.partner]
+    # As published, the roll is the key's first word itself, not a draw from the key.
     roll = jax.random.key_data(memory.key)[0] % 100
-    yields = (action < STAY) & (distance <= 1) & (roll < 20 + 20 * slot)
+    yields = (action < STAY) & (distance <= 1) & (roll < 20 + 20 * scene.slot)
     return jnp.where(yields, STAY, action), jnp.where(yields, 1 + (roll % 2).astype(jnp.int32), 0)
+
+
+UTILITY_GREEDY = Heuristic(
+    kind="utility_greedy",
+    begin=begin_utility_greedy,
+    act=act_utility_greedy,
+    defaults={
+        "w_deliver": 10.0,
+        "w_pickup_cooked": 8.0,
+        "w_get_plate": 5.0,
+        "w_add_ingredient": 6.0,
+        "w_fetch_ingredient": 4.0,
+        "w_stage_on_counter": 2.0,
+        "w_start_cooking": 7.0,  # without effect: pots start by themselves
+        "w_press_L": 3.0,
+        "dist_weight": 0.5,
+        "inertia": 0.3,
+        "counter_preference": 0.5,
+    },
+    presets={
+        "default": {},
+        "delivery_focused": {
+            "w_deliver": 15.0,
+            "w_pickup_cooked": 12.0,
+            "w_get_plate": 8.0,
+            "w_add_ingredient": 3.0,
+            "w_fetch_ingredient": 2.0,
+            "w_stage_on_counter": 1.0,
+            "w_start_cooking": 4.0,
+            "w_press_L": 2.0,
+            "dist_weight": 0.3,
+            "inertia": 0.4,
+            "counter_preference": 0.3,
+        },
+        "prep_focused": {
+            "w_deliver": 8.0,
+            "w_pickup_cooked": 5.0,
+            "w_get_plate": 3.0,
+            "w_add_ingredient": 10.0,
+            "w_fetch_ingredient": 8.0,
+            "w_stage_on_counter": 4.0,
+            "w_start_cooking": 12.0,
+            "w_press_L": 5.0,
+            "dist_weight": 0.4,
+            "inertia": 0.5,
+            "counter_preference": 0.7,
+        },
+        "high_inertia": {"dist_weight": 0.5, "inertia": 0.7, "counter_preference": 0.5},
+        "distance_sensitive": {"dist_weight": 1.0, "inertia": 0.3, "counter_preference": 0.5},
+    },
+    train=Sampling(
+        ("default", "delivery_focused"),
+        {
+            "w_deliver": (8.0, 18.0),
+            "w_pickup_cooked": (6.0, 14.0),
+            "w_add_ingredient": (3.0, 8.0),
+            "dist_weight": (0.2, 0.7),
+            "inertia": (0.1, 0.5),
+        },
+    ),
+    test=Sampling(
+        ("prep_focused", "high_inertia", "distance_sensitive"),
+        {
+            "w_deliver": (5.0, 12.0),
+            "w_pickup_cooked": (3.0, 8.0),
+            "w_add_ingredient": (7.0, 12.0),
+            "dist_weight": (0.6, 1.2),
+            "inertia": (0.5, 0.9),
+        },
+    ),
+    spans={
+        "w_deliver": (5.0, 20.0),
+        "w_pickup_cooked": (3.0, 15.0),
+        "w_get_plate": (2.0, 10.0),
+        "w_add_ingredient": (3.0, 12.0),
+        "w_fetch_ingredient": (2.0, 10.0),
+        "w_stage_on_counter": (0.5, 5.0),
+        "w_start_cooking": (3.0, 15.0),
+        "w_press_L": (1.0, 8.0),
+        "dist_weight": (0.1, 1.5),
+        "inertia": (0.0, 1.0),
+        "counter_preference": (0.0, 1.0),
+    },
+    unbounded=frozenset(
+        {
+            "w_deliver",
+            "w_pickup_cooked",
+            "w_get_plate",
+            "w_add_ingredient",
+            "w_fetch_ingredient",
+            "w_stage_on_counter",
+            "w_start_cooking",
+            "w_press_L",
+            "dist_weight",
+        }
+    ),
+)
+"""The family H4; its parameters' order is that of the published manifests."""

@@ -16,7 +16,7 @@ from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import PROTOCOLS
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks, published_thetas
-from generation.teammates.registry import build
+from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.overcooked.actions import EGO, STAY
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout
@@ -51,7 +51,7 @@ def by_layout(*names: str) -> list[Any]:
 def h4(layout: Layout) -> Policy:
     """Heuristic H4 in the ego's agent slot."""
     theta = published_thetas(layout.name, "utility_greedy")[0]
-    return build(layout, {"family": "utility_greedy", "theta": theta}, EGO)
+    return build_teammate(layout, {"family": "utility_greedy", "theta": theta}, EGO)
 
 
 @cache

@@ -73,7 +73,7 @@ def test_entries_say_where_they_come_from(built):
     provenance = json.loads((root / "meta" / "provenance.json").read_text())[entry.task_id]
     assert provenance["ego"]["environments"] == 8
     assert provenance["streams_kept"] == 3
-    assert "What it is not" in (root / "README.md").read_text()
+    assert "## Limits" in (root / "README.md").read_text()
 
 
 def test_the_final_ego_is_kept(built):

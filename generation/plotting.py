@@ -1,4 +1,4 @@
-"""Pictures of training and of populations."""
+"""Figures of populations of teammates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icrl4aht_data.plotting import save_figure
 
 
 def plot_training(metrics: Path, path: Path, title: str) -> None:
-    """Returns over environment steps from a JSON-lines log: self-play, and cross-play where there is any."""
+    """Draw returns over environment steps from a JSON-lines log: self-play, and cross-play if there is any."""
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes: Any = figure.subplots()
@@ -31,20 +31,26 @@ def plot_training(metrics: Path, path: Path, title: str) -> None:
     save_figure(figure, path)
 
 
-def plot_matrix(
-    values: np.ndarray, rows: Sequence[str], columns: Sequence[str], path: Path, title: str, labels: tuple[str, str]
-) -> None:
-    """A matrix as coloured cells with their numbers."""
-    size = (1.6 + 0.75 * len(columns), 1.4 + 0.6 * len(rows))
-    figure = Figure(figsize=(max(size[0], 4.2), max(size[1], 3.4)), layout="constrained")
+def plot_matrix(values: np.ndarray, names: Sequence[str], path: Path, title: str, labels: tuple[str, str]) -> None:
+    """Draw a square matrix as coloured cells with their numbers.
+
+    Args:
+        values: float (n, n).
+        names: names of the rows and of the columns.
+        path: the picture.
+        title: its title.
+        labels: what rows and columns are.
+    """
+    size = len(names)
+    figure = Figure(figsize=(max(1.6 + 0.75 * size, 4.2), max(1.4 + 0.6 * size, 3.4)), layout="constrained")
     axes: Any = figure.subplots()
     image = axes.imshow(values, cmap="viridis", aspect="auto")
     middle = (values.max() + values.min()) / 2
     for (i, j), value in np.ndenumerate(values):
         text = f"{value:.2f}" if np.abs(values).max() < 2 else f"{value:.0f}"
         axes.text(j, i, text, ha="center", va="center", color="white" if value < middle else "black", fontsize=8)
-    axes.set_xticks(range(len(columns)), columns, fontsize=8)
-    axes.set_yticks(range(len(rows)), rows, fontsize=8)
+    axes.set_xticks(range(size), names, fontsize=8)
+    axes.set_yticks(range(size), names, fontsize=8)
     axes.set_ylabel(labels[0])
     axes.set_xlabel(labels[1])
     axes.set_title(title, fontsize=10)
