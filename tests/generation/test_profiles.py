@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from generation.learners.network import Widths
-from generation.profiles import FOLDER, load_profile, names
+from generation.learners.config import Widths
+from generation.profiles import FOLDER, load_profile, profile_names
 from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_id, write_tasks
@@ -52,11 +52,11 @@ def changed(tmp_path) -> Callable[[str, str], str]:
 
 
 def test_names_are_the_shipped_files():
-    assert names() == sorted(path.stem for path in FOLDER.glob("*.toml"))
-    assert {"mini", "paper", "smoke"} <= set(names())
+    assert profile_names() == sorted(path.stem for path in FOLDER.glob("*.toml"))
+    assert {"mini", "paper", "smoke"} <= set(profile_names())
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", profile_names())
 def test_shipped_profiles_load(name):
     profile = load_profile(name)
     assert profile.name == name
@@ -187,11 +187,15 @@ def test_learned_teammates_on_some_layouts(changed):
         ("keep = 8", "keep = true", r"release\.keep = True: expected int"),
         ('data_version = "0.2.0"', "data_version = 2", r"release\.data_version = 2: expected str"),
         ('data_version = "0.2.0"', "", r"missing key 'data_version'"),
-        ("minibatches = 4", "minibatches = 0", r"ego\.minibatches = 0: expected a positive number"),
-        ("rollout = 40", "rollout = -40", r"ego\.rollout = -40: expected a positive number"),
-        ("total_steps = 32000", "total_steps = 3.2e4", r"ego\.total_steps = 32000\.0: expected int"),
-        ("rollout = 40", 'rollout = 40\nlearning_rate = "fast"', r"ego\.learning_rate = 'fast': expected float"),
-        ("gru = 8", "gru = 8.5", r"widths\.gru = 8\.5: expected positive whole numbers"),
+        ("minibatches = 4", "minibatches = 0", r"ego\.minibatches = 0: expected an integer at least 1"),
+        ("rollout = 40", "rollout = -40", r"ego\.rollout = -40: expected an integer at least 1"),
+        ("total_steps = 32000", "total_steps = 3.2e4", r"ego\.total_steps = 32000\.0: expected an integer"),
+        (
+            "rollout = 40",
+            'rollout = 40\nlearning_rate = "fast"',
+            r"ego\.learning_rate = fast: expected a number",
+        ),
+        ("gru = 8", "gru = 8.5", r"widths\.gru = 8\.5: expected an integer at least 1"),
         (
             '["coord_simple", "cramped_room_up"]',
             "[]",

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from generation.collection import curate, record
-from generation.learners.network import ActorCritic, Widths
-from generation.learners.ppo import PPOConfig, Rollout
+from generation.learners.config import PPOConfig, Widths
+from generation.learners.network import ActorCritic
+from generation.learners.rollout import Rollout
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
@@ -31,9 +32,9 @@ def make_config(length: int, updates: int) -> PPOConfig:
     return PPOConfig(total_steps=TABLES * length * updates, environments=TABLES, rollout=length, minibatches=1)
 
 
-def empty_histories(config: PPOConfig) -> record.Histories:
-    shapes = record.shapes(LAYOUT, config)
-    return record.Histories(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
+def empty_histories(config: PPOConfig) -> record.HistoryArrays:
+    shapes = record.array_shapes(LAYOUT, config)
+    return record.HistoryArrays(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
 
 
 def random_rollouts(length: int, updates: int) -> list[Rollout]:
@@ -52,7 +53,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
     return [one() for _ in range(updates)]
 
 
-def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> record.Histories:
+def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> record.HistoryArrays:
     """One step of one table at a time: the first 100 of each 400, and the state after them."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
@@ -81,7 +82,7 @@ def test_keep_equals_a_loop_over_steps(length, updates):
     expected = kept_by_loop(rollouts, config)
     found = empty_histories(config)
     for number, rollout in enumerate(rollouts):
-        record.keep(found, number, rollout)
+        record.record_rollout(found, number, rollout)
     for name, array in expected._asdict().items():
         assert array.size and not (array == UNTOUCHED).any(), name  # every place is filled
         np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
@@ -93,9 +94,9 @@ def test_keeping_twice_changes_nothing_and_order_does_not_matter():
     rollouts = random_rollouts(96, 9)
     once, again = empty_histories(config), empty_histories(config)
     for number, rollout in enumerate(rollouts):
-        record.keep(once, number, rollout)
+        record.record_rollout(once, number, rollout)
     for number in (4, 8, 4, 1, 0, 2, 3, 5, 6, 7, 1):
-        record.keep(again, number, rollouts[number])
+        record.record_rollout(again, number, rollouts[number])
     for name, array in once._asdict().items():
         np.testing.assert_array_equal(getattr(again, name), array, err_msg=name)
 
@@ -103,7 +104,7 @@ def test_keeping_twice_changes_nothing_and_order_does_not_matter():
 def test_shapes():
     config = PPOConfig(total_steps=64 * 100 * 25, environments=64, rollout=100, minibatches=1)
     size = record_size(LAYOUT)
-    assert record.shapes(LAYOUT, config) == {
+    assert record.array_shapes(LAYOUT, config) == {
         "state": ((64, 600, size), "uint8"),
         "actions": ((64, 600), "int8"),
         "teammate_actions": ((64, 600), "int8"),

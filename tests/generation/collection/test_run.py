@@ -17,14 +17,14 @@ from rich.console import Console
 from generation.cli import main
 from generation.collection import job
 from generation.collection.job import CollectionError
-from generation.collection.options import Options
+from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
 from generation.collection.task_folder import LEARNER, partial_folder
 from generation.learners.resume import BusyError, run_lock
 from generation.profiles import load_profile
-from generation.progress import Board
+from generation.progress import ProgressBoard
 from generation.releases import build
-from generation.releases.check import compare
+from generation.releases.check import compare_rebuilds
 from icrl4aht_data import verify_release
 from tests.helpers.tiny import artefact, start
 
@@ -43,7 +43,7 @@ def failures(out: Path) -> list[dict]:
 def collect(tasks, out: Path, **options) -> str:
     """What the collection printed."""
     output = StringIO()
-    collect_tasks(tasks[0], tasks[1], out, Console(file=output, width=200), Options(**options))
+    collect_tasks(tasks[0], tasks[1], out, Console(file=output, width=200), CollectOptions(**options))
     return output.getvalue()
 
 
@@ -64,7 +64,7 @@ def failing(monkeypatch, *errors: Exception | None) -> list[int]:
 
 def test_a_task_that_raises_is_reported_and_the_others_are_done(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, ZeroDivisionError("no steps"))
-    with pytest.raises(CollectionError, match=r"1 of 2 tasks have no artefact: .*_s0_.*failed\.jsonl says why"):
+    with pytest.raises(CollectionError, match=r"1 of 2 tasks have no artefact: .*_s0_.*failed\.jsonl has the reasons"):
         collect(tasks, tmp_path)
     assert calls == [0, 1]
     (line,) = failures(tmp_path)
@@ -103,7 +103,7 @@ def test_an_interrupt_is_no_failure(tasks, tmp_path, monkeypatch):
 
 def test_a_task_that_another_collector_is_at_comes_last(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, BusyError("busy"))
-    assert "another collector is at it" in collect(tasks, tmp_path)
+    assert "another collector works on it" in collect(tasks, tmp_path)
     assert calls == [0, 1, 0]
 
 
@@ -113,10 +113,10 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     folder = tmp_path / "artefacts" / task.task_id
     folder.parent.mkdir()
     with run_lock(folder):
-        assert job.Job(profile, folder.parent, None, wait=False)(task) == "busy"
+        assert job.CollectionJob(profile, folder.parent, None, wait=False)(task) == "busy"
         shutil.copytree(pair / "artefacts" / task.task_id, folder)
     before = (folder / "metadata.json").stat().st_mtime_ns
-    assert job.Job(profile, folder.parent, None, wait=True)(task) == "done"
+    assert job.CollectionJob(profile, folder.parent, None, wait=True)(task) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
@@ -138,6 +138,7 @@ def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(built, pair, tmp_pa
     assert not (tmp_path / "lite").exists()
 
 
+@pytest.mark.slow
 def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
     command = ["-m", "generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
     processes = [start(*command) for _ in range(2)]
@@ -146,7 +147,7 @@ def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
     for folder in (artefact(tmp_path, 0), artefact(tmp_path, 1)):
         updates = [json.loads(line)["update"] for line in (folder / "timing.jsonl").read_text().splitlines()]
         assert updates == list(range(25))
-    assert not compare(tmp_path, pair).differences
+    assert not compare_rebuilds(tmp_path, pair).differences
 
 
 def listening(process: psutil.Process) -> set[str]:
@@ -160,6 +161,7 @@ def listening(process: psutil.Process) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_ray_with_two_workers(built, pair, tmp_path):
     """A damaged task fails and the other is finished; then both, bit-equal to the collection in one process; all that
     time, nothing listens beyond the loopback."""
@@ -185,7 +187,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     shutil.rmtree(broken)
     output, errors = (process := start(*command)).communicate()
     assert process.returncode == 0, output + errors
-    assert not compare(tmp_path, pair).differences
+    assert not compare_rebuilds(tmp_path, pair).differences
     assert verify_release(tmp_path / "lite").ok
     assert addresses
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
@@ -201,10 +203,10 @@ def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
 def test_the_board_counts_tasks_speed_and_time_left():
     output = StringIO()
     console = Console(file=output, force_terminal=True, width=160)
-    with Board(console, tasks=2, updates=10) as board:
-        board.running("one", 5, 1_000.0)
-        board.running("two", 2, 500.0)
-        board.ended("one")
+    with ProgressBoard(console, tasks=2, updates=10) as board:
+        board.show_running("one", 5, 1_000.0)
+        board.show_running("two", 2, 500.0)
+        board.show_ended("one")
     text = output.getvalue()
     assert "1/2 tasks, 500 steps/s" in text
     assert "12/20" in text
@@ -212,7 +214,7 @@ def test_the_board_counts_tasks_speed_and_time_left():
 
 def test_statistics_are_printed_and_kept(built):
     output = StringIO()
-    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output, width=100))
+    build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output, width=100))
     for row in ("Original transitions", "4,000", "Filtered transitions", "1,500", "(5, 5, 45)", "Disk size"):
         assert row in output.getvalue()
     info = json.loads((built / "a" / "lite" / "meta" / "info.json").read_text())

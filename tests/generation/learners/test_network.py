@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from tests.helpers.jit import compiled
 
 STEPS, TABLES, CHANNELS = 4, 3, 40
@@ -197,7 +198,7 @@ def test_initial_weights(small):
 
 def test_widths_from_a_table():
     table = {"pointwise": [4], "spatial": [5, 6], "dense": 7, "gru": 8, "head": 9}
-    assert Widths.from_table(table) == Widths((4,), (5, 6), 7, 8, 9)
-    assert Widths.from_table({"gru": 8}) == Widths(gru=8)
+    assert Widths.from_json(table) == Widths((4,), (5, 6), 7, 8, 9)
+    assert Widths.from_json({"gru": 8}) == Widths(gru=8)
     with pytest.raises(TypeError, match="grus"):
-        Widths.from_table({"grus": 8})
+        Widths.from_json({"grus": 8})

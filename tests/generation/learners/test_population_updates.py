@@ -13,8 +13,8 @@ import pytest
 from generation.learners.population.comedi import CoMeDi
 from generation.learners.population.lbrdiv import LBRDiv, Multipliers
 from generation.learners.population.population import Algorithm, Population, PopulationState
-from generation.learners.ppo import Batch, Sequences, sequences
-from generation.learners.rollout import Rollout, Seats, roll_out
+from generation.learners.ppo import Batch, Sequences, sequences, shaping_weight
+from generation.learners.rollout import Rollout, RolloutCarry, roll_out
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.jit import compiled, same_bytes
@@ -38,10 +38,10 @@ REWARDED = 2
 def parts(lbrdiv) -> Parts:
     """Made-up sequences in which one action brings a reward at once; the second policy's weights are -1."""
     before, rng = lbrdiv.before, np.random.default_rng(2)
-    steps, places = EPISODE, 16
-    action = rng.integers(0, 6, (2, steps, places))
-    record = np.asarray(before.seats.env.record)[rng.integers(0, 32, (2, steps, places))]
-    zeros = np.zeros((2, steps, places), np.float32)
+    steps, slots = EPISODE, 16
+    action = rng.integers(0, 6, (2, steps, slots))
+    record = np.asarray(before.carry.env.record)[rng.integers(0, 32, (2, steps, slots))]
+    zeros = np.zeros((2, steps, slots), np.float32)
     arrays: dict[str, Any] = {
         "record": record,
         "reset": np.broadcast_to(np.arange(steps)[:, None] == 0, zeros.shape),
@@ -50,9 +50,9 @@ def parts(lbrdiv) -> Parts:
         "value": zeros,
         "reward": (action == REWARDED).astype(np.float32),
         "done": zeros > -1,
-        "hidden": np.zeros((2, 1, places, 8), np.float32),
-        "partner": np.zeros((2, 1, places), np.int32),
-        "weight": np.array([1, -1], np.float32)[:, None, None] * np.ones((2, 1, places), np.float32),
+        "hidden": np.zeros((2, 1, slots, 8), np.float32),
+        "partner": np.zeros((2, 1, slots), np.int32),
+        "weight": np.array([1, -1], np.float32)[:, None, None] * np.ones((2, 1, slots), np.float32),
         "last_value": zeros[:, :1],
     }
     optimizer = jax.tree.map(
@@ -153,7 +153,7 @@ class Updated(NamedTuple):
     before: PopulationState
     after: PopulationState
     metrics: dict[str, float]
-    seats: Seats  # of the roll-out made anew
+    carry: RolloutCarry  # of the roll-out made anew
     rollout: Rollout
 
 
@@ -167,10 +167,10 @@ def updated(algorithm: Algorithm) -> Updated:
     def again(state):
         rolling = jax.random.split(jax.random.fold_in(state.key, state.update), 3)[0]
         players, restart = whole._players(state.params), whole._restart(state.visited)
-        return roll_out(whole.env, players, state.seats, EPISODE, rolling, restart)
+        return roll_out(whole.env, players, state.carry, EPISODE, rolling, restart)
 
-    seats, rollout = compiled(again)(before)
-    return Updated(whole, update, before, after, {n: float(v) for n, v in metrics.items()}, seats, rollout)
+    carry, rollout = compiled(again)(before)
+    return Updated(whole, update, before, after, {n: float(v) for n, v in metrics.items()}, carry, rollout)
 
 
 @pytest.fixture(scope="module")
@@ -199,13 +199,13 @@ def test_an_update_is_a_pure_function_of_the_state(either):
 def test_the_state_moves_on(either):
     assert int(either.after.update) == 2
     assert same_bytes(either.after.key, either.before.key)
-    np.testing.assert_array_equal(either.after.seats.env.record, either.seats.env.record)
-    np.testing.assert_array_equal(either.after.seats.env.episode, 2)
+    np.testing.assert_array_equal(either.after.carry.env.record, either.carry.env.record)
+    np.testing.assert_array_equal(either.after.carry.env.episode, 2)
 
 
 def test_all_learning_policies_change_and_no_other(either):
-    learning = either.population.seating.learning
-    for number in range(either.population.seating.policies):
+    learning = either.population.assignment.learning
+    for number in range(either.population.assignment.policies):
         same = same_bytes(part(either.before.params, number), part(either.after.params, number))
         assert same == (number >= learning)
 
@@ -216,37 +216,37 @@ def test_untrained_policies_differ(either):
 
 
 def test_metrics_tell_self_play_from_cross_play(either):
-    seating, done = either.population.seating, np.asarray(either.rollout.done)
+    assignment, done = either.population.assignment, np.asarray(either.rollout.done)
     returns = np.asarray(either.rollout.returns)
-    fresh, kin = seating.starts_from < 0, seating.policy[0] % 2 == seating.policy[1] % 2
+    fresh, group = assignment.starts_from < 0, assignment.policy[0] % 2 == assignment.policy[1] % 2
     assert done[-1].all()
-    assert either.metrics["episodes"] == seating.tables
-    np.testing.assert_allclose(either.metrics["self_play"], returns[-1][kin & fresh].mean(), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(either.metrics["cross_play"], returns[-1][~kin].mean(), rtol=1e-5, atol=1e-6)
+    assert either.metrics["episodes"] == assignment.envs
+    np.testing.assert_allclose(either.metrics["self_play"], returns[-1][group & fresh].mean(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(either.metrics["cross_play"], returns[-1][~group].mean(), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(either.metrics["shaping"], 1 - 96 / CONFIG.shaping_horizon, rtol=1e-6)
 
 
 def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(lbrdiv, learn):
-    """Policy by policy, each from its own places of the roll-out."""
+    """Policy by policy, each from its own slots of the roll-out."""
     whole, before = lbrdiv.population, lbrdiv.before
-    seating = whole.seating
+    assignment = whole.assignment
     key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]
     keys = jax.random.split(jax.random.fold_in(key, 0), 4)
     weight = np.asarray(whole._place_weights(before.memory))
     (group,) = whole.groups
 
-    def sequences_of_all(state, seats, rollout):
-        last = whole._players(state.params)[0].act(seats.memories[0], seats.env, key)[0].value
-        shaping = CONFIG.shaping(state.update)
-        return sequences(rollout, 0, group.places.ravel(), state.seats.memories[0], last, shaping)
+    def sequences_of_all(state, carry, rollout):
+        last = whole._players(state.params)[0].act(carry.memories[0], carry.env, key)[0].value
+        shaping = shaping_weight(CONFIG, state.update)
+        return sequences(rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
 
-    everyone = jax.tree.map(np.asarray, compiled(sequences_of_all)(before, lbrdiv.seats, lbrdiv.rollout))
+    everyone = jax.tree.map(np.asarray, compiled(sequences_of_all)(before, lbrdiv.carry, lbrdiv.rollout))
     for number in range(4):
-        places = seating.places(number)[0]
-        chosen = np.array([group.places.ravel().tolist().index(place) for place in places])
+        slots = assignment.agent_slots(number)[0]
+        chosen = np.array([group.agent_slots.ravel().tolist().index(slot) for slot in slots])
         played = jax.tree.map(lambda leaf, chosen=chosen: leaf[:, chosen], everyone)._replace(
-            weight=jnp.asarray(weight[places])[None],
-            partner=jnp.asarray(seating.policy[1 - places[0] // seating.tables, places % seating.tables])[None],
+            weight=jnp.asarray(weight[slots])[None],
+            partner=jnp.asarray(assignment.policy[1 - slots[0] // assignment.envs, slots % assignment.envs])[None],
         )
         expected = learn(part(before.params, number), part(before.optimizer, number), played, keys[number])[0]
         for a, b in zip(jax.tree.leaves(part(lbrdiv.after.params, number)), jax.tree.leaves(expected), strict=True):
@@ -262,7 +262,7 @@ def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
     @compiled
     def learned(shaped):
         rollout = lbrdiv.rollout._replace(shaped=shaped)
-        return whole._learn(before, whole._players(before.params), lbrdiv.seats, rollout, jax.random.key(1))[0]
+        return whole._learn(before, whole._players(before.params), lbrdiv.carry, rollout, jax.random.key(1))[0]
 
     params = learned(shaped)
     assert same_bytes(params, learned(np.where(lowered, 0.0, shaped)))
@@ -270,26 +270,26 @@ def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
 
 
 def test_the_multipliers_follow_the_returns_of_the_tables(lbrdiv):
-    seating, returns = lbrdiv.population.seating, np.asarray(lbrdiv.rollout.returns)[-1]
-    table = np.full((4, 4), np.nan)
+    assignment, returns = lbrdiv.population.assignment, np.asarray(lbrdiv.rollout.returns)[-1]
+    env = np.full((4, 4), np.nan)
     seen = np.zeros((4, 4), bool)
     for left, right in product((2, 3), (0, 1)):
-        table[left, right] = returns[(seating.policy[0] == left) & (seating.policy[1] == right)].mean()
+        env[left, right] = returns[(assignment.policy[0] == left) & (assignment.policy[1] == right)].mean()
         seen[left, right] = True
-    expected = plain_adapt(lbrdiv.before.memory, table, seen, 0.1, 0.01)
+    expected = plain_adapt(lbrdiv.before.memory, env, seen, 0.1, 0.01)
     for name, one, other in zip(Multipliers._fields, lbrdiv.after.memory, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi):
-    """A quarter of the tables starts from states that the third quarter went through in the roll-out before."""
-    source = comedi.population.seating.starts_from
-    started = np.asarray(comedi.after.seats.env.record)
+    """A quarter of the envs starts from states that the third quarter went through in the roll-out before."""
+    source = comedi.population.assignment.starts_from
+    started = np.asarray(comedi.after.carry.env.record)
     visited = np.asarray(comedi.before.visited)
     moved = source >= 0
     assert moved.sum() == 4
     np.testing.assert_array_equal(started[moved], visited[source[moved]])
-    env = comedi.after.seats.env
+    env = comedi.after.carry.env
     fresh = np.asarray(compiled(comedi.population.env.first_record)(env.key, env.episode))
     np.testing.assert_array_equal(started[~moved], fresh[~moved])
     assert (started[moved] != fresh[moved]).any(axis=1).all()
@@ -297,6 +297,6 @@ def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi):
 
 def test_a_visited_state_is_one_of_the_tables_own_last_roll_out(comedi):
     record, visited = np.asarray(comedi.rollout.record), np.asarray(comedi.after.visited)
-    steps = [(record[:, table] == visited[table]).all(axis=1).nonzero()[0].tolist() for table in range(len(visited))]
+    steps = [(record[:, env] == visited[env]).all(axis=1).nonzero()[0].tolist() for env in range(len(visited))]
     assert all(steps)
     assert len({own[0] for own in steps if len(own) == 1}) > 2, "the step is drawn"

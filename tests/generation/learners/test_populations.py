@@ -24,13 +24,13 @@ from tests.helpers.populations import plain_adapt, population
 
 
 def test_fcp_members_play_themselves_in_both_seats():
-    seating = FCP(3).seating(4)
-    np.testing.assert_array_equal(seating.policy, [[0] * 4 + [1] * 4 + [2] * 4] * 2)
-    np.testing.assert_array_equal(seating.term, seating.policy)
-    assert (seating.learning, seating.tables, seating.self_play.all()) == (3, 12, True)
-    np.testing.assert_array_equal(seating.starts_from, -1)
+    assignment = FCP(3).assignment(4)
+    np.testing.assert_array_equal(assignment.policy, [[0] * 4 + [1] * 4 + [2] * 4] * 2)
+    np.testing.assert_array_equal(assignment.term, assignment.policy)
+    assert (assignment.learning, assignment.envs, assignment.self_play.all()) == (3, 12, True)
+    np.testing.assert_array_equal(assignment.starts_from, -1)
     for member in range(3):
-        counting, others = seating.places(member)
+        counting, others = assignment.agent_slots(member)
         np.testing.assert_array_equal(
             counting, [*range(4 * member, 4 * member + 4), *range(12 + 4 * member, 16 + 4 * member)]
         )
@@ -40,25 +40,25 @@ def test_fcp_members_play_themselves_in_both_seats():
 @pytest.mark.parametrize("algorithm", [BRDiv, LBRDiv])
 @pytest.mark.parametrize(("members", "environments"), [(1, 4), (2, 8), (3, 8), (10, 256)])
 def test_confederates_sit_in_seat_1_and_best_responses_in_seat_0(algorithm, members, environments):
-    seating = algorithm(members).seating(environments)
-    responses, confederates = seating.policy
+    assignment = algorithm(members).assignment(environments)
+    responses, confederates = assignment.policy
     assert set(responses) == set(range(members, 2 * members))
     assert set(confederates) == set(range(members))
-    assert seating.learning == seating.policies == 2 * members
-    np.testing.assert_array_equal(seating.kin, [*range(members)] * 2)
-    np.testing.assert_array_equal(seating.self_play, responses - members == confederates)
-    np.testing.assert_array_equal(seating.starts_from, -1)
+    assert assignment.learning == assignment.policies == 2 * members
+    np.testing.assert_array_equal(assignment.group, [*range(members)] * 2)
+    np.testing.assert_array_equal(assignment.self_play, responses - members == confederates)
+    np.testing.assert_array_equal(assignment.starts_from, -1)
     for policy in range(2 * members):
-        counting, others = seating.places(policy)
-        seat = EGO if policy >= members else TEAMMATE
+        counting, others = assignment.agent_slots(policy)
+        agent = EGO if policy >= members else TEAMMATE
         assert (counting.size, others.size) == (environments, 0)
-        np.testing.assert_array_equal(counting // seating.tables, seat)
-        np.testing.assert_array_equal(seating.policy[seat, counting % seating.tables], policy)
+        np.testing.assert_array_equal(counting // assignment.envs, agent)
+        np.testing.assert_array_equal(assignment.policy[agent, counting % assignment.envs], policy)
 
 
 @pytest.mark.parametrize(("members", "environments"), [(2, 8), (3, 8), (4, 24), (10, 256)])
 def test_every_pair_plays_three_quarters_of_all_tables_self_play(members, environments):
-    responses, confederates = BRDiv(members).seating(environments).policy
+    responses, confederates = BRDiv(members).assignment(environments).policy
     pairs = np.zeros((members, members), int)
     np.add.at(pairs, (confederates, responses - members), 1)
     assert (pairs > 0).all()
@@ -69,18 +69,18 @@ def test_every_pair_plays_three_quarters_of_all_tables_self_play(members, enviro
 
 
 def test_each_pair_of_brdiv_is_a_term_for_either_side():
-    seating = BRDiv(3).seating(8)
-    for table, (response, confederate) in enumerate(seating.policy.T):
+    assignment = BRDiv(3).assignment(8)
+    for table, (response, confederate) in enumerate(assignment.policy.T):
         pair = 3 * confederate + response - 3
-        assert seating.term[:, table].tolist() == [9 + pair, pair]
+        assert assignment.term[:, table].tolist() == [9 + pair, pair]
 
 
 @pytest.mark.parametrize("environments", [8, 16, 256])
 def test_comedi_has_a_quarter_each_of_self_play_cross_play_mixed_play_and_its_states(environments):
-    seating = CoMeDi().seating(environments)
+    assignment = CoMeDi().assignment(environments)
     quarter = environments // 4
-    play, cross, mixed, from_mixed = np.split(seating.policy, 4, axis=1)
-    terms = np.split(seating.term, 4, axis=1)
+    play, cross, mixed, from_mixed = np.split(assignment.policy, 4, axis=1)
+    terms = np.split(assignment.term, 4, axis=1)
     np.testing.assert_array_equal(play, 0)
     np.testing.assert_array_equal(terms[0], 0)
     half = quarter // 2
@@ -92,37 +92,37 @@ def test_comedi_has_a_quarter_each_of_self_play_cross_play_mixed_play_and_its_st
     np.testing.assert_array_equal(from_mixed, mixed)
     np.testing.assert_array_equal(terms[3][:, ::2], 2)
     np.testing.assert_array_equal(terms[3][:, 1::2], np.where(mixed[:, 1::2] == 0, 3, -1))
-    tables = np.arange(environments)
-    np.testing.assert_array_equal(seating.starts_from, np.where(tables < 3 * quarter, -1, tables - quarter))
-    assert (seating.learning, seating.policies) == (1, 2)
-    np.testing.assert_array_equal(seating.self_play, (seating.policy == 0).all(axis=0))
-    assert seating.places(0)[0].size == 2 * quarter + quarter + quarter * 3 // 2
-    assert seating.places(1)[0].size == 0
-    assert seating.places(0)[1].size + seating.places(1)[1].size == 2 * quarter + quarter + quarter // 2
+    envs = np.arange(environments)
+    np.testing.assert_array_equal(assignment.starts_from, np.where(envs < 3 * quarter, -1, envs - quarter))
+    assert (assignment.learning, assignment.policies) == (1, 2)
+    np.testing.assert_array_equal(assignment.self_play, (assignment.policy == 0).all(axis=0))
+    assert assignment.agent_slots(0)[0].size == 2 * quarter + quarter + quarter * 3 // 2
+    assert assignment.agent_slots(1)[0].size == 0
+    assert assignment.agent_slots(0)[1].size + assignment.agent_slots(1)[1].size == 2 * quarter + quarter + quarter // 2
 
 
 def test_comedi_mixes_the_frozen_member_into_both_seats():
-    mixed = np.split(CoMeDi().seating(16).policy, 4, axis=1)[2]
+    mixed = np.split(CoMeDi().assignment(16).policy, 4, axis=1)[2]
     assert (mixed == 1).any(axis=1).all()
 
 
 def test_comedi_needs_tables_that_divide_by_eight():
     with pytest.raises(ValueError, match="environments = 12: CoMeDi needs a multiple of 8"):
-        CoMeDi().seating(12)
+        CoMeDi().assignment(12)
 
 
 @pytest.mark.parametrize("algorithm", [FCP(3), BRDiv(3), LBRDiv(4), CoMeDi()])
 def test_groups_hold_every_place_once_those_that_count_first(algorithm):
     whole = population(algorithm)
-    seating = whole.seating
-    everyone = np.concatenate([group.places.ravel() for group in whole.groups])
-    np.testing.assert_array_equal(np.sort(everyone), np.arange(2 * seating.tables))
-    policies = [group.first + k for group in whole.groups for k in range(len(group.places))]
-    assert policies == list(range(seating.policies))
+    assignment = whole.assignment
+    everyone = np.concatenate([group.agent_slots.ravel() for group in whole.groups])
+    np.testing.assert_array_equal(np.sort(everyone), np.arange(2 * assignment.envs))
+    policies = [group.first + k for group in whole.groups for k in range(len(group.agent_slots))]
+    assert policies == list(range(assignment.policies))
     for group in whole.groups:
-        for k, places in enumerate(group.places):
-            counting, others = seating.places(group.first + k)
-            np.testing.assert_array_equal(places, np.concatenate([counting, others]))
+        for k, slots in enumerate(group.agent_slots):
+            counting, others = assignment.agent_slots(group.first + k)
+            np.testing.assert_array_equal(slots, np.concatenate([counting, others]))
             assert group.counting == counting.size
 
 
@@ -138,22 +138,22 @@ def test_critics_are_told_the_partner_where_partners_vary():
 
 def by_hand(algorithm: Any, memory: Any) -> np.ndarray:
     """The weight of each place's return in its policy's objective, from the paper's equations, (2, N); each expected
-    return is a mean over its places."""
-    seating = algorithm.seating(16)
+    return is a mean over its slots."""
+    assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)
-    expected = np.zeros(seating.policy.shape)
-    for table, (left, right) in enumerate(seating.policy.T):
+    expected = np.zeros(assignment.policy.shape)
+    for table, (left, right) in enumerate(assignment.policy.T):
         if isinstance(algorithm, FCP):
             expected[:, table] = 1 / 32
         elif isinstance(algorithm, CoMeDi):
             quarter = table // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
-            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # half of J_MP over 4 places, half over 2
+            mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # half of J_MP over 4 slots, half over 2
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
             expected[:, table] = [both * (left == 0), both * (right == 0)]
         else:
             i, j = int(right), int(left) - k
-            n = np.sum((seating.policy[0] == left) & (seating.policy[1] == right))
+            n = np.sum((assignment.policy[0] == left) & (assignment.policy[1] == right))
             if isinstance(algorithm, BRDiv):
                 conf = 1 + 2 * algorithm.cross_play_weight if i == j else -algorithm.cross_play_weight
                 expected[:, table] = [float(i == j) / n, conf / n]
@@ -179,29 +179,36 @@ def some_multipliers(members: int) -> Multipliers:
         (BRDiv(3), ()),
         (BRDiv(2, cross_play_weight=0.25), ()),
         (LBRDiv(3), some_multipliers(3)),
-        (LBRDiv(4), LBRDiv(4).begin()),
+        (LBRDiv(4), LBRDiv(4).init()),
         (CoMeDi(), ()),
         (CoMeDi(cross_play_weight=0.3, mixed_play_weight=2.0), ()),
     ],
 )
-def test_place_weights_are_the_papers(algorithm, memory):
+def test_slot_weights_are_the_papers(algorithm, memory):
     """Up to a positive factor for each policy, which makes the mean size of a policy's weights 1."""
     whole = population(algorithm)
-    found = np.asarray(whole._place_weights(memory))
-    expected, policy, counts = by_hand(algorithm, memory).ravel(), whole.seating.policy.ravel(), whole.seating.term >= 0
+    found = np.asarray(whole._slot_weights(memory))
+    expected, policy, counts = (
+        by_hand(algorithm, memory).ravel(),
+        whole.assignment.policy.ravel(),
+        whole.assignment.term >= 0,
+    )
     np.testing.assert_array_equal(found[~counts.ravel()], 0)
-    for number in range(whole.seating.learning):
+    for number in range(whole.assignment.learning):
         mine = (policy == number) & counts.ravel()
         np.testing.assert_allclose(np.abs(found[mine]).mean(), 1, rtol=1e-5)
         np.testing.assert_allclose(found[mine], expected[mine] / np.abs(expected[mine]).mean(), rtol=1e-5)
 
 
 def test_brdiv_weighs_self_play_by_one_more_than_twice_cross_play():
-    """Of a confederate's weights, summed over its places by opposite: 2 for its own, -1/2 for each other one's."""
-    seating = BRDiv(3).seating(16)
-    weights = np.asarray(population(BRDiv(3))._place_weights(()))[seating.tables :]
+    """Of a confederate's weights, summed over its slots by opposite: 2 for its own, -1/2 for each other one's."""
+    assignment = BRDiv(3).assignment(16)
+    weights = np.asarray(population(BRDiv(3))._slot_weights(()))[assignment.envs :]
     totals = np.array(
-        [[weights[(seating.policy[1] == i) & (seating.policy[0] == 3 + j)].sum() for j in range(3)] for i in range(3)]
+        [
+            [weights[(assignment.policy[1] == i) & (assignment.policy[0] == 3 + j)].sum() for j in range(3)]
+            for i in range(3)
+        ]
     )
     np.testing.assert_allclose(
         totals / totals[0, 0], [[1, -0.25, -0.25], [-0.25, 1, -0.25], [-0.25, -0.25, 1]], rtol=1e-5
@@ -212,7 +219,7 @@ def test_brdiv_weighs_self_play_by_one_more_than_twice_cross_play():
 
 
 def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2k, 2k) returns that are not a number where none was seen; only responses in seat 0 are."""
+    """(2k, 2k) returns that are not a number where none was seen; only responses in agent 0 are."""
     seen = np.zeros((2 * k, 2 * k), bool)
     seen[k:, :k] = rng.random((k, k)) < share
     return np.where(seen, rng.normal(size=seen.shape) * 30, np.nan).astype(np.float32), seen
@@ -222,7 +229,7 @@ def test_multipliers_follow_the_papers_update():
     """From the start, a few pairs seen at a time."""
     k, rng = 4, np.random.default_rng(12)
     algorithm = LBRDiv(k, tolerance=0.3, learning_rate=0.05)
-    found, expected = algorithm.begin(), algorithm.begin()
+    found, expected = algorithm.init(), algorithm.init()
     adapt, clipped, unknown = jax.jit(algorithm.adapt), 0, 0
     for share in (0.0, 0.2, 0.5, 0.0, 0.5, 0.9, 1.0):
         returns, seen = random_returns(k, rng, share)

@@ -17,9 +17,16 @@ import numpy as np
 import pytest
 
 from generation.env import Environment
+from generation.learners.config import PPOConfig, Widths
 from generation.learners.ego import Learner, LearnerState
-from generation.learners.network import Widths
-from generation.learners.ppo import PPO, Batch, PPOConfig, Sequences, generalised_advantage, sequences
+from generation.learners.ppo import (
+    PPO,
+    Batch,
+    Sequences,
+    generalised_advantage,
+    make_optimizer,
+    sequences,
+)
 from generation.learners.rollout import Choice, Rollout, policy_player, roll_out
 from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
@@ -141,15 +148,15 @@ def egos(rollout: Rollout) -> Choice:
 
 def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
     """What the roll-out from this state is to the ego's learning."""
-    places, hidden = np.arange(CONFIG.environments), state.seats.memories[EGO]
-    return sequences(rollout, EGO, places, hidden, jnp.zeros(places.size), jnp.float32(0))
+    slots, hidden = np.arange(CONFIG.environments), state.carry.memories[EGO]
+    return sequences(rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(0))
 
 
 # Advantages.
 
 
 def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -> np.ndarray:
-    """GAE by a loop over tables and steps."""
+    """GAE by a loop over envs and steps."""
     out = np.zeros(reward.shape)
     for n in range(reward.shape[1]):
         trace, following = 0.0, last_value[n]
@@ -207,7 +214,7 @@ def test_the_loss_replays_the_rollout_across_an_episode_end(learner, played):
     state, rollout = played.before[1], played.rollouts[1]
     np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)
     np.testing.assert_array_equal(rollout.done.nonzero()[0], [3] * 4)
-    assert np.abs(state.seats.memories[EGO]).min() > 0
+    assert np.abs(state.carry.memories[EGO]).min() > 0
     log_prob, value = replay(learner, state, rollout, rollout.reset)
     np.testing.assert_allclose(log_prob, egos(rollout).log_prob, rtol=0, atol=1e-4)
     np.testing.assert_allclose(value, egos(rollout).value, rtol=0, atol=1e-4)
@@ -222,7 +229,7 @@ def test_loss_against_plain_numpy(learner, played):
     rollout = played.rollouts[1]
     rng = np.random.default_rng(6)
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.1, played.before[1].params)
-    hidden = played.before[1].seats.memories[EGO]
+    hidden = played.before[1].carry.memories[EGO]
     advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
     batch = jax.tree.map(jnp.asarray, Batch(egos_sequences(played.before[1], rollout), advantage, target))
     total, parts = compiled(learner.ppo.loss)(params, batch)
@@ -271,7 +278,7 @@ def test_update_is_a_pure_function(update, played):
     assert same_bytes(once, again)
     other_state, other_rollout, _ = update(state._replace(key=jax.random.key(77)))
     assert not np.array_equal(other_rollout.actions[..., EGO], once[1].actions[..., EGO])
-    assert not same_bytes(other_state.seats.memories[EGO], once[0].seats.memories[EGO])
+    assert not same_bytes(other_state.carry.memories[EGO], once[0].carry.memories[EGO])
 
 
 def test_learning_is_a_pure_function_too(update, learning, trained):
@@ -354,7 +361,7 @@ def expected_teammate_actions(learner: Learner, state: LearnerState, whole: Roll
     seen = np.asarray(observe(CLOSET, whole.record, TEAMMATE)).sum(axis=(2, 3, 4))
     out = np.zeros_like(seen)
     for episode in np.unique(step // EPISODE):
-        keys = learner.env.episode_key(state.seats.env._replace(episode=jnp.full(4, episode)))
+        keys = learner.env.episode_key(state.carry.env._replace(episode=jnp.full(4, episode)))
         own = jax.vmap(jax.random.fold_in)(keys, jnp.full(4, TEAMMATE))
         rows = step // EPISODE == episode
         offset = np.asarray(jax.random.key_data(own))[:, 1] % 4
@@ -375,8 +382,8 @@ def test_a_teammate_that_sees_the_state_is_given_the_record(learner, played):
     state, rollout = played.before[2], played.rollouts[2]
     mate = policy_player(learner.env, Policy({}, begin, reads, "state"), {}, TEAMMATE, CONFIG.environments)
     players = learner.players(state.params, {})[EGO], mate
-    turn = compiled(lambda seats, key: roll_out(learner.env, players, seats, 1, key))
-    _, turned = turn(state.seats, jax.random.key(0))
+    turn = compiled(lambda carry, key: roll_out(learner.env, players, carry, 1, key))
+    _, turned = turn(state.carry, jax.random.key(0))
     np.testing.assert_array_equal(turned.record[0], rollout.record[0])
     np.testing.assert_array_equal(turned.actions[0, :, TEAMMATE], rollout.record[0].sum(axis=-1, dtype=np.int32) % 4)
     np.testing.assert_array_equal(turned.actions[0, :, EGO], egos(turned).action[0])
@@ -406,10 +413,10 @@ def test_learning_rate_schedule():
     gradient = jnp.float32(1e-3)
 
     def one(state, _):
-        change, state = CONFIG.optimizer.update(gradient, state)
+        change, state = make_optimizer(CONFIG).update(gradient, state)
         return state, change
 
-    changes = jax.lax.scan(one, CONFIG.optimizer.init(gradient), length=steps + 1)[1]
+    changes = jax.lax.scan(one, make_optimizer(CONFIG).init(gradient), length=steps + 1)[1]
     rates = -np.asarray(changes, np.float64) * (1e-3 + 1e-5) / 1e-3
     t = np.arange(steps + 1)
     expected = np.where(t < warm, t / warm, 0.5 * (1 + np.cos(np.pi * (t - warm) / (steps - warm))))
@@ -427,9 +434,9 @@ def test_gradients_are_clipped_by_their_global_norm():
     directions = {"a": jnp.float32(0.6), "b": jnp.float32(-0.8)}
 
     def second(first: float) -> list[float]:
-        state = CONFIG.optimizer.init(directions)
+        state = make_optimizer(CONFIG).init(directions)
         for size in (first, bound):
-            change, state = CONFIG.optimizer.update(jax.tree.map(lambda x, s=size: x * s, directions), state)
+            change, state = make_optimizer(CONFIG).update(jax.tree.map(lambda x, s=size: x * s, directions), state)
         return [float(x) for x in jax.tree.leaves(change)]
 
     np.testing.assert_allclose(second(100.0), second(bound), rtol=1e-5)
@@ -484,4 +491,4 @@ def test_the_ego_learns_not_to_press(trained):
 def test_training_moves_the_state_on(trained, untrained):
     assert int(trained.after.update) == CONFIG.updates == 150
     assert same_bytes(trained.after.key, untrained.key)
-    np.testing.assert_array_equal(trained.after.seats.env.episode, 100)
+    np.testing.assert_array_equal(trained.after.carry.env.episode, 100)

@@ -1,6 +1,6 @@
-"""The roll-out: places, seats, what each actor sees, memories that restart with the episodes, the restart hook.
+"""The roll-out: slots, carry, what each actor sees, memories that restart with the episodes, the restart hook.
 
-Four tables of five-step episodes; two scripted players share the eight places in no order, and each remembers the
+Four envs of five-step episodes; two scripted players share the eight slots in no order, and each remembers the
 record that its episode began with and the steps since.
 """
 
@@ -14,18 +14,19 @@ import numpy as np
 import pytest
 
 from generation.env import Environment, EnvState
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from generation.learners.rollout import (
     Choice,
     Player,
     Rollout,
-    Seats,
+    RolloutCarry,
     init_rollout,
     network_player,
     policy_player,
     random_player,
     roll_out,
-    seen_from,
+    slot_records,
 )
 from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
@@ -35,52 +36,52 @@ from tests.helpers.jit import compiled
 from tests.helpers.scenes import random_records
 
 LAYOUT = get_layout("cramped_up")
-TABLES, EPISODE, STEPS = 4, 5, 8
+ENVS, EPISODE, STEPS = 4, 5, 8
 ENV = Environment(LAYOUT, max_steps=EPISODE)
-PLACES = np.array([5, 0, 3, 6]), np.array([2, 7, 4, 1])
-"""Of the two scripted players. The second table seats the second player twice, the third and fourth one of each."""
+SLOTS = np.array([5, 0, 3, 6]), np.array([2, 7, 4, 1])
+"""Of the two scripted players. The second env carry the second player twice, the third and fourth one of each."""
 
 NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8), partners=3)
 
 
 class Notes(NamedTuple):
-    """What a scripted player remembers at each of its places."""
+    """What a scripted player remembers at each of its slots."""
 
     begun: jax.Array  # (M, S), the record that it began with
     steps: jax.Array  # (M,)
 
 
-def scripted(places: np.ndarray) -> Player:
-    """Acts by its place, the steps of the episode and the record that it began with."""
+def scripted(slots: np.ndarray) -> Player:
+    """Acts by its slot, the steps of the episode and the record that it began with."""
 
     def begin(state: EnvState) -> Notes:
-        return Notes(state.record[places % TABLES], jnp.zeros(places.size, jnp.int32))
+        return Notes(state.record[slots % ENVS], jnp.zeros(slots.size, jnp.int32))
 
     def act(memory: Notes, state: EnvState, key):
-        action = (places + 2 * memory.steps + memory.begun.sum(axis=1, dtype=jnp.int32)) % len(ACTIONS)
+        action = (slots + 2 * memory.steps + memory.begun.sum(axis=1, dtype=jnp.int32)) % len(ACTIONS)
         value = memory.steps.astype(jnp.float32)
-        return Choice(jnp.asarray(action), jnp.full(places.size, -1.0), value), memory._replace(steps=memory.steps + 1)
+        return Choice(jnp.asarray(action), jnp.full(slots.size, -1.0), value), memory._replace(steps=memory.steps + 1)
 
-    return Player(places, begin, act)
+    return Player(slots, begin, act)
 
 
 def expected_actions(record: np.ndarray) -> np.ndarray:
     """What scripted players do, int (T, N, 2), from the records of a roll-out that starts with the episodes."""
-    place = np.arange(2 * TABLES).reshape(2, TABLES).T
+    slot = np.arange(2 * ENVS).reshape(2, ENVS).T
     step = np.arange(len(record))
     begun = record[step - step % EPISODE].sum(axis=-1, dtype=np.int64)
-    return (place + 2 * (step % EPISODE)[:, None, None] + begun[..., None]) % len(ACTIONS)
+    return (slot + 2 * (step % EPISODE)[:, None, None] + begun[..., None]) % len(ACTIONS)
 
 
 def marked(state: EnvState, done: jax.Array) -> EnvState:
-    """A restart hook: where an episode starts, the agents change places."""
+    """A restart hook: where an episode starts, the agents change slots."""
     first = state.record.at[:, :2].set(state.record[:, 1::-1])
     return state._replace(record=jnp.where(done[:, None], first, state.record))
 
 
 class Played(NamedTuple):
-    start: Seats
-    seats: Seats  # after the last step
+    start: RolloutCarry
+    carry: RolloutCarry  # after the last step
     rollout: Rollout  # of both halves
 
 
@@ -90,22 +91,22 @@ def play(players: list[Player], restart: Any = None) -> Played:
 
     def run(start):
         middle, one = roll_out(ENV, players, start, STEPS, jax.random.key(1), *more)
-        seats, other = roll_out(ENV, players, middle, STEPS, jax.random.key(2), *more)
-        return seats, jax.tree.map(lambda *parts: jnp.concatenate(parts), one, other)
+        carry, other = roll_out(ENV, players, middle, STEPS, jax.random.key(2), *more)
+        return carry, jax.tree.map(lambda *parts: jnp.concatenate(parts), one, other)
 
-    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), TABLES))
-    seats, rollout = compiled(run)(start)
-    return Played(start, seats, jax.tree.map(np.asarray, rollout))
+    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
+    carry, rollout = compiled(run)(start)
+    return Played(start, carry, jax.tree.map(np.asarray, rollout))
 
 
 @pytest.fixture(scope="module")
 def played() -> Played:
-    return play([scripted(places) for places in PLACES])
+    return play([scripted(slots) for slots in SLOTS])
 
 
 @pytest.fixture(scope="module")
 def restarted() -> Played:
-    return play([scripted(places) for places in PLACES], marked)
+    return play([scripted(slots) for slots in SLOTS], marked)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +122,7 @@ def params() -> Any:
 
 @pytest.fixture(scope="module")
 def apply():
-    """One step of the network at M places."""
+    """One step of the network at M slots."""
 
     def apply(params, hidden, obs, partner):
         outputs: Any = NETWORK.apply(params, hidden, obs[None], jnp.zeros((1, obs.shape[0]), bool), partner)
@@ -145,9 +146,9 @@ def one(params: Any, policy: int) -> Any:
 
 def test_actions_reach_the_seats_of_their_places(played):
     np.testing.assert_array_equal(played.rollout.actions, expected_actions(played.rollout.record))
-    for choice, places in zip(played.rollout.choices, PLACES, strict=True):
-        seat, table = np.divmod(places, TABLES)
-        np.testing.assert_array_equal(choice.action, played.rollout.actions[:, table, seat])
+    for choice, slots in zip(played.rollout.choices, SLOTS, strict=True):
+        agent, env = np.divmod(slots, ENVS)
+        np.testing.assert_array_equal(choice.action, played.rollout.actions[:, env, agent])
 
 
 def test_the_game_is_played_with_these_actions(played):
@@ -161,29 +162,29 @@ def test_the_game_is_played_with_these_actions(played):
         np.testing.assert_array_equal(played.rollout.shaped[t], outcome.shaped)
         np.testing.assert_array_equal(played.rollout.done[t], outcome.done)
         state = outcome.state
-    np.testing.assert_array_equal(played.seats.env.record, state.record)
+    np.testing.assert_array_equal(played.carry.env.record, state.record)
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_seat_1_sees_what_the_teammate_observes(batch):
-    places = np.array([7, 0, 3, 4, 5, 4])
+    slots = np.array([7, 0, 3, 4, 5, 4])
     rng = np.random.default_rng(8)
-    record = random_records(LAYOUT, 12, rng).reshape(3, TABLES, -1)[(0,) if batch == () else slice(None)]
-    own = observe(LAYOUT, np.asarray(seen_from(jnp.asarray(record), places)), EGO)
+    record = random_records(LAYOUT, 12, rng).reshape(3, ENVS, -1)[(0,) if batch == () else slice(None)]
+    own = observe(LAYOUT, np.asarray(slot_records(jnp.asarray(record), slots)), EGO)
     assert own.shape[:-3] == (*batch, 6)
     differ = 0
-    for m, place in enumerate(places):
-        at_table = record[..., place % TABLES, :]
-        agent = TEAMMATE if place >= TABLES else EGO
+    for m, slot in enumerate(slots):
+        at_table = record[..., slot % ENVS, :]
+        agent = TEAMMATE if slot >= ENVS else EGO
         np.testing.assert_array_equal(own[..., m, :, :, :], observe(LAYOUT, at_table, agent))
         differ += np.any(own[..., m, :, :, :] != observe(LAYOUT, at_table, 1 - agent))
-    assert differ == len(places)
+    assert differ == len(slots)
 
 
 def test_places_of_seat_0_in_order_are_the_records_themselves():
-    record = jnp.asarray(random_records(LAYOUT, TABLES, np.random.default_rng(1)))
-    assert seen_from(record, np.arange(TABLES)) is record
-    np.testing.assert_array_equal(seen_from(record, np.array([2, 0])), record[jnp.array([2, 0])])
+    record = jnp.asarray(random_records(LAYOUT, ENVS, np.random.default_rng(1)))
+    assert slot_records(record, np.arange(ENVS)) is record
+    np.testing.assert_array_equal(slot_records(record, np.array([2, 0])), record[jnp.array([2, 0])])
 
 
 # Episodes.
@@ -194,28 +195,28 @@ def test_memories_restart_with_each_episode(played):
     clock = np.arange(2 * STEPS) % EPISODE
     for choice in played.rollout.choices:
         np.testing.assert_array_equal(choice.value, np.broadcast_to(clock[:, None], choice.value.shape))
-    for notes, places in zip(played.seats.memories, PLACES, strict=True):
-        np.testing.assert_array_equal(notes.begun, played.rollout.record[15][places % TABLES])
+    for notes, slots in zip(played.carry.memories, SLOTS, strict=True):
+        np.testing.assert_array_equal(notes.begun, played.rollout.record[15][slots % ENVS])
         np.testing.assert_array_equal(notes.steps, 1)
 
 
 def test_only_the_players_at_a_table_that_ended_begin_anew():
-    """A table whose episode is two steps older than the others'."""
-    players = [scripted(places) for places in PLACES]
-    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), TABLES))
+    """A env whose episode is two steps older than the others'."""
+    players = [scripted(slots) for slots in SLOTS]
+    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
     start = start._replace(env=start.env._replace(clock=jnp.array([0, 0, 2, 0])))
-    run = compiled(lambda seats: roll_out(ENV, players, seats, 4, jax.random.key(1)))
-    seats, rollout = run(start)
+    run = compiled(lambda carry: roll_out(ENV, players, carry, 4, jax.random.key(1)))
+    carry, rollout = run(start)
     np.testing.assert_array_equal(rollout.done, np.array([[0, 0, n == 2, 0] for n in range(4)], bool))
-    for notes, places in zip(seats.memories, PLACES, strict=True):
-        np.testing.assert_array_equal(notes.steps, np.where(places % TABLES == 2, 1, 4))
+    for notes, slots in zip(carry.memories, SLOTS, strict=True):
+        np.testing.assert_array_equal(notes.steps, np.where(slots % ENVS == 2, 1, 4))
 
 
 def test_reset_follows_done_across_roll_outs(played):
     step = np.arange(2 * STEPS)[:, None]
-    np.testing.assert_array_equal(played.rollout.reset, np.broadcast_to(step % EPISODE == 0, (2 * STEPS, TABLES)))
-    np.testing.assert_array_equal(played.rollout.done, np.broadcast_to(step % EPISODE == 4, (2 * STEPS, TABLES)))
-    np.testing.assert_array_equal(played.seats.ended, False)
+    np.testing.assert_array_equal(played.rollout.reset, np.broadcast_to(step % EPISODE == 0, (2 * STEPS, ENVS)))
+    np.testing.assert_array_equal(played.rollout.done, np.broadcast_to(step % EPISODE == 4, (2 * STEPS, ENVS)))
+    np.testing.assert_array_equal(played.carry.ended, False)
 
 
 def test_returns_are_sums_over_the_episode_across_roll_outs(played):
@@ -225,8 +226,8 @@ def test_returns_are_sums_over_the_episode_across_roll_outs(played):
         def step(self, state, actions):
             return super().step(state, actions)._replace(reward=(actions.sum(axis=1) + state.clock).astype(jnp.float32))
 
-    env, players = Paying(LAYOUT, EPISODE), [scripted(places) for places in PLACES]
-    run = compiled(lambda seats, key: roll_out(env, players, seats, STEPS, key))
+    env, players = Paying(LAYOUT, EPISODE), [scripted(slots) for slots in SLOTS]
+    run = compiled(lambda carry, key: roll_out(env, players, carry, STEPS, key))
     middle, first = run(played.start, jax.random.key(1))
     after, second = run(middle, jax.random.key(2))
     reward, returns = (
@@ -249,8 +250,8 @@ def test_the_restart_hook_changes_first_states_and_no_others(played, restarted):
 
 def test_players_begin_with_the_restarted_state(restarted):
     np.testing.assert_array_equal(restarted.rollout.actions, expected_actions(restarted.rollout.record))
-    for notes, places in zip(restarted.seats.memories, PLACES, strict=True):
-        np.testing.assert_array_equal(notes.begun, restarted.rollout.record[15][places % TABLES])
+    for notes, slots in zip(restarted.carry.memories, SLOTS, strict=True):
+        np.testing.assert_array_equal(notes.begun, restarted.rollout.record[15][slots % ENVS])
 
 
 # Policies of the network.
@@ -258,18 +259,18 @@ def test_players_begin_with_the_restarted_state(restarted):
 
 @pytest.mark.parametrize("greedy", [True, False])
 def test_a_network_player_does_what_its_network_says(params, apply, greedy):
-    """In both seats, with a memory: log-probabilities, values, greedy actions and the next hidden state."""
-    places, partner = np.array([6, 1, 3, 4]), jnp.array([2, 0, 1, 1])
+    """In both carry, with a memory: log-probabilities, values, greedy actions and the next hidden state."""
+    slots, partner = np.array([6, 1, 3, 4]), jnp.array([2, 0, 1, 1])
     own = one(params, 1)
-    player = network_player(ENV, NETWORK, own, places, partner, greedy)
-    record = random_records(LAYOUT, TABLES, np.random.default_rng(3))
+    player = network_player(ENV, NETWORK, own, slots, partner, greedy)
+    record = random_records(LAYOUT, ENVS, np.random.default_rng(3))
     state = in_state(record)
     hidden = jnp.asarray(np.random.default_rng(5).normal(size=(4, 8)), jnp.float32)
-    np.testing.assert_array_equal(player.begin(state), np.zeros((4, 8)))
+    np.testing.assert_array_equal(player.init(state), np.zeros((4, 8)))
     choice, after = compiled(player.act)(hidden, state, jax.random.key(6))
 
     both = np.stack([observe(LAYOUT, record, agent) for agent in (EGO, TEAMMATE)])
-    expected, logits, value = apply(own, hidden, both[places // TABLES, places % TABLES], partner)
+    expected, logits, value = apply(own, hidden, both[slots // ENVS, slots % ENVS], partner)
     logits = np.asarray(logits, np.float64)
     log_probs = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
     if greedy:
@@ -280,33 +281,33 @@ def test_a_network_player_does_what_its_network_says(params, apply, greedy):
 
 
 def test_sampled_actions_follow_the_networks_distribution(params):
-    """4,000 tables in one state: shares within five standard deviations."""
-    tables, own = 4000, one(params, 0)
+    """4,000 envs in one state: shares within five standard deviations."""
+    envs, own = 4000, one(params, 0)
     record = random_records(LAYOUT, 1, np.random.default_rng(3))
-    state = in_state(np.repeat(record, tables, axis=0))
-    player = network_player(ENV, NETWORK, own, np.arange(tables), jnp.zeros(tables, int))
-    choice, _ = compiled(player.act)(player.begin(state), state, jax.random.key(3))
+    state = in_state(np.repeat(record, envs, axis=0))
+    player = network_player(ENV, NETWORK, own, np.arange(envs), jnp.zeros(envs, int))
+    choice, _ = compiled(player.act)(player.init(state), state, jax.random.key(3))
     action, log_prob = np.asarray(choice.action), np.asarray(choice.log_prob)
-    shares = np.bincount(action, minlength=6) / tables
+    shares = np.bincount(action, minlength=6) / envs
     seen = shares > 0
     assert seen.sum() > 1
     for number in seen.nonzero()[0]:
         probability = np.exp(log_prob[action == number][0])
-        assert abs(shares[number] - probability) < 5 * (probability * (1 - probability) / tables) ** 0.5 + 1e-6
+        assert abs(shares[number] - probability) < 5 * (probability * (1 - probability) / envs) ** 0.5 + 1e-6
     np.testing.assert_array_less(shares[~seen], 0.01)
 
 
 def test_several_policies_in_one_player_act_as_each_alone(params):
-    places = np.array([[6, 1], [3, 4], [0, 7]])
+    slots = np.array([[6, 1], [3, 4], [0, 7]])
     partner = jnp.array([[2, 0], [1, 1], [0, 2]])
-    record = random_records(LAYOUT, TABLES, np.random.default_rng(3))
+    record = random_records(LAYOUT, ENVS, np.random.default_rng(3))
     state = in_state(record)
     hidden = jnp.asarray(np.random.default_rng(5).normal(size=(6, 8)), jnp.float32)
-    together = network_player(ENV, NETWORK, params, places, partner, greedy=True)
-    np.testing.assert_array_equal(together.places, places.ravel())
+    together = network_player(ENV, NETWORK, params, slots, partner, greedy=True)
+    np.testing.assert_array_equal(together.agent_slots, slots.ravel())
     choice, after = compiled(together.act)(hidden, state, jax.random.key(0))
     for policy in range(3):
-        alone = network_player(ENV, NETWORK, one(params, policy), places[policy], partner[policy], greedy=True)
+        alone = network_player(ENV, NETWORK, one(params, policy), slots[policy], partner[policy], greedy=True)
         part = slice(2 * policy, 2 * policy + 2)
         own, own_after = compiled(alone.act)(hidden[part], state, jax.random.key(0))
         np.testing.assert_array_equal(choice.action[part], own.action)
@@ -319,21 +320,21 @@ def test_several_policies_in_one_player_act_as_each_alone(params):
 
 
 def test_each_table_may_have_an_instance_of_its_own():
-    """One that acts by its parameters, and one that acts by its episode's key, which no other table shares."""
+    """One that acts by its parameters, and one that acts by its episode's key, which no other env shares."""
 
     def draws(params, key):
         return jax.random.key_data(key)[1] % 5
 
     policy = Policy({}, draws, lambda params, memory, view, key: ((params["action"] + memory) % 6, memory), "state")
-    own = policy_player(ENV, policy, {"action": jnp.arange(TABLES)}, TEAMMATE, TABLES, own_params=True)
-    common = policy_player(ENV, policy, {"action": jnp.int32(3)}, EGO, TABLES)
-    np.testing.assert_array_equal(own.places, np.arange(TABLES, 2 * TABLES))
-    np.testing.assert_array_equal(common.places, np.arange(TABLES))
-    state = in_state(random_records(LAYOUT, TABLES, np.random.default_rng(7)))
-    for player, action, seat in ((own, np.arange(TABLES), TEAMMATE), (common, 3, EGO)):
-        keys = jax.vmap(jax.random.fold_in)(ENV.episode_key(state), jnp.full(TABLES, seat))
+    own = policy_player(ENV, policy, {"action": jnp.arange(ENVS)}, TEAMMATE, ENVS, own_params=True)
+    common = policy_player(ENV, policy, {"action": jnp.int32(3)}, EGO, ENVS)
+    np.testing.assert_array_equal(own.agent_slots, np.arange(ENVS, 2 * ENVS))
+    np.testing.assert_array_equal(common.agent_slots, np.arange(ENVS))
+    state = in_state(random_records(LAYOUT, ENVS, np.random.default_rng(7)))
+    for player, action, agent in ((own, np.arange(ENVS), TEAMMATE), (common, 3, EGO)):
+        keys = jax.vmap(jax.random.fold_in)(ENV.episode_key(state), jnp.full(ENVS, agent))
         memory = np.asarray(jax.random.key_data(keys))[:, 1] % 5
-        choice, _ = player.act(player.begin(state), state, jax.random.key(0))
+        choice, _ = player.act(player.init(state), state, jax.random.key(0))
         np.testing.assert_array_equal(choice.action, (action + memory) % 6)
 
 
@@ -341,21 +342,21 @@ def test_a_policy_sees_its_own_seats_observation():
     policy = Policy(
         {}, lambda params, key: (), lambda params, memory, view, key: (view.sum(dtype=int), ()), "observation"
     )
-    record = random_records(LAYOUT, TABLES, np.random.default_rng(11))
+    record = random_records(LAYOUT, ENVS, np.random.default_rng(11))
     state = in_state(record)
     sums = []
-    for seat in (EGO, TEAMMATE):
-        player = policy_player(ENV, policy, {}, seat, TABLES)
+    for agent in (EGO, TEAMMATE):
+        player = policy_player(ENV, policy, {}, agent, ENVS)
         sums.append(np.asarray(player.act((), state, jax.random.key(0))[0].action))
-        np.testing.assert_array_equal(sums[-1], observe(LAYOUT, record, seat).sum(axis=(1, 2, 3)))
+        np.testing.assert_array_equal(sums[-1], observe(LAYOUT, record, agent).sum(axis=(1, 2, 3)))
     assert (sums[0] != sums[1]).any()
 
 
 def test_the_random_player_draws_every_action_equally_often():
-    tables = 6000
-    player = random_player(TEAMMATE, tables)
-    np.testing.assert_array_equal(player.places, np.arange(tables, 2 * tables))
-    state = in_state(random_records(LAYOUT, tables, np.random.default_rng(3)))
-    shares = np.bincount(player.act((), state, jax.random.key(2))[0].action, minlength=6) / tables
+    envs = 6000
+    player = random_player(TEAMMATE, envs)
+    np.testing.assert_array_equal(player.agent_slots, np.arange(envs, 2 * envs))
+    state = in_state(random_records(LAYOUT, envs, np.random.default_rng(3)))
+    shares = np.bincount(player.act((), state, jax.random.key(2))[0].action, minlength=6) / envs
     assert len(shares) == 6
-    np.testing.assert_allclose(shares, 1 / 6, rtol=0, atol=5 * (1 / 6 * 5 / 6 / tables) ** 0.5)
+    np.testing.assert_allclose(shares, 1 / 6, rtol=0, atol=5 * (1 / 6 * 5 / 6 / envs) ** 0.5)

@@ -18,13 +18,13 @@ from tests.helpers.tiny import LEARNED, artefact
 def measured(monkeypatch) -> None:
     """A machine that makes 100,000 steps/s of egos, 50,000 of populations, and compiles in 36 s."""
     speeds = {1024: 100_000.0, 64: 100_000.0, 256: 50_000.0}
-    monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.Speed(speeds[config.environments], 36.0))
+    monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.LearnerSpeed(speeds[config.environments], 36.0))
 
 
 def test_the_papers_numbers(measured):
     """8 layouts x 80 teammates; FCP has 10 members of 256 tables, BRDiv and LBRDiv too, CoMeDi ten in turn."""
     profile = load_profile("paper")
-    found = plan.cost(profile, devices=16)
+    found = plan.estimate_cost(profile, devices=16)
     steps = 228 * 262_144
     assert (found.tasks, found.environment_steps) == (640, 640 * steps)
     assert found.kept_transitions == 640 * 128 * 146 * 100
@@ -65,7 +65,7 @@ def test_calibration_measures_a_share_then_the_whole(built, monkeypatch):
 
     def measure(config):
         widths.append(config.environments)
-        return plan.Speed(50.0 if len(widths) == 1 else 70.0, 1.0), config.steps_per_update
+        return plan.LearnerSpeed(50.0 if len(widths) == 1 else 70.0, 1.0), config.steps_per_update
 
     def make(config) -> Any:
         return config
@@ -79,12 +79,12 @@ def test_calibration_measures_a_share_then_the_whole(built, monkeypatch):
     assert widths == [4]
 
 
-@pytest.mark.parametrize("make", [plan.task_learner, plan.population])
+@pytest.mark.parametrize("make", [plan.task_learner, plan.calibration_population])
 def test_measuring(tmp_path, make):
     path = tmp_path / "learned.toml"
     path.write_text(LEARNED)
     profile = load_profile(str(path))
     speed, steps = plan._measure(make(profile, profile.ego))
-    assert steps == (2 if make is plan.population else 1) * 8 * 80
+    assert steps == (2 if make is plan.calibration_population else 1) * 8 * 80
     assert speed.steps_per_second > 0
     assert speed.compile_seconds > 0

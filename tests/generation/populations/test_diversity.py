@@ -12,7 +12,7 @@ import pytest
 
 from generation.policy import Policy
 from generation.populations import diversity
-from generation.populations.diversity import actions_on_common_states, between_families, hamming
+from generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -78,12 +78,12 @@ def records(compiled_fast) -> jax.Array:
 
 def test_hamming_is_the_share_of_states_with_other_actions():
     actions = np.array([[0, 1, 2, 3], [0, 1, 2, 5], [5, 4, 3, 2]], np.int8)
-    np.testing.assert_array_equal(hamming(actions), [[0, 0.25, 1], [0.25, 0, 1], [1, 1, 0]])
+    np.testing.assert_array_equal(hamming_distances(actions), [[0, 0.25, 1], [0.25, 0, 1], [1, 1, 0]])
 
 
 def test_hamming_against_a_loop():
     actions = np.random.default_rng(0).integers(0, 6, (4, 50)).astype(np.int8)
-    found = hamming(actions)
+    found = hamming_distances(actions)
     for a in range(4):
         for b in range(4):
             assert found[a, b] == sum(x != y for x, y in zip(actions[a], actions[b], strict=True)) / 50
@@ -92,7 +92,7 @@ def test_hamming_against_a_loop():
 def test_families_are_as_far_as_their_policies_on_average():
     """Within a family a policy's distance to itself counts, as in the paper's formula."""
     distances = np.array([[0, 0.5, 1, 0.2], [0.5, 0, 0.6, 0.4], [1, 0.6, 0, 0.8], [0.2, 0.4, 0.8, 0]])
-    found = between_families(distances, {"A": [0, 2], "B": [1], "C": range(1, 4)})
+    found = family_distances(distances, {"A": [0, 2], "B": [1], "C": range(1, 4)})
     expected = [
         [(0 + 1 + 1 + 0) / 4, (0.5 + 0.6) / 2, (0.5 + 1 + 0.2 + 0.6 + 0 + 0.8) / 6],
         [(0.5 + 0.6) / 2, 0, (0 + 0.6 + 0.4) / 3],
@@ -112,7 +112,7 @@ def test_every_policy_answers_on_the_episodes_of_all(actions):
 
 def test_identical_policies_have_distance_0_and_others_do_not(actions):
     """Also where their functions are not the same objects."""
-    distances = hamming(actions)
+    distances = hamming_distances(actions)
     assert distances[0, 2] == distances[0, 4] == 0
     assert distances[0, 3] == 1  # always one action further
     assert 0 < distances[0, 1] < 1
@@ -142,4 +142,4 @@ def test_on_the_same_states_the_order_of_policies_does_not_matter(records, monke
     plain = actions_on_common_states(LAYOUT, POLICIES, steps=STEPS)
     other = actions_on_common_states(LAYOUT, [POLICIES[k] for k in order], steps=STEPS)
     np.testing.assert_array_equal(other, plain[order])
-    np.testing.assert_array_equal(hamming(other), hamming(plain)[np.ix_(order, order)])
+    np.testing.assert_array_equal(hamming_distances(other), hamming_distances(plain)[np.ix_(order, order)])

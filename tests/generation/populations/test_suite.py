@@ -20,17 +20,30 @@ import numpy as np
 import pytest
 
 from generation.env import Environment
-from generation.learners.checkpoint import CARD, WEIGHTS, load_policy, save_policy
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from generation.learners.resume import BusyError, run_lock
 from generation.learners.rollout import init_rollout, network_player, policy_player, random_player, roll_out
 from generation.policy import stacked
 from generation.populations import cross_play
-from generation.populations import train as suite
-from generation.populations.select import Selection, layout_number, make_tasks, select, write_manifests
-from generation.populations.train import Checkpoint, Run, checkpoints, is_finished, play_matrix, train
+from generation.populations.select import (
+    TeammateSelection,
+    layout_number,
+    make_tasks,
+    select_teammates,
+    write_manifests,
+)
+from generation.populations.train import (
+    PopulationRun,
+    SuiteCheckpoint,
+    is_population_finished,
+    play_matrix,
+    suite_checkpoints,
+    train_population,
+)
 from generation.profiles import load_profile
-from generation.releases.check import compare
+from generation.releases.check import compare_rebuilds
 from generation.teammates import learned
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.benchmark.tasks import read_tasks, write_tasks
@@ -43,6 +56,8 @@ from tests.helpers.paths import ROOT
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 LAYOUT = get_layout("cramped_up")
+SEED = 7
+"""Seed of the moment at which a run is killed."""
 SMOKE = load_profile("smoke").teammates
 CONFIG, WIDTHS = SMOKE.ppo, SMOKE.ppo.widths
 
@@ -56,8 +71,7 @@ def report(update, updates, metrics):
     print(update, flush=True)
     time.sleep(0.02)
 
-suite._SAVE_SECONDS = 0.0
-suite.train(test_suite.run_of(sys.argv[1]), Path(sys.argv[2]), report)
+suite.train_population(test_suite.run_of(sys.argv[1]), Path(sys.argv[2]), report, save_seconds=0.0)
 """
 
 TWO_DEVICES = """
@@ -78,8 +92,8 @@ np.savez(sys.argv[1], **flatten_dict(jax.tree.map(np.asarray, state.params), sep
 """
 
 
-def run_of(algorithm: str) -> Run:
-    return Run(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
+def run_of(algorithm: str) -> PopulationRun:
+    return PopulationRun(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +101,7 @@ def trained(tmp_path_factory, compiled_quickly) -> Path:
     """A suite of all four algorithms on cramped_up. Read only."""
     root = tmp_path_factory.mktemp("trained")
     for algorithm in ALGORITHMS:
-        train(run_of(algorithm), root / LAYOUT.name / algorithm)
+        train_population(run_of(algorithm), root / LAYOUT.name / algorithm)
     return root
 
 
@@ -97,7 +111,7 @@ def population(root: Path, algorithm: str) -> Path:
 
 def weights(folder: Path) -> dict[str, str]:
     """The hash of every policy of a population."""
-    return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(WEIGHTS))}
+    return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
 
 
 def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[str]:
@@ -118,20 +132,20 @@ def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[st
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
-    found = list(checkpoints(trained, LAYOUT.name, algorithm))
+    found = list(suite_checkpoints(trained, LAYOUT.name, algorithm))
     names = [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(2) for c in range(5)]
     assert [point.path for point in found] == names
     folder = population(trained, algorithm)
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
     assert len(set(weights(folder).values())) == 10 + len(responses), "all differ"
-    assert is_finished(folder, run_of(algorithm))
+    assert is_population_finished(folder, run_of(algorithm))
     assert not list(folder.glob("resume*"))
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_cards_say_what_a_checkpoint_is(trained, algorithm):
-    for number, point in enumerate(checkpoints(trained, LAYOUT.name, algorithm)):
+    for number, point in enumerate(suite_checkpoints(trained, LAYOUT.name, algorithm)):
         member, checkpoint = divmod(number, 5)
         card = point.card
         assert (card["algorithm"], card["layout"], card["seed"]) == (algorithm, "cramped_up", 0)
@@ -139,7 +153,7 @@ def test_cards_say_what_a_checkpoint_is(trained, algorithm):
         assert card["step"] == 2048 * (checkpoint + 2)
         assert card["seats"] == ([1] if algorithm in ("brdiv", "lbrdiv") else [0, 1])
         assert card["shapes"]["params/actor/kernel"] == [16, 6]
-        assert Widths.from_table(card["widths"]) == WIDTHS
+        assert Widths.from_json(card["widths"]) == WIDTHS
         assert isinstance(card["return"], float)
         assert isinstance(card["teammate_return"], float)
         assert card["code_version"]
@@ -152,7 +166,7 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
         loaded = [load_policy(folder / f"m{m}" / f"c{checkpoint}") for m in range(2)]
         members = stacked([params for _, params, _ in loaded])
         for name, greedy in (("return", False), ("teammate_return", True)):
-            returns = cross_play.together(LAYOUT, loaded[0][0], members, members, greedy=greedy)
+            returns = cross_play.paired_returns(LAYOUT, loaded[0][0], members, members, greedy=greedy)
             assert [card[name] for _, _, card in loaded] == returns.tolist()
 
 
@@ -184,7 +198,7 @@ def test_as_a_teammate_seat_1_alone_is_greedy(trained, monkeypatch):
 
     monkeypatch.setattr(cross_play, "network_player", player)
     for greedy in (False, True):
-        cross_play.together(LAYOUT, network, stacked([params]), stacked([params]), episodes=2, greedy=greedy)
+        cross_play.paired_returns(LAYOUT, network, stacked([params]), stacked([params]), episodes=2, greedy=greedy)
     assert made == [(False, False), (True, False), (False, False), (True, True)]
 
 
@@ -194,7 +208,7 @@ def test_the_play_matrix_seats_best_responses_opposite_members(trained):
     members, responses = (
         stacked([load_policy(folder / where.format(m))[1] for m in range(2)]) for where in ("m{}/c4", "responses/m{}")
     )
-    expected = cross_play.matrix(LAYOUT, network, responses, members)
+    expected = cross_play.cross_play_returns(LAYOUT, network, responses, members)
     assert expected.shape == (2, 2)
     assert len(np.unique(expected)) > 1
     np.testing.assert_array_equal(play_matrix(trained, LAYOUT, "brdiv"), expected)
@@ -203,7 +217,7 @@ def test_the_play_matrix_seats_best_responses_opposite_members(trained):
 def test_every_result_plays_as_a_teammate_in_both_seats(trained):
     env, tables = Environment(LAYOUT), 3
     for seat in (EGO, TEAMMATE):
-        first = learned.build(LAYOUT, population(trained, "fcp") / "m0/c0")
+        first = learned.build_learned(LAYOUT, population(trained, "fcp") / "m0/c0")
 
         def play(params, seat=seat, policy=first):
             players = [policy_player(env, policy, params, seat, tables), random_player(1 - seat, tables)]
@@ -212,8 +226,8 @@ def test_every_result_plays_as_a_teammate_in_both_seats(trained):
 
         play, seen = jax.jit(play), set()
         for algorithm in ALGORITHMS:
-            for point in checkpoints(trained, LAYOUT.name, algorithm):
-                policy = learned.build(LAYOUT, trained / point.path)
+            for point in suite_checkpoints(trained, LAYOUT.name, algorithm):
+                policy = learned.build_learned(LAYOUT, trained / point.path)
                 assert policy.act is first.act
                 seen.add(np.asarray(play(policy.params)).tobytes())
         assert len(seen) > 4, "policies act differently"
@@ -222,10 +236,11 @@ def test_every_result_plays_as_a_teammate_in_both_seats(trained):
 # Runs that stop and go on.
 
 
-def test_a_killed_run_goes_on_to_the_same_policies(trained, tmp_path):
+@pytest.mark.slow
+def test_a_killed_run_resumes_to_the_same_policies(trained, tmp_path):
     """Killed at a random moment; CoMeDi trains its members one after the other."""
     folder = tmp_path / "comedi"
-    moment = int(np.random.default_rng().integers(1, 12))
+    moment = int(np.random.default_rng(SEED).integers(1, 12))
     process = child(CHILD, "comedi", str(folder))
     assert process.stdout is not None
     for line in process.stdout:
@@ -234,13 +249,13 @@ def test_a_killed_run_goes_on_to_the_same_policies(trained, tmp_path):
             break
     process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL, f"killed after update {moment}"
-    assert not is_finished(folder, run_of("comedi"))
+    assert not is_population_finished(folder, run_of("comedi"))
     done: list[int] = []
-    train(run_of("comedi"), folder, lambda update, updates, metrics: done.append(update))
+    train_population(run_of("comedi"), folder, lambda update, updates, metrics: done.append(update))
     assert done[-1] == 12
     assert moment == 1 or len(done) < 12, f"killed after update {moment}, but began at {done[0]}"
     assert weights(folder) == weights(population(trained, "comedi")), f"killed after update {moment}"
-    assert is_finished(folder, run_of("comedi"))
+    assert is_population_finished(folder, run_of("comedi"))
 
 
 class Stopped(Exception):
@@ -255,9 +270,8 @@ def stopped(tmp_path, monkeypatch) -> Path:
         if update == updates:
             raise Stopped
 
-    monkeypatch.setattr(suite, "_SAVE_SECONDS", 0.0)
     with pytest.raises(Stopped):
-        train(run_of("lbrdiv"), tmp_path / "lbrdiv", stop)
+        train_population(run_of("lbrdiv"), tmp_path / "lbrdiv", stop, save_seconds=0.0)
     return tmp_path / "lbrdiv"
 
 
@@ -267,33 +281,33 @@ def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(
         OptionError,
         match=r"lbrdiv.resume\.safetensors: saved by a training of other settings: seed was 0, now it is 1",
     ):
-        train(replace(run_of("lbrdiv"), seed=1), stopped)
+        train_population(replace(run_of("lbrdiv"), seed=1), stopped)
     assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
 
     done: list[int] = []
-    train(run_of("lbrdiv"), stopped, lambda update, updates, metrics: done.append(update))
+    train_population(run_of("lbrdiv"), stopped, lambda update, updates, metrics: done.append(update))
     assert done == [6]
     whole = population(trained, "lbrdiv")
     assert weights(stopped) == weights(whole)
-    assert not compare(stopped, whole).differences
+    assert not compare_rebuilds(stopped, whole).differences
 
 
 def test_a_run_beside_another_in_the_same_folder_is_refused(tmp_path):
     with run_lock(tmp_path / "fcp"), pytest.raises(BusyError, match="another process works in"):
-        train(run_of("fcp"), tmp_path / "fcp")
+        train_population(run_of("fcp"), tmp_path / "fcp")
 
 
-@pytest.mark.parametrize("name", [f"m0/c0/{WEIGHTS}", f"m1/c4/{CARD}", f"responses/m1/{WEIGHTS}"])
+@pytest.mark.parametrize("name", [f"m0/c0/{POLICY_WEIGHTS}", f"m1/c4/{POLICY_CARD}", f"responses/m1/{POLICY_WEIGHTS}"])
 def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained, tmp_path, name):
     folder, run = tmp_path / "brdiv", run_of("brdiv")
     shutil.copytree(population(trained, "brdiv"), folder)
-    assert is_finished(folder, run)
+    assert is_population_finished(folder, run)
     content = bytearray((folder / name).read_bytes())
     content[len(content) // 2] ^= 1
     (folder / name).write_bytes(content)
-    assert not is_finished(folder, run)
+    assert not is_population_finished(folder, run)
     (folder / name).unlink()
-    assert not is_finished(folder, run)
+    assert not is_population_finished(folder, run)
 
 
 def test_a_population_of_other_settings_is_not_finished(trained):
@@ -305,20 +319,21 @@ def test_a_population_of_other_settings_is_not_finished(trained):
         replace(run, config=replace(CONFIG, entropy=0.02)),
         run_of("brdiv"),
     ]
-    assert [is_finished(folder, other) for other in (run, *others)] == [True] + [False] * len(others)
+    assert [is_population_finished(folder, other) for other in (run, *others)] == [True] + [False] * len(others)
 
 
 def test_an_unknown_algorithm_is_refused():
     with pytest.raises(UnknownNameError, match=r"unknown algorithm 'fpc'.*Did you mean 'fcp'"):
-        Run(LAYOUT, "fpc", 2, CONFIG, 0)
+        PopulationRun(LAYOUT, "fpc", 2, CONFIG, 0)
 
 
 def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
     with pytest.raises(OptionError, match=r"fcp: no finished population; run .*--layout cramped_up"):
-        list(checkpoints(tmp_path, "cramped_up", "fcp"))
+        list(suite_checkpoints(tmp_path, "cramped_up", "fcp"))
 
 
-def test_a_population_learns_the_same_shared_out_over_two_devices(tmp_path):
+@pytest.mark.slow
+def test_a_population_learns_the_same_on_two_devices(tmp_path):
     """To rounding: half of the policies on each device, one update."""
     (whole,) = run_of("fcp").stages
     state, _ = jax.jit(whole.update)(jax.jit(whole.init)(jax.random.fold_in(jax.random.key(0), 0)))
@@ -357,24 +372,24 @@ def candidates(tmp_path_factory) -> Path:
     return root
 
 
-def paths(points: list[Checkpoint]) -> list[str]:
+def paths(points: list[SuiteCheckpoint]) -> list[str]:
     return [point.path for point in points]
 
 
 def test_candidates_are_sorted_by_number(candidates):
     """Not by name, where m10 comes before m2."""
-    found = paths(list(checkpoints(candidates, LAYOUT.name, "fcp")))
+    found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "fcp")))
     assert found == [f"{LAYOUT.name}/fcp/m{m}/c{c}" for m in range(10) for c in range(5)]
 
 
 def test_sorted_by_number_with_more_than_ten_members(tmp_path):
     made_up(tmp_path, {(m, 0): 0.0 for m in (10, 2, 0, 11)})
-    found = paths(list(checkpoints(tmp_path, LAYOUT.name, "fcp")))
+    found = paths(list(suite_checkpoints(tmp_path, LAYOUT.name, "fcp")))
     assert [path.split("/")[2] for path in found] == ["m0", "m2", "m10", "m11"]
 
 
 def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
-    chosen = select(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
+    chosen = select_teammates(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
     assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
     everyone = chosen.train + chosen.heldout
     assert len(set(paths(everyone))) == 40
@@ -382,14 +397,16 @@ def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
 
 
 def test_train_and_heldout_are_disjoint_and_of_the_wanted_numbers(candidates):
-    chosen = select(candidates, LAYOUT.name, "brdiv", train=20, heldout=5)
+    chosen = select_teammates(candidates, LAYOUT.name, "brdiv", train=20, heldout=5)
     assert (len(chosen.train), len(chosen.heldout)) == (20, 5)
     assert len({*paths(chosen.train), *paths(chosen.heldout)}) == 25
 
 
 def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates):
-    draws = {(a, s): select(candidates, LAYOUT.name, a, 20, 5, seed=s) for a in ("fcp", "brdiv") for s in (0, 1)}
-    again = select(candidates, LAYOUT.name, "fcp", 20, 5, seed=0)
+    draws = {
+        (a, s): select_teammates(candidates, LAYOUT.name, a, 20, 5, seed=s) for a in ("fcp", "brdiv") for s in (0, 1)
+    }
+    again = select_teammates(candidates, LAYOUT.name, "fcp", 20, 5, seed=0)
     assert (paths(again.train), paths(again.heldout)) == (paths(draws["fcp", 0].train), paths(draws["fcp", 0].heldout))
     names = [[path.partition("/m")[2] for path in paths(draw.train)] for draw in draws.values()]
     assert len({tuple(own) for own in names}) == 4
@@ -403,7 +420,7 @@ def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates
 def test_few_candidates_are_shared_four_to_one(tmp_path, good, train, heldout):
     """20 for training and 5 held out are wanted."""
     made_up(tmp_path, {(k // 5, k % 5): 30.0 if k < good else 5.0 for k in range(50)})
-    chosen = select(tmp_path, LAYOUT.name, "fcp", 20, 5)
+    chosen = select_teammates(tmp_path, LAYOUT.name, "fcp", 20, 5)
     assert (chosen.good, len(chosen.train), len(chosen.heldout)) == (good, train, heldout)
     assert not {*paths(chosen.train)} & {*paths(chosen.heldout)}
 
@@ -411,7 +428,7 @@ def test_few_candidates_are_shared_four_to_one(tmp_path, good, train, heldout):
 def test_manifests_read_back(candidates, tmp_path):
     root = tmp_path / "suite"
     shutil.copytree(candidates, root)
-    selections = [select(root, LAYOUT.name, algorithm, 20, 5) for algorithm in ALGORITHMS]
+    selections = [select_teammates(root, LAYOUT.name, algorithm, 20, 5) for algorithm in ALGORITHMS]
     written = write_manifests(root, selections)
     assert [path.name for path in written] == ["layout_train.jsonl", "layout_heldout.jsonl"]
     for path, split, count in zip(written, ("train", "heldout"), (20, 5), strict=True):
@@ -426,29 +443,29 @@ def test_manifests_read_back(candidates, tmp_path):
         chosen = [point for own in selections for point in (own.train if split == "train" else own.heldout)]
         for task, point in zip(tasks, chosen, strict=True):
             assert (task.layout_name, task.teammate_family) == ("cramped_room_up", "rl")
-            hashed = file_hash(root / point.path / WEIGHTS)
+            hashed = file_hash(root / point.path / POLICY_WEIGHTS)
             assert task.teammate["theta"] == {"checkpoint": point.path, "sha256": hashed}
             assert task.teammate["base_seed"] == 7
 
 
 def test_tracks_without_teammates_have_no_manifest(tmp_path):
     made_up(tmp_path, {(0, 0): 30.0})
-    written = write_manifests(tmp_path, [select(tmp_path, LAYOUT.name, "fcp", 20, 5)])
+    written = write_manifests(tmp_path, [select_teammates(tmp_path, LAYOUT.name, "fcp", 20, 5)])
     assert [path.name for path in written] == ["layout_train.jsonl"]
 
 
 def test_a_tasks_teammate_is_built_and_another_hash_refused(trained, tmp_path):
-    points = list(checkpoints(trained, LAYOUT.name, "comedi"))
-    tasks = make_tasks(trained, [Selection(LAYOUT.name, "comedi", 10, 10, points, [])], "train")
+    points = list(suite_checkpoints(trained, LAYOUT.name, "comedi"))
+    tasks = make_tasks(trained, [TeammateSelection(LAYOUT.name, "comedi", 10, 10, points, [])], "train")
     write_tasks(tmp_path / "tasks.jsonl", tasks)
     for task, point in zip(read_tasks(tmp_path / "tasks.jsonl"), points, strict=True):
-        built: Any = learned.build_entry(task.layout, task.teammate, trained)
+        built: Any = learned.build_learned_entry(task.layout, task.teammate, trained)
         expected = load_policy(trained / point.path)[1]["params"]["actor"]["kernel"]
         np.testing.assert_array_equal(built.params["params"]["actor"]["kernel"], expected)
 
     wrong = tasks[0].teammate | {"theta": tasks[0].teammate["theta"] | {"sha256": "0" * 64}}
     with pytest.raises(TaskFormatError, match=f"expected {'0' * 64} as the task says"):
-        learned.build_entry(LAYOUT, wrong, trained)
+        learned.build_learned_entry(LAYOUT, wrong, trained)
     write_tasks(tmp_path / "wrong.jsonl", [replace(tasks[0], teammate=wrong)])
     with pytest.raises(TaskFormatError, match=r"line 1: task_id .* does not match the task's content"):
         read_tasks(tmp_path / "wrong.jsonl")

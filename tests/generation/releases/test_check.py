@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
-from generation.releases.check import compare
+from generation.releases.check import compare_rebuilds
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import artefact
 
@@ -56,8 +56,10 @@ def test_an_array_that_is_none(tmp_path):
     for name, content in (("a", b"junk"), ("b", b"juno"), ("c", b"")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "x.npy").write_bytes(content)
-    assert compare(tmp_path / "a", tmp_path / "b").differences == {"x.npy": "4 bytes, the first difference at byte 3"}
-    assert compare(tmp_path / "a", tmp_path / "c").differences == {
+    assert compare_rebuilds(tmp_path / "a", tmp_path / "b").differences == {
+        "x.npy": "4 bytes, the first difference at byte 3"
+    }
+    assert compare_rebuilds(tmp_path / "a", tmp_path / "c").differences == {
         "x.npy": "4 and 0 bytes, the first difference at byte 0"
     }
 
@@ -65,6 +67,6 @@ def test_an_array_that_is_none(tmp_path):
 def test_nothing_to_compare(tmp_path):
     (tmp_path / ".hidden").touch()
     with pytest.raises(OptionError, match="no files to compare"):
-        compare(tmp_path, tmp_path)
+        compare_rebuilds(tmp_path, tmp_path)
     with pytest.raises(OptionError, match=r"nowhere: no such folder"):
-        compare(tmp_path, tmp_path / "nowhere")
+        compare_rebuilds(tmp_path, tmp_path / "nowhere")

@@ -90,7 +90,7 @@ def test_a_finished_task_is_not_done_again(built, monkeypatch):
     monkeypatch.setattr(job, "run_task", never)
     output = StringIO()
     before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
-    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
+    build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output))
     assert "finished before" in output.getvalue()
     assert (built / "a" / "lite" / "MANIFEST.sha256").read_bytes() == before
 
@@ -100,15 +100,15 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
     (task,) = profile.heuristic_tasks()
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
-    assert artefacts.is_finished(folder, task, profile)
+    assert artefacts.is_task_finished(folder, task, profile)
     (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
-    assert not artefacts.is_finished(folder, task, load_profile(str(built / "other.toml")))
+    assert not artefacts.is_task_finished(folder, task, load_profile(str(built / "other.toml")))
     actions = bytearray((folder / "actions.npy").read_bytes())
     actions[-1] ^= 1
     (folder / "actions.npy").write_bytes(actions)
-    assert not artefacts.is_finished(folder, task, profile)
+    assert not artefacts.is_task_finished(folder, task, profile)
     (folder / METADATA).unlink()
-    assert not artefacts.is_finished(folder, task, profile)
+    assert not artefacts.is_task_finished(folder, task, profile)
 
 
 def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
@@ -135,13 +135,13 @@ def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
     (tmp_path / "lite").mkdir()
     (tmp_path / "lite" / "notes.txt").write_text("mine")
     with pytest.raises(OptionError, match="is not a release"):
-        build.build_releases(str(built / "tiny.toml"), tmp_path, ["lite"], Console(file=StringIO()))
+        build.build_releases(load_profile(str(built / "tiny.toml")), tmp_path, ["lite"], Console(file=StringIO()))
     assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
 
 
 def test_nothing_but_lines_where_output_is_no_terminal(built):
     output = StringIO()
-    build.build_releases(str(built / "tiny.toml"), built / "a", ["lite"], Console(file=output))
+    build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output))
     assert not re.search(r"\x1b|━", output.getvalue())
 
 
@@ -167,7 +167,7 @@ def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
 
 
 def test_the_teammate_can_be_rebuilt(built):
-    from generation.teammates.registry import build as build_teammate
+    from generation.teammates.registry import build_teammate
 
     spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
     assert (spec["slot"], spec["noise"]) == (1, "seeded")
@@ -181,7 +181,7 @@ def learned(tmp_path_factory) -> Path:
     (out / "learned.toml").write_text(LEARNED)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(select, "THRESHOLD", -np.inf)
-        build.build_releases(str(out / "learned.toml"), out, ["lite", "full"], Console(file=StringIO()))
+        build.build_releases(load_profile(str(out / "learned.toml")), out, ["lite", "full"], Console(file=StringIO()))
     return out
 
 
@@ -253,7 +253,9 @@ def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
     report = verify_release(root)
     assert report.ok
     assert any("2 tasks have learned teammates whose checkpoints" in note for note in report.notes)
-    with pytest.raises(OptionError, match=r"lacks checkpoint \w{64}, the teammate of history 0: .*came without it"):
+    with pytest.raises(
+        OptionError, match=r"checkpoint \w{64} is missing, the teammate of history 0: .*made without it"
+    ):
         recover_teammate(load_icrl4aht(root), 0)
 
 
@@ -321,10 +323,10 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
         raise AssertionError("something was done again")
 
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
-    monkeypatch.setattr(suite._Training, "run_on", never)
+    monkeypatch.setattr(suite._PopulationTraining, "train", never)
     monkeypatch.setattr(job, "run_task", never)
     output = StringIO()
-    build.build_releases(str(learned / "learned.toml"), learned, ["lite"], Console(file=output))
+    build.build_releases(load_profile(str(learned / "learned.toml")), learned, ["lite"], Console(file=output))
     assert output.getvalue().count("finished before") == 4
 
 
@@ -333,7 +335,7 @@ def test_teammates_that_are_all_too_bad(learned, tmp_path):
     with pytest.raises(
         CollectionError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
     ):
-        build.build_releases(str(learned / "learned.toml"), tmp_path, ["lite"], Console(file=StringIO()))
+        build.build_releases(load_profile(str(learned / "learned.toml")), tmp_path, ["lite"], Console(file=StringIO()))
     assert not (tmp_path / "lite").exists()
 
 
@@ -343,8 +345,8 @@ def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
     card = json.loads(path.read_text())
     del card["teammate_return"]
     path.write_text(json.dumps(card))
-    with pytest.raises(OptionError, match=r"demo_wide/fcp/m0/c3: its card lacks 'teammate_return'.*anew"):
-        select.select(tmp_path / "suite", "demo_wide", "fcp", 1, 1)
+    with pytest.raises(OptionError, match=r"demo_wide/fcp/m0/c3: its card has no 'teammate_return'.*again"):
+        select.select_teammates(tmp_path / "suite", "demo_wide", "fcp", 1, 1)
 
 
 def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):

@@ -1,5 +1,5 @@
 """The heuristic teammates: the published play, digit by digit, the published means, every family on every layout from
-both seats, rules that no published play reaches, their noise, and the registry."""
+both slots, rules that no published play reaches, their noise, and the registry."""
 
 from __future__ import annotations
 
@@ -13,11 +13,18 @@ import numpy as np
 import pytest
 
 from generation.env import Environment
-from generation.policy import Noise, draw
-from generation.teammates.heuristics import assembly_line, recipe_aware_button, territory, utility_greedy
+from generation.policy import Noise
+from generation.teammates.heuristics import territory
+from generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
+from generation.teammates.heuristics.heuristic import draw
 from generation.teammates.heuristics.paths import Paths, Scene
 from generation.teammates.instances import published_thetas
-from generation.teammates.registry import build, heuristic_teammate, sample
+from generation.teammates.registry import (
+    HEURISTIC_FAMILIES,
+    build_teammate,
+    heuristic_teammate,
+    sample_teammate,
+)
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
@@ -26,7 +33,6 @@ from icrl4aht_data.overcooked.state import faults
 from tests.helpers.scenes import random_records, scene
 
 H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
-MODULES = {H1: recipe_aware_button, H2: territory, H3: assembly_line, H4: utility_greedy}
 # These programs are compiled to run a few times: neither optimise them nor use the newer, slower code generator.
 FAST = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
@@ -73,7 +79,7 @@ NOISE = """
 
 def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     """Parameters with a leading axis over thetas."""
-    defaults = MODULES[family].DEFAULTS
+    defaults = HEURISTIC_FAMILIES[family].defaults
     dtypes = {name: np.int32 if isinstance(default, int) else np.float32 for name, default in defaults.items()}
     return {name: np.array([theta[name] for theta in thetas], dtype) for name, dtype in dtypes.items()}
 
@@ -83,11 +89,11 @@ def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 @lru_cache
 def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.ndarray]:
-    """100 steps of t0..t4 in seat 1 under the published noise beside an ego that stays: actions and returns
+    """100 steps of t0..t4 in agent 1 under the published noise beside an ego that stays: actions and returns
     (100, 5, N), (5, N). The last episode starts from the published scene and its recipe stays."""
     layout = LAYOUTS[name]
     thetas = published_thetas(name, family)
-    policy = build(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
+    policy = build_teammate(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
     records = Environment(layout).init(jax.random.split(jax.random.key(7), episodes)).record
     pinned = scene(layout, (1, 1, "up"), (5, 2, "up"))
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
@@ -117,7 +123,7 @@ def test_published_actions(line):
 
 
 @pytest.mark.parametrize("name", PUBLISHED_MEANS)
-@pytest.mark.parametrize("family", MODULES)
+@pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
 def test_published_means(name, family):
     returns = played(name, family)[1][:, :-1]
     published = np.array(PUBLISHED_MEANS[name][family])
@@ -138,7 +144,7 @@ def test_noise_chain_is_the_published_one():
 def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
     for slot in (0, 1):
         teammate = heuristic_teammate(family, "default", 0)
-        fixed, seeded = (build(LAYOUTS["cramped_up"], teammate, slot, noise) for noise in get_args(Noise))
+        fixed, seeded = (build_teammate(LAYOUTS["cramped_up"], teammate, slot, noise) for noise in get_args(Noise))
         assert fixed.init(fixed.params, jax.random.key(123)).key == jax.random.key(slot)
         assert seeded.init(seeded.params, jax.random.key(123)).key == jax.random.key(123)
 
@@ -146,31 +152,31 @@ def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
 # One step of every family.
 
 ROWS = 48
-ALL_SEATS = tuple((family, slot) for family in MODULES for slot in (0, 1))
+ALL_SLOTS = tuple((family, slot) for family in HEURISTIC_FAMILIES for slot in (0, 1))
 
 
 @lru_cache
-def table(layout: Layout, seats: tuple[tuple[str, int], ...] = ALL_SEATS) -> tuple[dict, Callable]:
-    """Policies by seat, and one program for them all: params and memories (ROWS, ...) in order of the seats, records
+def table(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_SLOTS) -> tuple[dict, Callable]:
+    """Policies by seat, and one program for them all: params and memories (ROWS, ...) in order of the slots, records
     (ROWS, S) -> actions and memories."""
-    policies = {seat: build(layout, heuristic_teammate(seat[0], "default", 0), seat[1]) for seat in seats}
+    policies = {seat: build_teammate(layout, heuristic_teammate(seat[0], "default", 0), seat[1]) for seat in slots}
 
     def act(params, memories, record):
         key = jax.random.key(0)
-        return [policies[s].act(p, m, record, key) for s, p, m in zip(seats, params, memories, strict=True)]
+        return [policies[s].act(p, m, record, key) for s, p, m in zip(slots, params, memories, strict=True)]
 
     return policies, jax.jit(jax.vmap(act), compiler_options=FAST)
 
 
-def act_all(layout: Layout, seats, params: dict, memories: dict, records: np.ndarray) -> dict:
-    _, act = table(layout, seats)
-    return dict(zip(seats, act(*([part[seat] for seat in seats] for part in (params, memories)), records), strict=True))
+def act_all(layout: Layout, slots, params: dict, memories: dict, records: np.ndarray) -> dict:
+    _, act = table(layout, slots)
+    return dict(zip(slots, act(*([part[seat] for seat in slots] for part in (params, memories)), records), strict=True))
 
 
 @lru_cache
-def first_memories(layout: Layout, seats=ALL_SEATS) -> dict:
+def first_memories(layout: Layout, slots=ALL_SLOTS) -> dict:
     keys = jax.random.split(jax.random.key(4), ROWS)
-    policies, _ = table(layout, seats)
+    policies, _ = table(layout, slots)
     return {seat: jax.vmap(p.init, (None, 0))(p.params, keys) for seat, p in policies.items()}
 
 
@@ -178,9 +184,11 @@ def first_memories(layout: Layout, seats=ALL_SEATS) -> dict:
 def many_params(name: str) -> dict:
     """Of every seat ROWS parameter sets: the published ones, the presets and sampled ones."""
     params = {}
-    for family, module in MODULES.items():
-        presets = [heuristic_teammate(family, preset, 0)["theta"] for preset in module.PRESETS]
-        sampled = [sample(family, number, split)["theta"] for number in range(3) for split in ("train", "test")]
+    for family, heuristic in HEURISTIC_FAMILIES.items():
+        presets = [heuristic_teammate(family, preset, 0)["theta"] for preset in heuristic.presets]
+        sampled = [
+            sample_teammate(family, number, split)["theta"] for number in range(3) for split in ("train", "test")
+        ]
         thetas = [*published_thetas(name, family), *presets, *sampled]
         params[family, 0] = params[family, 1] = stacked(family, [thetas[i % len(thetas)] for i in range(ROWS)])
     return params
@@ -195,9 +203,9 @@ def test_every_family_plays_every_layout_from_both_seats(name):
     shapes = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), memories)
     records = random_records(layout, ROWS, rng)
     for _ in range(25):
-        acted = act_all(layout, ALL_SEATS, params, memories, records)
+        acted = act_all(layout, ALL_SLOTS, params, memories, records)
         memories = {seat: memory for seat, (_, memory) in acted.items()}
-        actions = np.stack([acted[seat][0] for seat in ALL_SEATS])
+        actions = np.stack([acted[seat][0] for seat in ALL_SLOTS])
         assert actions.dtype == np.int32
         assert set(np.unique(actions)) <= set(range(len(ACTIONS)))
         played = actions.reshape(4, 2, ROWS)[np.arange(ROWS) % 4, :, np.arange(ROWS)]
@@ -218,16 +226,16 @@ def one_step(
     layout: Layout, family: str, slot: int, theta: dict[str, float], mine, partner, memory=None, **fields
 ) -> tuple[str, Any]:
     """What a teammate at `mine` (x, y, facing, item in hand) does beside `partner`: action name and memory."""
-    seats = ALL_SEATS if layout.name in LAYOUTS else ((family, slot),)
-    seated = (mine, partner) if slot == 0 else (partner, mine)
-    fields["hands"] = [place[3] for place in seated]
-    records = np.repeat(scene(layout, seated[0][:3], seated[1][:3], **fields), ROWS, axis=0)
-    memories = first_memories(layout, seats)
+    slots = ALL_SLOTS if layout.name in LAYOUTS else ((family, slot),)
+    agents = (mine, partner) if slot == 0 else (partner, mine)
+    fields["hands"] = [place[3] for place in agents]
+    records = np.repeat(scene(layout, agents[0][:3], agents[1][:3], **fields), ROWS, axis=0)
+    memories = first_memories(layout, slots)
     mind = memories[family, slot]
     mind = mind._replace(**{name: np.full_like(getattr(mind, name), v) for name, v in (memory or {}).items()})
-    params = {seat: stacked(seat[0], [MODULES[seat[0]].DEFAULTS] * ROWS) for seat in seats}
-    params[family, slot] = stacked(family, [MODULES[family].DEFAULTS | theta] * ROWS)
-    actions, after = act_all(layout, seats, params, memories | {(family, slot): mind}, records)[family, slot]
+    params = {seat: stacked(seat[0], [HEURISTIC_FAMILIES[seat[0]].defaults] * ROWS) for seat in slots}
+    params[family, slot] = stacked(family, [HEURISTIC_FAMILIES[family].defaults | theta] * ROWS)
+    actions, after = act_all(layout, slots, params, memories | {(family, slot): mind}, records)[family, slot]
     assert len(set(actions.tolist())) == 1
     return ACTIONS[actions[0]], jax.tree.map(lambda leaf: leaf[0], after)
 
@@ -243,9 +251,9 @@ CRAMPED_CASES = [
     # H1: round the partner, or push.
     (H1, {}, {}, "1 32- 12- left, 1 32- 22- up, 0 21d 31- down, 0 210 22- right, 0 120 22- right, 0 32- 22- up"),
     (H1, {}, DONE, "0 21p 22- right, 1 21p 32d down"),
-    # H1 seat 1 leaves the pot to a partner who brings an ingredient and is about as near.
+    # H1 agent 1 leaves the pot to a partner who brings an ingredient and is about as near.
     (H1, {}, {}, "1 220v 210 right, 1 220v 110 interact, 1 220v 21p interact, 0 220v 210 interact, 0 21d 32- right"),
-    # H1 specialists: seat 1 fetches no plate while the partner has none; seat 0 puts its dish down.
+    # H1 specialists: agent 1 fetches no plate while the partner has none; agent 0 puts its dish down.
     (H1, SPECIALIST, {}, "1 21- 32- down, 1 21- 32p left, 0 21d 32- interact"),
     # H1 with a plate makes way for a dish.
     (H1, {}, {}, "1 21p 11d down, 1 12p 11d right, 1 32p 11d stay, 1 22p 32d left, 0 31p 32d left, 1 21p 12d stay"),
@@ -263,9 +271,9 @@ CRAMPED_CASES = [
     (H2, {}, FULL, "1 22pv 32- stay"),
     # H2, strict, for want of a goal or pile of its own uses the other's.
     (H2, {"strictness": 1.0}, {"recipe": 3 * ONE}, "0 21d 32- right, 0 11- 32- right"),
-    # H3 seat 1, empty-handed, makes room for a partner who carries something; seat 0 does not.
+    # H3 agent 1, empty-handed, makes room for a partner who carries something; agent 0 does not.
     (H3, {}, {}, "1 21- 11p right, 1 31- 21p down, 1 21- 220 right, 1 32- 31d left, 0 21- 11p left"),
-    # H3 seat 1 stays where the next cell touches the partner.
+    # H3 agent 1 stays where the next cell touches the partner.
     (H3, {}, {}, "1 32- 12- stay, 0 32- 12- left, 1 22- 31- left"),
     # H3: an ingredient in the partner's hand counts as in the pot, a dish does not.
     (H3, {}, TWO, "0 22- 310 down, 0 22- 311 left, 0 22- 31d left"),
@@ -289,7 +297,7 @@ ASYMM_CASES = [
     (H2, INVADER, {"pot_items": [SOUP_0, SOUP_0]}, "1 53-v 13- interact"),
 ]
 DEMO_CASES = [
-    # A stubborn H3 walks home, with empty hands: seat 1 to (5, 3); seat 0's home is a wall.
+    # A stubborn H3 walks home, with empty hands: agent 1 to (5, 3); agent 0's home is a wall.
     (H3, {"stubbornness": 1.0}, {}, "1 13- 51- right, 1 130 51- right, 0 41- 13- left"),
     (H3, {}, {}, "1 13- 51- down"),
 ]
@@ -306,8 +314,8 @@ def test_scenes(case):
     facings = {"": "up", "v": "down", "<": "left", ">": "right"}
     for move in moves.split(", "):
         slot, mine, partner, expected = move.split()
-        seated = [(int(p[0]), int(p[1]), facings[p[3:]], hands[p[2]]) for p in (mine, partner)]
-        assert one_step(LAYOUTS[name], family, int(slot), theta, *seated, **fields)[0] == expected, move
+        agents = [(int(p[0]), int(p[1]), facings[p[3:]], hands[p[2]]) for p in (mine, partner)]
+        assert one_step(LAYOUTS[name], family, int(slot), theta, *agents, **fields)[0] == expected, move
 
 
 @pytest.mark.parametrize(
@@ -381,9 +389,9 @@ def test_h3_wrong_moves_are_the_keys_own(stubbornness):
     records = np.repeat(scene(layout, (5, 1, "up"), (4, 3, "up")), ROWS, axis=0)
     memories = first_memories(layout)
     params = many_params("demo_wide") | {
-        seat: stacked(H3, [assembly_line.DEFAULTS | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)
+        seat: stacked(H3, [ASSEMBLY_LINE.defaults | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)
     }
-    actions, after = act_all(layout, ALL_SEATS, params, memories, records)[seat]
+    actions, after = act_all(layout, ALL_SLOTS, params, memories, records)[seat]
     for action, key, start in zip(actions, after.key, memories[seat].key, strict=True):
         own = jax.random.split(jax.random.split(start)[0])[1]
         drawn = PUBLISHED_ACTIONS[int(jax.random.randint(own, (), 0, 4))]
@@ -421,38 +429,40 @@ def test_h1_asks_the_button(theta, memory, fields, expected, steps):
 # The registry.
 
 
-@pytest.mark.parametrize("family", MODULES)
+@pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
 def test_missing_and_unknown_parameters(family):
-    theta = dict(MODULES[family].DEFAULTS)
+    theta = dict(HEURISTIC_FAMILIES[family].defaults)
     first = next(iter(theta))
     theta[f"{first}_"] = theta.pop(first)
     with pytest.raises(TaskFormatError, match=rf"{family}: missing parameters \['{first}'\].*\['{first}_'\]"):
-        build(LAYOUTS["demo_wide"], {"family": family, "theta": theta})
+        build_teammate(LAYOUTS["demo_wide"], {"family": family, "theta": theta})
 
 
 @pytest.mark.parametrize(
     ("family", "name", "value", "expected"),
     [
         (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number in 0..1\)"),
-        (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected a whole number from 0\)"),
-        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected a whole number in 0..5\)"),
-        (H2, "shared_margin", True, r"shared_margin = True \(expected a whole number from 0\)"),
-        (H3, "role_mode", -1, r"role_mode = -1 \(expected a whole number in 0..2\)"),
+        (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected an integer from 0\)"),
+        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected an integer in 0..5\)"),
+        (H2, "shared_margin", True, r"shared_margin = True \(expected an integer from 0\)"),
+        (H3, "role_mode", -1, r"role_mode = -1 \(expected an integer in 0..2\)"),
         (H4, "inertia", None, r"inertia = None \(expected a number in 0..1\)"),
     ],
 )
 def test_impossible_parameters(family, name, value, expected):
     with pytest.raises(TaskFormatError, match=f"teammate {family}: out of range: {expected}"):
-        build(LAYOUTS["demo_wide"], {"family": family, "theta": MODULES[family].DEFAULTS | {name: value}})
+        build_teammate(
+            LAYOUTS["demo_wide"], {"family": family, "theta": HEURISTIC_FAMILIES[family].defaults | {name: value}}
+        )
 
 
 def test_unknown_presets_and_splits():
     with pytest.raises(UnknownNameError, match=r"preset of assembly_line 'plater'.*Did you mean 'plater_deliverer'"):
         heuristic_teammate(H3, "plater", 0)
     with pytest.raises(UnknownNameError, match=r"split 'tests'.*Did you mean 'test'"):
-        sample(H1, 0, "tests")
+        sample_teammate(H1, 0, "tests")
     with pytest.raises(UnknownNameError, match=r"teammate family 'territori'.*Did you mean 'territory'"):
-        sample("territori", 0, "test")
+        sample_teammate("territori", 0, "test")
 
 
 RANGES = """
@@ -472,19 +482,19 @@ preset's value, or . for that value: the published code's, for the splits of the
 @pytest.mark.parametrize("line", RANGES.split("\n")[1:-1])
 def test_samples_stay_in_their_ranges(line):
     family, split, presets, *ranges = line.split()
-    module = MODULES[family]
-    entries = [sample(family, number, split) for number in range(12)]
-    assert entries == [sample(family, number, split) for number in range(12)]
+    heuristic = HEURISTIC_FAMILIES[family]
+    entries = [sample_teammate(family, number, split) for number in range(12)]
+    assert entries == [sample_teammate(family, number, split) for number in range(12)]
     assert len({str(entry["theta"]) for entry in entries}) == 12
-    assert sample(family, 0, split, 1)["theta"] != entries[0]["theta"]
-    assert sample(family, 0, ("train", "test")[split == "train"])["theta"] != entries[0]["theta"]
+    assert sample_teammate(family, 0, split, 1)["theta"] != entries[0]["theta"]
+    assert sample_teammate(family, 0, ("train", "test")[split == "train"])["theta"] != entries[0]["theta"]
     for entry in entries:
         assert list(entry) == ["kind", "family", "theta_id", "base_seed", "theta"]
-        assert list(entry["theta"]) == list(module.DEFAULTS)
-        build(LAYOUTS["demo_wide"], entry)
+        assert list(entry["theta"]) == list(heuristic.defaults)
+        build_teammate(LAYOUTS["demo_wide"], entry)
         for (name, value), text in zip(entry["theta"].items(), ranges, strict=True):
-            assert type(value) is type(module.DEFAULTS[name])
-            bases = [(module.DEFAULTS | module.PRESETS[preset])[name] for preset in presets.split(",")]
+            assert type(value) is type(heuristic.defaults[name])
+            bases = [(heuristic.defaults | heuristic.presets[preset])[name] for preset in presets.split(",")]
             assert in_range(value, text, bases), (name, value)
 
 

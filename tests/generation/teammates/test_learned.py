@@ -1,4 +1,4 @@
-"""Checkpoints as teammates: refused where they do not fit, greedy or sampled, with a memory, in either seat."""
+"""Checkpoints as teammates: refused where they do not fit, greedy or sampled, with a memory, in either slot."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from generation.env import Environment, EnvState
-from generation.learners.checkpoint import CARD, WEIGHTS, save_policy
-from generation.learners.network import ActorCritic, Widths
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
+from generation.learners.config import Widths
+from generation.learners.network import ActorCritic
 from generation.learners.rollout import policy_player
 from generation.teammates import learned, registry
 from icrl4aht_data.errors import OptionError, TaskFormatError
@@ -53,7 +54,7 @@ def suite(tmp_path_factory) -> Path:
 
 
 def entry(suite: Path, name: str) -> dict[str, Any]:
-    theta = {"checkpoint": name, "sha256": file_hash(suite / name / WEIGHTS)}
+    theta = {"checkpoint": name, "sha256": file_hash(suite / name / POLICY_WEIGHTS)}
     return {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
 
 
@@ -62,9 +63,9 @@ def states(steps: int, seed: int) -> np.ndarray:
     return random_records(LAYOUT, steps * TABLES, np.random.default_rng(seed)).reshape(steps, TABLES, -1)
 
 
-def logits_of(params: Any, partners: int, record: np.ndarray, seat: int) -> np.ndarray:
+def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.ndarray:
     """What the whole network says of a sequence of states, (T, N, 6)."""
-    obs = observe(LAYOUT, record, seat)
+    obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(TABLES)
     apply = compiled(network.apply)
@@ -72,13 +73,13 @@ def logits_of(params: Any, partners: int, record: np.ndarray, seat: int) -> np.n
     return np.asarray(outputs[1], np.float64)
 
 
-def played(policy: Any, record: np.ndarray, seat: int) -> np.ndarray:
+def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
     """Its actions (T, N) at three tables in these states, one after the other."""
-    player = policy_player(Environment(LAYOUT), policy, policy.params, seat, TABLES)
+    player = policy_player(Environment(LAYOUT), policy, policy.params, slot, TABLES)
     act = compiled(player.act)
     zero = jnp.zeros(TABLES, jnp.int32)
     state = EnvState(jax.random.split(jax.random.key(0), TABLES), zero, zero, jnp.asarray(record[0]))
-    memory, actions = player.begin(state), []
+    memory, actions = player.init(state), []
     for step, now in enumerate(record):
         choice, memory = act(memory, state._replace(record=jnp.asarray(now)), jax.random.key(step))
         actions.append(np.asarray(choice.action))
@@ -88,19 +89,19 @@ def played(policy: Any, record: np.ndarray, seat: int) -> np.ndarray:
 # Playing.
 
 
-@pytest.mark.parametrize("seat", [EGO, TEAMMATE])
-def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_path, seat):
+@pytest.mark.parametrize("slot", [EGO, TEAMMATE])
+def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_path, slot):
     params = save(tmp_path / "a", partners=4)
     record = states(STEPS, 2)
-    logits = logits_of(params, 4, record, seat)
-    actions = played(learned.build(LAYOUT, tmp_path / "a"), record, seat)
+    logits = logits_of(params, 4, record, slot)
+    actions = played(learned.build_learned(LAYOUT, tmp_path / "a"), record, slot)
     np.testing.assert_array_equal(actions, logits.argmax(axis=-1))
     assert len(np.unique(actions)) > 1
 
 
 def test_the_memory_is_carried_and_matters(suite):
     """The hidden state after other states gives other logits in the same last state, and it starts from zero."""
-    policy = learned.build(LAYOUT, suite / "b")
+    policy = learned.build_learned(LAYOUT, suite / "b")
     act = compiled(policy.act)
     obs = observe(LAYOUT, states(STEPS, 5)[:, 0], TEAMMATE)
     start = policy.init(policy.params, jax.random.key(0))
@@ -115,7 +116,7 @@ def test_the_memory_is_carried_and_matters(suite):
 
 def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite):
     """3,000 draws in one state; shares within five standard deviations."""
-    greedy, sampled = (learned.build(LAYOUT, suite / "b", action) for action in ("greedy", "sampled"))
+    greedy, sampled = (learned.build_learned(LAYOUT, suite / "b", action) for action in ("greedy", "sampled"))
     record = states(1, 8)[:, :1]
     params = {"params": save(suite.parent / f"{suite.name}-b", seed=1)["params"]}
     logits = logits_of(params, 0, np.repeat(record, TABLES, axis=1), TEAMMATE)[0, 0]
@@ -136,18 +137,18 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
 
 def test_checkpoints_of_one_shape_share_their_functions(suite):
     """Whatever their critics are told; so that they share compilations."""
-    one, other = (learned.build(LAYOUT, suite / name) for name in "ab")
-    elsewhere = learned.build(get_layout("test_simple"), suite / "c")
+    one, other = (learned.build_learned(LAYOUT, suite / name) for name in "ab")
+    elsewhere = learned.build_learned(get_layout("test_simple"), suite / "c")
     assert one.init is other.init is elsewhere.init
     assert one.act is other.act is elsewhere.act
     assert one.sees == "observation"
     assert jax.tree.map(jnp.shape, one.params) == jax.tree.map(jnp.shape, other.params)
-    assert learned.build(LAYOUT, suite / "a", "sampled").act is not one.act
+    assert learned.build_learned(LAYOUT, suite / "a", "sampled").act is not one.act
 
 
 def test_checkpoints_of_other_widths_have_functions_of_their_own(suite, tmp_path):
     save(tmp_path / "wide", widths=replace(WIDTHS, dense=9))
-    assert learned.build(LAYOUT, tmp_path / "wide").act is not learned.build(LAYOUT, suite / "a").act
+    assert learned.build_learned(LAYOUT, tmp_path / "wide").act is not learned.build_learned(LAYOUT, suite / "a").act
 
 
 # Refusals.
@@ -156,12 +157,12 @@ def test_checkpoints_of_other_widths_have_functions_of_their_own(suite, tmp_path
 def test_a_checkpoint_of_other_channels_is_refused_with_both_shapes(suite):
     """cramped_up has 35 channels, test_simple 41."""
     with pytest.raises(OptionError) as error:
-        learned.build(LAYOUT, suite / "c")
+        learned.build_learned(LAYOUT, suite / "c")
     text = str(error.value)
     for part in (str(suite / "c"), "does not fit cramped_up", "5 x 5 x 35", "(41, 4)", "expected", "(35, 4)"):
         assert part in text
     assert "gru" not in text, "only what differs"
-    learned.build(get_layout("cramped_down"), suite / "a")
+    learned.build_learned(get_layout("cramped_down"), suite / "a")
 
 
 def test_a_checkpoint_without_the_actor_is_refused(suite, tmp_path):
@@ -169,39 +170,42 @@ def test_a_checkpoint_without_the_actor_is_refused(suite, tmp_path):
     del params["params"]["actor"]
     save_policy(tmp_path / "b", ActorCritic(WIDTHS), params, {})
     with pytest.raises(OptionError, match=r"expected .*actor/kernel"):
-        learned.build(LAYOUT, tmp_path / "b")
+        learned.build_learned(LAYOUT, tmp_path / "b")
 
 
-@pytest.mark.parametrize("missing", [CARD, WEIGHTS, "."])
+@pytest.mark.parametrize("missing", [POLICY_CARD, POLICY_WEIGHTS, "."])
 def test_a_missing_checkpoint_is_a_clear_error(tmp_path, missing):
     folder = tmp_path / "gone"
     if missing != ".":
         save(folder)
         (folder / missing).unlink()
-    with pytest.raises(OptionError, match=rf"gone: not a checkpoint .*expected {WEIGHTS} and {CARD}"):
-        learned.build(LAYOUT, folder)
+    with pytest.raises(OptionError, match=rf"gone: not a checkpoint .*expected {POLICY_WEIGHTS} and {POLICY_CARD}"):
+        learned.build_learned(LAYOUT, folder)
 
 
 def test_a_missing_suite_is_a_clear_error(suite):
     with pytest.raises(OptionError, match="teammate a is a checkpoint: say in which folder the suite of teammates is"):
-        learned.build_entry(LAYOUT, entry(suite, "a"), None)
+        learned.build_learned_entry(LAYOUT, entry(suite, "a"), None)
 
 
 def test_a_suite_without_the_checkpoint_is_a_clear_error(suite, tmp_path):
     with pytest.raises(OptionError, match=r"a: not a checkpoint"):
-        learned.build_entry(LAYOUT, entry(suite, "a"), tmp_path)
+        learned.build_learned_entry(LAYOUT, entry(suite, "a"), tmp_path)
 
 
 def test_other_weights_than_the_task_names_are_refused(suite):
     other = entry(suite, "a")
     other["theta"] = {"checkpoint": "b", "sha256": other["theta"]["sha256"]}
-    with pytest.raises(TaskFormatError, match=f"sha256 {file_hash(suite / 'b' / WEIGHTS)}, expected") as error:
-        learned.build_entry(LAYOUT, other, suite)
+    with pytest.raises(TaskFormatError, match=f"sha256 {file_hash(suite / 'b' / POLICY_WEIGHTS)}, expected") as error:
+        learned.build_learned_entry(LAYOUT, other, suite)
     assert other["theta"]["sha256"] in str(error.value)
 
 
 def test_an_entry_builds_the_checkpoint_it_names(suite):
-    built, direct = learned.build_entry(LAYOUT, entry(suite, "b"), suite), learned.build(LAYOUT, suite / "b")
+    built, direct = (
+        learned.build_learned_entry(LAYOUT, entry(suite, "b"), suite),
+        learned.build_learned(LAYOUT, suite / "b"),
+    )
     for a, b in zip(jax.tree.leaves(built.params), jax.tree.leaves(direct.params), strict=True):
         np.testing.assert_array_equal(a, b)
     assert built.act is direct.act
@@ -209,5 +213,5 @@ def test_an_entry_builds_the_checkpoint_it_names(suite):
 
 @pytest.mark.parametrize("slot", [EGO, TEAMMATE])
 def test_the_registry_builds_checkpoints_for_both_slots(suite, slot):
-    policy = registry.build(LAYOUT, entry(suite, "b"), slot, suite=suite)
-    assert policy.act is learned.build(LAYOUT, suite / "b").act
+    policy = registry.build_teammate(LAYOUT, entry(suite, "b"), slot, suite=suite)
+    assert policy.act is learned.build_learned(LAYOUT, suite / "b").act

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from generation.policy import Noise, next_key
+from generation.policy import Noise
 from generation.teammates.heuristics import utility_greedy
+from generation.teammates.heuristics.heuristic import next_key
 from generation.teammates.heuristics.paths import UNREACHABLE, Paths
-from generation.teammates.heuristics.utility_greedy import DEFAULTS, PRESETS, Memory
-from generation.teammates.registry import build, heuristic_teammate
+from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY, GreedyMemory
+from generation.teammates.registry import build_teammate, heuristic_teammate
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, PUBLISHED_ACTIONS, RIGHT, STAY, TEAMMATE, UP
@@ -72,7 +73,7 @@ ingredient 1, which the recipes ask for, is out of reach."""
 def _scan(layout: Layout, slot: int, noise: Noise, steps: int):
     """A jitted function: thetas (K, ...), records (N, S), next recipes (steps, N), keys (N,) -> actions, rewards
     (steps, K, N) of H4 beside a motionless partner."""
-    policy = build(layout, {"family": "utility_greedy", "theta": DEFAULTS}, slot, noise)
+    policy = build_teammate(layout, {"family": "utility_greedy", "theta": UTILITY_GREEDY.defaults}, slot, noise)
 
     def one(params, record, recipes, key):
         def step(carry, recipe):
@@ -99,7 +100,7 @@ def play(
     noise: Noise = "fixed",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Actions and rewards (steps, thetas, N)."""
-    params = {name: jnp.array([theta[name] for theta in thetas], jnp.float32) for name in DEFAULTS}
+    params = {name: jnp.array([theta[name] for theta in thetas], jnp.float32) for name in UTILITY_GREEDY.defaults}
     actions, rewards = _scan(layout, slot, noise, len(recipes))(params, records, recipes, keys)
     return np.asarray(actions), np.asarray(rewards)
 
@@ -113,7 +114,7 @@ def start_records(layout: Layout, n: int) -> np.ndarray:
 
 @lru_cache
 def published(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """100 steps of H4-t0..t4 in seat 1 under the published noise, from 12 random starts and, last, from the scene of
+    """100 steps of H4-t0..t4 in agent 1 under the published noise, from 12 random starts and, last, from the scene of
     the published string with its recipe pinned: actions and rewards (100, 5, 13)."""
     layout = LAYOUTS[name]
     records = start_records(layout, 12)
@@ -311,14 +312,16 @@ def test_equals_plain_rules_on_random_states(layout, slot):
     if layout is ISLAND:  # some in the dead end behind the partner, with a plate that nothing asks for yet
         records[:20] = scene(layout, (5, 2, "up"), (6, 2, "down"), hands=(0, 1))
     last, rolls = rng.integers(-1, 8, n), rng.integers(0, 100, n)
-    thetas = [DEFAULTS | PRESETS[preset] for preset in PRESETS] + TEST_THETAS
+    thetas = [
+        UTILITY_GREEDY.defaults | UTILITY_GREEDY.presets[preset] for preset in UTILITY_GREEDY.presets
+    ] + TEST_THETAS
     close = (3.0,) * 8 + (0.3, 1.0, 1.0)  # the highest of weights under which the intents score much alike
-    thetas += [dict(zip(DEFAULTS, (rng.random(11) * close).tolist(), strict=True)) for _ in range(30)]
+    thetas += [dict(zip(UTILITY_GREEDY.defaults, (rng.random(11) * close).tolist(), strict=True)) for _ in range(30)]
     of = rng.integers(0, len(thetas), n)
-    params = {name: jnp.array([thetas[t][name] for t in of], jnp.float32) for name in DEFAULTS}
+    params = {name: jnp.array([thetas[t][name] for t in of], jnp.float32) for name in UTILITY_GREEDY.defaults}
     keys = jax.random.wrap_key_data(jnp.stack([jnp.asarray(rolls, jnp.uint32), jnp.zeros(n, jnp.uint32)], axis=1))
-    policy = build(layout, {"family": "utility_greedy", "theta": DEFAULTS}, slot)
-    memory = Memory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
+    policy = build_teammate(layout, {"family": "utility_greedy", "theta": UTILITY_GREEDY.defaults}, slot)
+    memory = GreedyMemory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
     act = compiled(jax.vmap(policy.act))
     actions, after = act(params, memory, records, keys)
     found = [Plain(*row) for row in np.stack([after.intent, actions, after.wait], axis=1).tolist()]
@@ -337,19 +340,19 @@ ROLLS = [0, 1, 19, 20, 39, 40, 41, 99]
 @lru_cache
 def _act(slot: int):
     """H4 in cramped_up, eight at once: memory, records (8, S) -> actions (8,), memory."""
-    policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot)
+    policy = build_teammate(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot)
     keys = jax.random.split(jax.random.key(0), 8)
     act = compiled(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)))
     return lambda memory, records: act(policy.params, memory, records, keys)
 
 
-def _memory(rolls: list[int], intent: int = -1, wait: int = 0) -> Memory:
+def _memory(rolls: list[int], intent: int = -1, wait: int = 0) -> GreedyMemory:
     key = jax.random.wrap_key_data(jnp.array([[300 + roll, 7] for roll in rolls], jnp.uint32))
-    return Memory(key, jnp.full(8, intent), jnp.full(8, wait))
+    return GreedyMemory(key, jnp.full(8, intent), jnp.full(8, wait))
 
 
-def _first_memory(noise: Noise, keys: jax.Array, slot: int = TEAMMATE) -> Memory:
-    policy = build(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot, noise)
+def _first_memory(noise: Noise, keys: jax.Array, slot: int = TEAMMATE) -> GreedyMemory:
+    policy = build_teammate(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot, noise)
     return jax.vmap(policy.init, in_axes=(None, 0))(policy.params, keys)
 
 
@@ -466,8 +469,8 @@ def test_presets_are_the_published_ones():
         "high_inertia": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.7, 0.5),
         "distance_sensitive": (10, 8, 5, 6, 4, 2, 7, 3, 1.0, 0.3, 0.5),
     }
-    assert tuple(DEFAULTS) == NAMES
-    assert set(PRESETS) == set(published)
+    assert tuple(UTILITY_GREEDY.defaults) == NAMES
+    assert set(UTILITY_GREEDY.presets) == set(published)
     for name, values in published.items():
         entry = heuristic_teammate("utility_greedy", name, 3)
         theta = dict(zip(NAMES, values, strict=True))
@@ -479,7 +482,7 @@ def test_unknown_family():
     with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
         heuristic_teammate("utility_gredy", "default", 0)
     with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
-        build(LAYOUTS["demo_wide"], {"family": "utility_gredy", "theta": DEFAULTS})
+        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_gredy", "theta": UTILITY_GREEDY.defaults})
 
 
 def test_unknown_preset():
@@ -490,9 +493,9 @@ def test_unknown_preset():
 
 
 def test_missing_and_unknown_parameters():
-    theta = {name: value for name, value in DEFAULTS.items() if name != "inertia"} | {"w_inertia": 0.3}
+    theta = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "inertia"} | {"w_inertia": 0.3}
     with pytest.raises(TaskFormatError, match=r"missing parameters \['inertia'\], unknown parameters \['w_inertia'\]"):
-        build(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": theta})
+        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": theta})
     with pytest.raises(TaskFormatError, match=r"missing parameters \['w_deliver'\], unknown parameters \[\]"):
-        without = {name: value for name, value in DEFAULTS.items() if name != "w_deliver"}
-        build(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": without})
+        without = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "w_deliver"}
+        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": without})
