@@ -105,11 +105,12 @@ def _source_card(datasets: Sequence[Dataset]) -> str:
     """Return a list of the releases, with the hashes of their manifests, and their cards."""
     parts, cards = [], []
     for dataset in datasets:
+        listed = read_manifest(dataset.root)  # before hashing: refuses a manifest that is a pipe or far too large
         parts.append(
             f"* {dataset.root.name}: data version {dataset.info.data_version}, {len(dataset):,} histories, "
             f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}\n"
         )
-        names = [RELEASE_CARD] + [name for name in read_manifest(dataset.root) if name == SOURCE_CARD]
+        names = [RELEASE_CARD] + [name for name in listed if name == SOURCE_CARD]
         cards += [_card_text(read_text(dataset.origin.file(name))) for name in names]
     heading = "# ICRL4AHT learning histories, combined\n\nMade of these releases, whose own cards follow:\n\n"
     return f"{heading}{''.join(parts)}\n" + "\n".join(cards)
