@@ -195,7 +195,7 @@ def test_learned_teammates_on_some_layouts(changed):
             'rollout = 40\nlearning_rate = "fast"',
             r"ego\.learning_rate = fast: expected a number",
         ),
-        ("gru = 8", "gru = 8.5", r"widths\.gru = 8\.5: expected an integer at least 1"),
+        ("gru = 8", "gru = 8.5", r"ego\.widths\.gru = 8\.5: expected an integer at least 1"),
         (
             '["coord_simple", "cramped_room_up"]',
             "[]",

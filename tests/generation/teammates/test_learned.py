@@ -184,7 +184,7 @@ def test_a_missing_checkpoint_is_a_clear_error(tmp_path, missing):
 
 
 def test_a_missing_suite_is_a_clear_error(suite):
-    with pytest.raises(OptionError, match="teammate a is a checkpoint: say in which folder the suite of teammates is"):
+    with pytest.raises(OptionError, match="teammate a is a checkpoint: give the folder of the suite of teammates"):
         learned.build_learned_entry(LAYOUT, entry(suite, "a"), None)
 
 
