@@ -18,7 +18,7 @@ from baselines.report.results import EvaluationRun, note_results, read_run
 from baselines.training.histories import prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.trainer import train
-from generation.teammates.instances import named_task
+from generation.teammates.instances import published_task
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.benchmark.tasks import Task
@@ -92,7 +92,7 @@ def run_demo(
     _train_demo(out / "ad", model, options, console)
 
     say(5, f"evaluating it and {', '.join(AGENTS)} on {len(families)} tasks of {DEMO_LAYOUT}")
-    tasks = [named_task(DEMO_LAYOUT, f"{family}/t0") for family in families]
+    tasks = [published_task(DEMO_LAYOUT, f"{family}/t0") for family in families]
     runs = [_evaluate_demo(agent, tasks, protocol, out / "results") for agent in (*AGENTS, str(out / "ad"))]
     console.print(_format_returns(runs), highlight=False)
     console.print("(a model this small, trained this briefly, shows the workflow, not the method's ability)")

@@ -131,7 +131,8 @@ def transition_bytes(streams: int) -> dict[str, Any]:
     dataset = load_icrl4aht(obs="uint8")
     chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
     new = [
-        NewTask(task, Provenance(), len(part), lambda part=part: map(NewHistory.from_history, part)) for task, part in chosen
+        NewTask(task, Provenance(), len(part), lambda part=part: map(NewHistory.from_history, part))
+        for task, part in chosen
     ]
     transitions = sum(history.entry.T for _, part in chosen for history in part)
     with tempfile.TemporaryDirectory() as folder:

@@ -14,7 +14,9 @@ from rich.console import Console
 
 from generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
 from generation.learners.config import PPOConfig, Widths
-from icrl4aht_data.benchmark.facts import ALGORITHMS
+from generation.teammates.instances import published_tasks
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
@@ -29,7 +31,9 @@ from icrl4aht_data.commands.options import (
     run,
     version_option,
 )
+from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.format.schema import KINDS, Kind
+from icrl4aht_data.overcooked.layouts import get_layout
 
 console = Console(soft_wrap=True)
 
@@ -186,7 +190,6 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
     from generation.planning.plan import task_learner
     from generation.planning.speed import learner_speed
     from generation.profiles import load_profile
-    from icrl4aht_data.overcooked.layouts import get_layout
 
     name = get_layout(layout).name
     profile = load_profile(profile_name).with_ego(ego)
@@ -201,11 +204,6 @@ def manifests(check: bool) -> None:
 
     Makes icrl4aht_data/manifests/*.jsonl from the published parameter sets.
     """
-    from generation.teammates.instances import published_tasks
-    from icrl4aht_data.benchmark.facts import TRACKS
-    from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
-    from icrl4aht_data.errors import TaskFormatError
-
     for track in TRACKS:
         path, tasks = manifest_path(track, "test"), published_tasks(track)
         if not check:
@@ -247,8 +245,6 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
     """
     from generation.populations.build import build_suite
     from generation.profiles import load_profile
-    from icrl4aht_data.errors import OptionError
-    from icrl4aht_data.overcooked.layouts import get_layout
 
     request_determinism()
     profile = load_profile(profile_name)

@@ -24,7 +24,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.published import from_published, to_published
 from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 from tests.helpers.tiny import PAIR, TINY
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
@@ -123,7 +123,7 @@ def full(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
 
 
 @pytest.fixture(params=["lite", "full"])
-def either(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+def lite_or_full(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
     """`lite`, then `full`."""
     return request.getfixturevalue(request.param)
 
@@ -161,22 +161,22 @@ def pair(built, shared_folder) -> Path:
 
 
 @pytest.fixture(scope="session")
-def theirs(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
+def published_folder(tmp_path_factory) -> tuple[Path, list[dict[str, np.ndarray]]]:
     """Hand-written published files. Read only."""
     folder = tmp_path_factory.mktemp("theirs") / "files"
     return folder, publish(folder)
 
 
 @pytest.fixture(scope="session")
-def ours(theirs, tmp_path_factory) -> Path:
+def converted_release(published_folder, tmp_path_factory) -> Path:
     """The release of observations converted from `theirs`. Read only."""
     root = tmp_path_factory.mktemp("ours") / "release"
-    assert from_published(theirs[0], root, kept_steps=KEPT) == "observations"
+    assert from_published(published_folder[0], root, kept_steps=KEPT) == "observations"
     return root
 
 
 @pytest.fixture(scope="session")
-def twin(lite, tmp_path_factory) -> Path:
+def reconverted_release(lite, tmp_path_factory) -> Path:
     """`lite` converted to published files without states and back. Read only."""
     folder = tmp_path_factory.mktemp("twin")
     to_published(load_icrl4aht(lite[0]), folder / "files", states=False)

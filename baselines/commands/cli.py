@@ -32,7 +32,7 @@ from baselines.commands.options import (
 )
 from baselines.methods.options import SIZES, ModelOptions
 from baselines.training.options import HistoryOptions, TrainOptions
-from generation.teammates.instances import INSTANCES, named_task
+from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
@@ -209,7 +209,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     from baselines.evaluate.protocols import get_protocol
     from baselines.report.episode_gifs import episode_gif
 
-    task = named_task(layout, teammate)
+    task = published_task(layout, teammate)
     earned = episode_gif(out, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
     _console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
 
@@ -261,7 +261,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     played = get_protocol(protocol, episodes or 3 * fill_window)
     name = get_layout(layout or trained.layouts[0]).name
     check_fits(trained, get_layout(name), run)
-    tasks = [named_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
+    tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
     with bars() as show:
         found = []
         for episode in measure_drift(trained.method, trained.params, trained.context, tasks, played):

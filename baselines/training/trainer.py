@@ -67,7 +67,7 @@ def learning_rate_schedule(options: TrainOptions) -> optax.Schedule:
     return optax.warmup_cosine_decay_schedule(0.0, options.learning_rate, warmup, max(options.steps, warmup + 1))
 
 
-def make_optimizer(options: TrainOptions) -> optax.GradientTransformation:
+def training_optimizer(options: TrainOptions) -> optax.GradientTransformation:
     """Returns AdamW on gradients clipped by global norm."""
     adam = optax.adamw(learning_rate_schedule(options), weight_decay=options.weight_decay)
     return optax.chain(optax.clip_by_global_norm(options.clip), adam)
@@ -93,7 +93,7 @@ class Trainer:
                 f"batch_size = {options.batch_size}: expected a multiple of {share}, {len(devices)} devices x "
                 f"{options.accumulate} parts"
             )
-        self.method, self.options, self._optimizer = method, options, make_optimizer(options)
+        self.method, self.options, self._optimizer = method, options, training_optimizer(options)
         self._learning_rate = learning_rate_schedule(options)
         mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
         self.rows, self._parts, self.everywhere = (

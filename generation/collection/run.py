@@ -14,6 +14,7 @@ from rich.console import Console
 from generation.collection.failures import FAILED, FailureLog
 from generation.collection.job import CollectionError, CollectionJob, TaskOutcome
 from generation.collection.options import CollectOptions
+from generation.collection.ray_executor import run_on_ray
 from generation.collection.task_folder import is_task_finished, last_timing
 from generation.profiles import Profile
 from generation.progress import ProgressBoard
@@ -125,7 +126,6 @@ def _run_all(
 def _executor(options: CollectOptions) -> Executor:
     if options.executor == "local":
         return run_in_process
-    from generation.collection.ray_executor import run_on_ray
 
     return run_on_ray
 

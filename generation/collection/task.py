@@ -36,7 +36,7 @@ from icrl4aht_data.overcooked.actions import TEAMMATE
 TEAMMATE_NOISE: Noise = "seeded"
 """Heuristic teammates of training histories draw from each episode's own key."""
 
-SAVE_SECONDS = 30.0
+TASK_SAVE_SECONDS = 30.0
 """Interval of saves: the work that a kill can cost."""
 
 UpdateCallback = Callable[[int, dict[str, float]], None]
@@ -57,7 +57,7 @@ def run_task(
     *,
     suite: Path | None = None,
     wait: bool = False,
-    save_seconds: float = SAVE_SECONDS,
+    save_seconds: float = TASK_SAVE_SECONDS,
 ) -> bool:
     """Train the ego of a task and record its histories into `folder`, resuming from the last saved update.
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Int, Key
 from generation.env import Environment
 from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
-from generation.learners.ppo import PPO, episode_metrics, make_optimizer, sequences, shaping_weight
+from generation.learners.ppo import PPO, episode_metrics, ppo_optimizer, sequences, shaping_weight
 from generation.learners.rollout import (
     Player,
     Rollout,
@@ -86,7 +86,7 @@ class Learner:
         params = self.network.untrained(params_key, self.env.layout.channels)
         env_keys = jax.random.split(env_key, self.config.environments)
         carry = init_rollout(self.env, self.players(params, self.teammate.params), env_keys)
-        optimizer = make_optimizer(self.config).init(params)
+        optimizer = ppo_optimizer(self.config).init(params)
         return LearnerState(params, optimizer, carry, self.teammate.params, running_key, jnp.int32(0))
 
     def update(self, state: LearnerState) -> tuple[LearnerState, Rollout, dict[str, Array]]:

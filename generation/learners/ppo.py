@@ -25,7 +25,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
 
-def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
+def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     """Adam under a linear warm-up and a cosine decay (paper, App. C.2.3), gradients clipped by global norm."""
     steps = config.updates * config.epochs * config.minibatches
     schedule = optax.warmup_cosine_decay_schedule(
@@ -123,7 +123,7 @@ class PPO:
         Returns:
             Parameters, optimiser state, and the mean of each loss over all minibatches.
         """
-        config, optimiser = self.config, make_optimizer(self.config)
+        config, optimiser = self.config, ppo_optimizer(self.config)
         count = played.done.shape[1] - played.done.shape[1] % config.minibatches
         # From the values at playing time: advantages and targets stay fixed over the epochs.
         advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)

@@ -52,7 +52,7 @@ from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 CHECKPOINTS_PER_MEMBER = 5
 """Evenly spaced over a policy's training (paper, App. B.1)."""
 
-SAVE_SECONDS = 60.0
+POPULATION_SAVE_SECONDS = 60.0
 """Interval of saves: the work that a kill can cost."""
 
 _SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
@@ -156,7 +156,7 @@ def train_population(
     on_update: PopulationCallback = lambda update, updates, metrics: None,
     *,
     wait: bool = False,
-    save_seconds: float = SAVE_SECONDS,
+    save_seconds: float = POPULATION_SAVE_SECONDS,
 ) -> bool:
     """Train a population into `folder`, resuming a stopped run of the same settings.
 

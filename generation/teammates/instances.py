@@ -111,7 +111,7 @@ def _published(value: float, family: str) -> float:
     return float(np.float32(value))
 
 
-def named_task(layout: str, teammate: str) -> Task:
+def published_task(layout: str, teammate: str) -> Task:
     """The test task of a layout, of the test or the training split, with a teammate such as "H3/t1".
 
     Raises:

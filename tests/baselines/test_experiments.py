@@ -37,7 +37,7 @@ from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 

@@ -17,7 +17,7 @@ from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
 from icrl4aht_data.overcooked.state import State, columns, faults, unpack
-from tests.helpers.scenes import random_records, scene
+from tests.helpers.states import random_records, state_record
 
 CRAMPED, ASYMM = LAYOUTS["cramped_up"], LAYOUTS["asymm_both"]
 PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
@@ -64,7 +64,7 @@ def some_keys(number: int) -> jax.Array:
 def at_goal(state: EnvState) -> EnvState:
     """Environments of cramped_up changed: the teammate stands at the goal with the dish of the current recipe."""
     where, recipes = columns(CRAMPED), fields(CRAMPED, state.record).recipe
-    records = np.repeat(scene(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
+    records = np.repeat(state_record(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
     records[:, where.recipe] = recipes
     records[:, where.hands.start + 1] = recipes | (PLATE | COOKED)
     return state._replace(record=jnp.asarray(records))
@@ -298,9 +298,11 @@ def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
 
 def test_shaped_rewards_are_each_agents_own_and_apart_from_the_teams(cramped, keys):
     """Environments of three scenes in one batch: a placement, a dish, and a wrong delivery beside a plate."""
-    places = scene(CRAMPED, (2, 1, "up"), (2, 2, "up"), hands=[ZERO, 0])
-    dishes = scene(CRAMPED, (2, 2, "up"), (2, 1, "up"), hands=[0, PLATE], pot_items=[COOKED + 3 * ZERO])
-    serves = scene(CRAMPED, (1, 2, "down"), (3, 2, "down"), hands=[0, PLATE + COOKED + 3 * ONE], pot_items=[ZERO])
+    places = state_record(CRAMPED, (2, 1, "up"), (2, 2, "up"), hands=[ZERO, 0])
+    dishes = state_record(CRAMPED, (2, 2, "up"), (2, 1, "up"), hands=[0, PLATE], pot_items=[COOKED + 3 * ZERO])
+    serves = state_record(
+        CRAMPED, (1, 2, "down"), (3, 2, "down"), hands=[0, PLATE + COOKED + 3 * ONE], pot_items=[ZERO]
+    )
     kinds = np.arange(N) % 3
     state = cramped.init(keys)._replace(record=jnp.asarray(np.concatenate([places, dishes, serves])[kinds]))
     step = cramped.step(state, jnp.asarray(np.full((N, 2), INTERACT, np.int32)))

@@ -11,7 +11,7 @@ import numpy as np
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
-from tests.helpers.random_play import play
+from tests.helpers.random_releases import random_history
 
 KEPT = 20
 """Steps of an episode."""
@@ -34,7 +34,7 @@ def publish(folder: Path) -> list[dict[str, np.ndarray]]:
     with h5py.File(folder / "histories.h5", "w") as file, (folder / "histories_index.jsonl").open("w") as index:
         for number, (name, task, steps) in enumerate(plans):
             layout = get_layout(name)
-            arrays = play(layout, 7, KEPT, rng)
+            arrays = random_history(layout, 7, KEPT, rng)
             kept = {"obs": observe(layout, arrays["state"], 0)[:steps]}
             kept |= {field: arrays[field][:steps] for field in ("actions", "rewards", "dones")}
             kept |= {"teammate_actions": arrays["teammate_actions"][:steps]} if task != "c" else {}

@@ -30,7 +30,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.paths import ROOT
-from tests.helpers.random_play import play, random_release
+from tests.helpers.random_releases import random_history, random_release
 from tests.helpers.tiny import start
 from tests.packaging.test_readme import PROGRAMS, blocks, commands, understand
 
@@ -171,7 +171,7 @@ class TestFormat:
         assert parsed["S"] == state.record_size(layout)
         for part in ("pots", "buttons", "counters"):
             assert tuple(parsed[part]) == getattr(layout, part)
-        records = play(layout, 3, 60, np.random.default_rng(0))["state"][::4]
+        records = random_history(layout, 3, 60, np.random.default_rng(0))["state"][::4]
         parts = state.unpack(layout, records)
         for number, record in enumerate(records):
             for ours, values in zip(parts, reader["unpack"](parsed, record).values(), strict=True):
@@ -270,7 +270,7 @@ sys.path[:0] = sys.argv[1:]
 os.chdir(sys.argv[1])
 import dataclasses
 from pathlib import Path
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 from baselines.agents import stay
 from baselines.evaluate import evaluate, get_protocol
 from baselines.report import as_run, markdown, rows

@@ -24,7 +24,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import FORMAT_VERSION
 from tests.helpers.paths import ROOT
-from tests.helpers.random_play import SHARD
+from tests.helpers.random_releases import SHARD
 
 
 @pytest.fixture

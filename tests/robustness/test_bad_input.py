@@ -23,7 +23,7 @@ from icrl4aht_data.errors import (
     UnknownNameError,
 )
 from icrl4aht_data.format.chunks import chunk_table_path
-from tests.helpers.random_play import SHARD
+from tests.helpers.random_releases import SHARD
 
 
 def read_all(root):

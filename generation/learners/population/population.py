@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 from generation.env import Environment, EnvState
 from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
-from generation.learners.ppo import PPO, make_optimizer, sequences, shaping_weight
+from generation.learners.ppo import PPO, ppo_optimizer, sequences, shaping_weight
 from generation.learners.rollout import Player, Rollout, RolloutCarry, init_rollout, network_player, roll_out
 
 
@@ -212,7 +212,7 @@ class Population:
         learning = jax.tree.map(lambda leaf: leaf[: self.assignment.learning], params)
         return PopulationState(
             params=params,
-            optimizer=jax.vmap(make_optimizer(self.config).init)(learning),
+            optimizer=jax.vmap(ppo_optimizer(self.config).init)(learning),
             carry=carry,
             memory=self.algorithm.init(),
             visited=carry.env.record,

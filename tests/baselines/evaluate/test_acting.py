@@ -25,7 +25,7 @@ from generation.learners.resume import Checkpoints
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.utils.hashes import file_hash
-from tests.helpers.flat_world import drawn
+from tests.helpers.small_models import random_parameters
 from tests.servers.common import http_server
 
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2, steps=10)
@@ -45,7 +45,7 @@ def runs(lite, tmp_path_factory) -> Path:
         job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
         config = {**format_versions(), "method": name, **job.about, "train": dataclasses.asdict(OPTIONS)}
         open_run(folder / name, config)
-        Checkpoints(folder / name / CHECKPOINTS).save({"params": drawn(job.method), "step": np.int32(2)}, 2)
+        Checkpoints(folder / name / CHECKPOINTS).save({"params": random_parameters(job.method), "step": np.int32(2)}, 2)
     return folder
 
 
@@ -68,7 +68,7 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
 def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
     """With one layer there is no drift at all: a step's cache is computed from that step alone."""
     two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
-    params, found, protocol = drawn(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
+    params, found, protocol = random_parameters(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
 
     def on_two_layers(method, params_of_run, context, tasks, planned):
         assert (context, len(tasks), planned.episodes) == (30, 5, 3)

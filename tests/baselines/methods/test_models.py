@@ -30,8 +30,8 @@ from baselines.methods.tokens import (
 from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.sampling.ad import ADBatch
-from tests.helpers.flat_world import FLAT, TINY, ad_batch, dpt_batch, drawn
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
+from tests.helpers.small_models import FLAT, TINY, ad_batch, dpt_batch, random_parameters
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -46,7 +46,7 @@ def sizes(method: Method) -> int:
 def tiny(name: str, **changes: Any) -> tuple[Method, Any]:
     """Returns a method in the flat world, and parameters, none of them zero."""
     method = get_method(name)(dataclasses.replace(TINY, **changes), FLAT)
-    return method, drawn(method)
+    return method, random_parameters(method)
 
 
 def run(method: Method, params: Any, *inputs: Any, **named: Any) -> Any:
@@ -289,7 +289,7 @@ class TestOvercooked:
         data = {obs: load_icrl4aht(lite[0], layout="demo_wide", obs=obs) for obs in ("state", "float32")}
         shown = get_method(name)(options, world._replace(view=plain_view))
         rendered = get_method(name)(options, world)
-        params = drawn(shown)
+        params = random_parameters(shown)
         state, obs = (
             d.ad(batch_size=2, length=6)[3] if name == "ad" else d.dpt(batch_size=2, context=5)[3]
             for d in data.values()
@@ -392,7 +392,7 @@ def test_amago_prefers_what_is_rewarded():
     """Learns from random play in which action 2 is rewarded; imitation alone would remain random."""
     options = ModelOptions(layers=1, width=16, heads=2, dropout=0.0, discounts=(0.5, 0.8))
     method = get_method("amago_offline")(options, FLAT)
-    params = slow = drawn(method)
+    params = slow = random_parameters(method)
     optimizer = optax.adam(5e-3)
 
     def batch(key):

@@ -20,12 +20,19 @@ from baselines.methods.registry import get_method
 from baselines.training.histories import hold_out, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS
-from baselines.training.trainer import Trainer, TrainingData, TrainState, learning_rate_schedule, make_optimizer, train
+from baselines.training.trainer import (
+    Trainer,
+    TrainingData,
+    TrainState,
+    learning_rate_schedule,
+    training_optimizer,
+    train,
+)
 from generation.learners.resume import Checkpoints
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import LabelsMissingError, OptionError
-from tests.helpers.flat_world import FLAT, TINY, ad_batch, drawn
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
+from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -153,10 +160,10 @@ class TestStep:
         one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
         batch = Rows().batch(0)
         batch = batch._replace(attention_mask=np.arange(7) < np.array([7, 2, 5, 7])[:, None])
-        params = drawn(method)
+        params = random_parameters(method)
 
         def log_of(trainer: Trainer) -> dict[str, Any]:
-            state = TrainState(params, None, make_optimizer(OPTIONS).init(params), jnp.int32(0))
+            state = TrainState(params, None, training_optimizer(OPTIONS).init(params), jnp.int32(0))
             placed = jax.device_put(jax.tree.map(jnp.copy, state), trainer.everywhere)
             return trainer.step(placed, jax.device_put(batch, trainer.rows))[1]
 
@@ -171,7 +178,7 @@ class TestStep:
         np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
 
     def test_gradients_are_clipped(self):
-        optimizer = make_optimizer(dataclasses.replace(OPTIONS, clip=1.0, warmup=0.0))
+        optimizer = training_optimizer(dataclasses.replace(OPTIONS, clip=1.0, warmup=0.0))
         params = {"w": jnp.zeros(4)}
         for scale in (1e3, 1e6):
             _, state = optimizer.update({"w": scale * jnp.ones(4)}, optimizer.init(params), params)

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
-from tests.helpers.scenes import random_records
+from tests.helpers.states import random_records
 
 LAYOUT = LAYOUTS["cramped_up"]
 TABLES = 3

@@ -26,6 +26,7 @@ from generation.progress import ProgressBoard
 from generation.releases import build
 from generation.releases.check import compare_rebuilds
 from icrl4aht_data import verify_release
+from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import artefact, start
 
 
@@ -194,7 +195,6 @@ def test_ray_with_two_workers(built, pair, tmp_path):
 
 
 def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
-    from icrl4aht_data.errors import OptionError
 
     with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 has its own"):
         collect(tasks, tmp_path, executor="ray", address="there:6379", workers=2)

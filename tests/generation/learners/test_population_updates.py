@@ -110,13 +110,13 @@ def test_weights_scale_the_surrogate_place_by_place(surrogate, parts):
 
 @pytest.fixture(scope="module")
 def learn(lbrdiv):
-    """Of one policy."""
+    """The compiled update of one policy."""
     return compiled(lbrdiv.population.ppo.learn)
 
 
 @pytest.fixture(scope="module")
 def learned(lbrdiv, parts) -> tuple[Any, Any, dict[str, Any]]:
-    """Both parts at once."""
+    """The updates of both policies, vmapped."""
     return compiled(jax.vmap(lbrdiv.population.ppo.learn))(*parts, jax.random.split(jax.random.key(8), 2))
 
 
@@ -130,7 +130,7 @@ def test_policies_that_learn_at_once_learn_as_each_alone(learn, parts, learned):
 
 
 def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
-    """Of the two policies the first plays the rewarded action more often than before, the second less often."""
+    """The first of two policies plays the rewarded action more often than before, the second less often."""
     obs = observe(LAYOUT, np.asarray(parts.played.record[0, 0]), EGO)[None]
 
     def probability(params):

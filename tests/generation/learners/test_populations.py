@@ -201,7 +201,7 @@ def test_slot_weights_are_the_papers(algorithm, memory):
 
 
 def test_brdiv_weighs_self_play_by_one_more_than_twice_cross_play():
-    """Of a confederate's weights, summed over its slots by opposite: 2 for its own, -1/2 for each other one's."""
+    """A confederate's weights, summed over its slots by partner: 2 for its best response, -1/2 for each other's."""
     assignment = BRDiv(3).assignment(16)
     weights = np.asarray(population(BRDiv(3))._slot_weights(()))[assignment.envs :]
     totals = np.array(

@@ -24,7 +24,7 @@ from generation.learners.ppo import (
     Batch,
     Sequences,
     generalised_advantage,
-    make_optimizer,
+    ppo_optimizer,
     sequences,
 )
 from generation.learners.rollout import Choice, Rollout, policy_player, roll_out
@@ -51,7 +51,7 @@ UpdateFunction = Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str,
 
 
 PARAMS = {"turn": np.uint32(0)}
-"""Of the stand-in teammate: how far it turns from where it would go."""
+"""Parameters of the scripted teammate: how far it turns from the direction that it would take."""
 
 
 class Diary(NamedTuple):
@@ -98,7 +98,7 @@ def frozen(untrained) -> LearnerState:
 
 @pytest.fixture(scope="module")
 def learning(frozen) -> LearnerState:
-    """The same in the middle of the schedule."""
+    """A learner in the middle of its schedule; otherwise equal to `frozen`."""
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     return frozen._replace(optimizer=counted(frozen.optimizer, steps // 2))
 
@@ -305,7 +305,7 @@ def test_minibatches_are_shuffled_by_the_key(update, learning):
 
 
 def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
-    """Of four sequences for three minibatches; which one, the key says."""
+    """Four sequences for three minibatches: the key decides which one is left out."""
     ppo = PPO(CLOSET, learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
     learn = compiled(ppo.learn)
     given = egos_sequences(played.before[1], played.rollouts[1])
@@ -413,10 +413,10 @@ def test_learning_rate_schedule():
     gradient = jnp.float32(1e-3)
 
     def one(state, _):
-        change, state = make_optimizer(CONFIG).update(gradient, state)
+        change, state = ppo_optimizer(CONFIG).update(gradient, state)
         return state, change
 
-    changes = jax.lax.scan(one, make_optimizer(CONFIG).init(gradient), length=steps + 1)[1]
+    changes = jax.lax.scan(one, ppo_optimizer(CONFIG).init(gradient), length=steps + 1)[1]
     rates = -np.asarray(changes, np.float64) * (1e-3 + 1e-5) / 1e-3
     t = np.arange(steps + 1)
     expected = np.where(t < warm, t / warm, 0.5 * (1 + np.cos(np.pi * (t - warm) / (steps - warm))))
@@ -434,9 +434,9 @@ def test_gradients_are_clipped_by_their_global_norm():
     directions = {"a": jnp.float32(0.6), "b": jnp.float32(-0.8)}
 
     def second(first: float) -> list[float]:
-        state = make_optimizer(CONFIG).init(directions)
+        state = ppo_optimizer(CONFIG).init(directions)
         for size in (first, bound):
-            change, state = make_optimizer(CONFIG).update(jax.tree.map(lambda x, s=size: x * s, directions), state)
+            change, state = ppo_optimizer(CONFIG).update(jax.tree.map(lambda x, s=size: x * s, directions), state)
         return [float(x) for x in jax.tree.leaves(change)]
 
     np.testing.assert_allclose(second(100.0), second(bound), rtol=1e-5)

@@ -33,13 +33,13 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.jit import compiled
-from tests.helpers.scenes import random_records
+from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
 ENVS, EPISODE, STEPS = 4, 5, 8
 ENV = Environment(LAYOUT, max_steps=EPISODE)
 SLOTS = np.array([5, 0, 3, 6]), np.array([2, 7, 4, 1])
-"""Of the two scripted players. The second env carry the second player twice, the third and fourth one of each."""
+"""Agent slots of the two scripted players: environment 1 has the second player twice, 2 and 3 one of each."""
 
 NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8), partners=3)
 
@@ -111,7 +111,7 @@ def restarted() -> Played:
 
 @pytest.fixture(scope="module")
 def params() -> Any:
-    """Of three policies, leaves (3, ...); far from uniform."""
+    """Parameters of three policies, leaves (3, ...), whose action probabilities are far from uniform."""
     obs = jnp.zeros((1, 1, 5, 5, LAYOUT.channels), jnp.uint8)
     shapes = jax.eval_shape(
         NETWORK.init, jax.random.key(0), NETWORK.initial_hidden(1), obs, jnp.ones((1, 1), bool), jnp.zeros(1, int)

@@ -31,7 +31,7 @@ def turning(params, steps, view, key):
 
 
 def turning_too(params, steps, view, key):
-    """The same by another function."""
+    """Acts as `turning` does, as a function of its own."""
     return turning(params, steps, view, key)
 
 

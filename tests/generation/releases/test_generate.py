@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
 
-from generation.cli import cli
+from generation.cli import cli, main
 from generation.collection import job
 from generation.collection import task as collect
 from generation.collection import task_folder as artefacts
@@ -29,7 +29,7 @@ from generation.populations import train as suite
 from generation.populations.build import build_suite
 from generation.profiles import FOLDER, load_profile
 from generation.releases import build, package
-from generation.teammates.registry import recover_teammate
+from generation.teammates.registry import build_teammate, recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import OptionError
@@ -167,7 +167,6 @@ def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
 
 
 def test_the_teammate_can_be_rebuilt(built):
-    from generation.teammates.registry import build_teammate
 
     spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
     assert (spec["slot"], spec["noise"]) == (1, "seeded")
@@ -377,7 +376,6 @@ def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, mo
 
 
 def test_unknown_profile_is_one_line(tmp_path):
-    from generation.cli import main
 
     result = CliRunner().invoke(cli, ["generate", "--profile", "huge", "--out", str(tmp_path)])
     assert "unknown profile 'huge'; valid: mini, paper, smoke" in str(result.exception)

@@ -30,7 +30,7 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, PLATE, Layout
 from icrl4aht_data.overcooked.state import faults
-from tests.helpers.scenes import random_records, scene
+from tests.helpers.states import random_records, state_record
 
 H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
 # These programs are compiled to run a few times: neither optimise them nor use the newer, slower code generator.
@@ -95,7 +95,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
     thetas = published_thetas(name, family)
     policy = build_teammate(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
     records = Environment(layout).init(jax.random.split(jax.random.key(7), episodes)).record
-    pinned = scene(layout, (1, 1, "up"), (5, 2, "up"))
+    pinned = state_record(layout, (1, 1, "up"), (5, 2, "up"))
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
     recipes[:, -1] = layout.recipe_items[0]
 
@@ -182,7 +182,7 @@ def first_memories(layout: Layout, slots=ALL_SLOTS) -> dict:
 
 @lru_cache
 def many_params(name: str) -> dict:
-    """Of every seat ROWS parameter sets: the published ones, the presets and sampled ones."""
+    """ROWS parameter sets for every agent slot: the published ones, the presets and sampled ones."""
     params = {}
     for family, heuristic in HEURISTIC_FAMILIES.items():
         presets = [heuristic_teammate(family, preset, 0)["theta"] for preset in heuristic.presets]
@@ -229,7 +229,7 @@ def one_step(
     slots = ALL_SLOTS if layout.name in LAYOUTS else ((family, slot),)
     agents = (mine, partner) if slot == 0 else (partner, mine)
     fields["hands"] = [place[3] for place in agents]
-    records = np.repeat(scene(layout, agents[0][:3], agents[1][:3], **fields), ROWS, axis=0)
+    records = np.repeat(state_record(layout, agents[0][:3], agents[1][:3], **fields), ROWS, axis=0)
     memories = first_memories(layout, slots)
     mind = memories[family, slot]
     mind = mind._replace(**{name: np.full_like(getattr(mind, name), v) for name, v in (memory or {}).items()})
@@ -386,7 +386,7 @@ def test_links_of_the_key_chain(family, theta, hand, expected):
 def test_h3_wrong_moves_are_the_keys_own(stubbornness):
     """The chain's next key is split once more, and the second half draws one of right, down, left, up."""
     layout, seat = LAYOUTS["demo_wide"], (H3, 1)
-    records = np.repeat(scene(layout, (5, 1, "up"), (4, 3, "up")), ROWS, axis=0)
+    records = np.repeat(state_record(layout, (5, 1, "up"), (4, 3, "up")), ROWS, axis=0)
     memories = first_memories(layout)
     params = many_params("demo_wide") | {
         seat: stacked(H3, [ASSEMBLY_LINE.defaults | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)

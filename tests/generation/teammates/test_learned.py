@@ -23,7 +23,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.jit import compiled
-from tests.helpers.scenes import random_records
+from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
 WIDTHS = Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8)
@@ -74,7 +74,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
 
 
 def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
-    """Its actions (T, N) at three tables in these states, one after the other."""
+    """Actions (T, N) of a policy in N environments with these states, step by step."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, slot, TABLES)
     act = compiled(player.act)
     zero = jnp.zeros(TABLES, jnp.int32)

@@ -23,7 +23,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, PUBL
 from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL, Layout
 from icrl4aht_data.overcooked.state import ingredient_count, start, unpack
 from tests.helpers.jit import compiled
-from tests.helpers.scenes import random_records, scene
+from tests.helpers.states import random_records, state_record
 
 PUBLISHED_PLAY = "030512503051250305125325124444444444444450530512503051250305"
 """H4-t0..t4 on test_simple in the published ids, by an independent simulator of the published teammates."""
@@ -119,7 +119,7 @@ def published(name: str) -> tuple[np.ndarray, np.ndarray]:
     layout = LAYOUTS[name]
     records = start_records(layout, 12)
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, 13))
-    pinned = scene(layout, (1, 1, "up"), (5, 2, "up")) if name == "test_simple" else records[:1]
+    pinned = state_record(layout, (1, 1, "up"), (5, 2, "up")) if name == "test_simple" else records[:1]
     recipes[:, -1] = pinned[0, 6]
     keys = jax.random.split(jax.random.key(8), 13)
     return play(layout, np.concatenate([records, pinned]), recipes, keys)
@@ -310,7 +310,7 @@ def test_equals_plain_rules_on_random_states(layout, slot):
     n = 400
     records = random_records(layout, n, rng)
     if layout is ISLAND:  # some in the dead end behind the partner, with a plate that nothing asks for yet
-        records[:20] = scene(layout, (5, 2, "up"), (6, 2, "down"), hands=(0, 1))
+        records[:20] = state_record(layout, (5, 2, "up"), (6, 2, "down"), hands=(0, 1))
     last, rolls = rng.integers(-1, 8, n), rng.integers(0, 100, n)
     thetas = [
         UTILITY_GREEDY.defaults | UTILITY_GREEDY.presets[preset] for preset in UTILITY_GREEDY.presets
@@ -359,7 +359,7 @@ def _first_memory(noise: Noise, keys: jax.Array, slot: int = TEAMMATE) -> Greedy
 def _heading_up(slot: int, partner: tuple[int, int, str]) -> np.ndarray:
     """(8, S): H4, empty-handed at (1, 2), wants to go up to (1, 1), towards pile 0."""
     mover = (1, 2, "up")
-    record = scene(LAYOUTS["cramped_up"], *((mover, partner) if slot == 0 else (partner, mover)))
+    record = state_record(LAYOUTS["cramped_up"], *((mover, partner) if slot == 0 else (partner, mover)))
     return np.repeat(record, 8, axis=0)
 
 

@@ -23,22 +23,22 @@ from icrl4aht_data.writing.published import to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.batches import CACHES
 from tests.helpers.published_files import KEPT, SHARD
-from tests.helpers.random_play import make_tasks
+from tests.helpers.random_releases import make_tasks
 
 
 @pytest.fixture
-def copy(ours, tmp_path) -> Path:
+def copy(converted_release, tmp_path) -> Path:
     """Return a copy of a release of observations, to damage."""
-    return shutil.copytree(ours, tmp_path / "copy")
+    return shutil.copytree(converted_release, tmp_path / "copy")
 
 
 def problems(root: Path, level: Level = "full") -> list[str]:
     return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
-def spoiled(theirs, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
+def spoiled(published_folder, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
     """Write the first history as a release with valid hashes and spoiled content."""
-    arrays = {key: array.copy() for key, array in theirs[1][0].items()}
+    arrays = {key: array.copy() for key, array in published_folder[1][0].items()}
     arrays[name][index] = value
     (task,) = make_tasks(["demo_wide"])
     new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)])
@@ -47,8 +47,8 @@ def spoiled(theirs, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
 
 class TestVerify:
     @pytest.mark.parametrize("level", ["full", "deep"])
-    def test_valid(self, ours, twin, level):
-        for root, transitions in ((ours, 360), (twin, 1440)):
+    def test_valid(self, converted_release, reconverted_release, level):
+        for root, transitions in ((converted_release, 360), (reconverted_release, 1440)):
             report = verify_release(root, level=level)
             assert report.ok, report.findings
             assert report.transitions == transitions
@@ -87,12 +87,12 @@ class TestVerify:
             ("rewards", 7, 200, "rewards: expected integers that fit into a byte, found"),
         ],
     )
-    def test_values_out_of_range(self, theirs, tmp_path, name, index, value, message):
-        assert any(message in line for line in problems(spoiled(theirs, tmp_path, name, index, value)))
+    def test_values_out_of_range(self, published_folder, tmp_path, name, index, value, message):
+        assert any(message in line for line in problems(spoiled(published_folder, tmp_path, name, index, value)))
 
-    def test_deep_finds_an_observation_that_no_cell_shows(self, theirs, tmp_path):
+    def test_deep_finds_an_observation_that_no_cell_shows(self, published_folder, tmp_path):
         first = 2 * (7 + get_layout("demo_wide").ingredient_types)
-        root = spoiled(theirs, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
+        root = spoiled(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
         assert problems(root) == []
         (found,) = problems(root, level="deep")
         assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
@@ -120,8 +120,8 @@ class TestCommand:
         assert result.exit_code == code, (result.output, result.exception)
         return result.output if result.exception is None or code == 2 else f"{result.output}{result.exception}"
 
-    def test_convert_says_what_is_missing(self, theirs, tmp_path):
-        said = self.run("convert", theirs[0], tmp_path / "out", "--kept-steps", KEPT)
+    def test_convert_says_what_is_missing(self, published_folder, tmp_path):
+        said = self.run("convert", published_folder[0], tmp_path / "out", "--kept-steps", KEPT)
         assert said == f"{tmp_path / 'out'}: observations, no state records: nothing can be replayed or drawn\n"
         self.run("convert", tmp_path / "out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide")
         self.run("convert", tmp_path / "out", tmp_path / "files", "--to", "published")
@@ -138,23 +138,23 @@ class TestCommand:
         assert "group /0: missing state, episode_end_state" in said
         assert f"a {kind} release is made of state records" in said
 
-    def test_show(self, ours, twin, lite):
-        missing = json.loads(self.run("show", "--json", ours))["missing"]
+    def test_show(self, converted_release, reconverted_release, lite):
+        missing = json.loads(self.run("show", "--json", converted_release))["missing"]
         assert [what.split(":")[0] for what in missing] == ["state records", "tasks", "teammate actions of 1 histories"]
-        assert [what.split(":")[0] for what in json.loads(self.run("show", "--json", twin))["missing"]] == [
-            "state records"
-        ]
+        assert [
+            what.split(":")[0] for what in json.loads(self.run("show", "--json", reconverted_release))["missing"]
+        ] == ["state records"]
         assert "missing" not in json.loads(self.run("show", "--json", lite[0]))
-        assert "observations release" in self.run("show", ours)
-        assert "teammate" not in json.loads(self.run("show", "--json", "--history", 0, ours))
-        assert "teammate" in json.loads(self.run("show", "--json", "--history", 0, twin))
-        assert "task_a" in self.run("list", ours)
+        assert "observations release" in self.run("show", converted_release)
+        assert "teammate" not in json.loads(self.run("show", "--json", "--history", 0, converted_release))
+        assert "teammate" in json.loads(self.run("show", "--json", "--history", 0, reconverted_release))
+        assert "task_a" in self.run("list", converted_release)
 
-    def test_verify(self, ours):
-        said = self.run("verify", "--deep", ours)
+    def test_verify(self, converted_release):
+        said = self.run("verify", "--deep", converted_release)
         assert "valid; checked" in said
         assert "physics" not in said
         assert "nothing was replayed: without state records" in said
-        content = json.loads(self.run("verify", "--deep", "--json", ours))
+        content = json.loads(self.run("verify", "--deep", "--json", converted_release))
         assert (content["ok"], len(content["notes"])) == (True, 1)
-        assert "replayed" not in self.run("verify", ours)
+        assert "replayed" not in self.run("verify", converted_release)

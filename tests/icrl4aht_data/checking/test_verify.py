@@ -20,15 +20,15 @@ from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing import release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from tests.helpers.random_play import SHARD, make_tasks, play, random_release
+from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
 
 
 def problems(root, level: Level = "full"):
     return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
-def test_a_valid_release(either):
-    report = verify_release(either[0], level="deep")
+def test_a_valid_release(lite_or_full):
+    report = verify_release(lite_or_full[0], level="deep")
     assert report.ok
     assert (report.histories, report.transitions) == (12, 1440)
     assert report.files == 9
@@ -55,7 +55,7 @@ def test_one_flipped_byte_names_the_chunk(damaged):
 
 @pytest.mark.parametrize("release", ["lite", "observations"])
 def test_every_file_is_covered(request, tmp_path, release):
-    source = request.getfixturevalue("lite")[0] if release == "lite" else request.getfixturevalue("ours")
+    source = request.getfixturevalue("lite")[0] if release == "lite" else request.getfixturevalue("converted_release")
     root = shutil.copytree(source, tmp_path / "copy")
     rng = np.random.default_rng(1)
     for path in sorted(p for p in root.rglob("*") if p.is_file() and p.stat().st_size):
@@ -83,7 +83,7 @@ def test_no_folder(tmp_path):
 def rewritten(tmp_path, spoil, kind: Kind = "lite"):
     """Write a release with valid hashes and spoiled content."""
     (task,) = make_tasks(["demo_simple"])
-    arrays = play(task.layout, 6, 20, np.random.default_rng(5))
+    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
     new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, spoil(arrays))])
     return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
@@ -224,7 +224,7 @@ def test_lost_shards_with_their_lines(tmp_path):
 
 def test_equal_histories_of_a_task(tmp_path):
     (task,) = make_tasks(["demo_simple"])
-    arrays = play(task.layout, 6, 20, np.random.default_rng(5))
+    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
     new = NewTask(task, Provenance(), 2, lambda: [NewHistory(k, arrays) for k in range(2)])
     write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
     assert problems(tmp_path / "r")[0].endswith("history 1: has the content of history 0")
@@ -337,7 +337,9 @@ def test_a_teammate_of_training_and_test(tmp_path):
     layout = get_layout("coord_simple")
     (train,) = make_tasks(["coord_simple"])
     tasks = [train, make_task("teammate", "test", "coord_simple", train.teammate, 9)]
-    new = [NewTask(task, Provenance(), 1, lambda: [NewHistory(0, play(layout, 6, 20, rng))]) for task in tasks]
+    new = [
+        NewTask(task, Provenance(), 1, lambda: [NewHistory(0, random_history(layout, 6, 20, rng))]) for task in tasks
+    ]
     write_release(tmp_path / "r", "lite", new, data_version="0.0.1", kept_steps=20)
     assert problems(tmp_path / "r") == [
         f"meta/tasks.jsonl: task {tasks[1].task_id!r} (test) has the teammate of {train.task_id!r} (train)"

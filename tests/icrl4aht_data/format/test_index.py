@@ -21,7 +21,7 @@ from icrl4aht_data.format import columns
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.utils import cache
-from tests.helpers.random_play import long_index
+from tests.helpers.random_releases import long_index
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from generation.cli import cli
 from generation.teammates.instances import published_tasks
+from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
@@ -66,7 +67,6 @@ def test_bundled_manifests_are_the_published_tasks(track):
 
 
 def test_check_fails_on_a_difference(monkeypatch, tmp_path):
-    from icrl4aht_data.benchmark import tasks
 
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])

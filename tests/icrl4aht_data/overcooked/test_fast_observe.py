@@ -9,13 +9,13 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns
-from tests.helpers.random_play import play
+from tests.helpers.random_releases import random_history
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
 def test_played_states(layout, dtype):
-    states = play(layout, 40, 120, np.random.default_rng(1))["state"]
+    states = random_history(layout, 40, 120, np.random.default_rng(1))["state"]
     out = np.full((len(states), *layout.obs_shape), 9, dtype)
     assert fast_observe(layout, states, out, threads=3) is out
     np.testing.assert_array_equal(out, observe(layout, states, 0))
@@ -26,7 +26,7 @@ def test_states_that_play_seldom_reaches(layout):
     """Every item on every counter and pot, every timer, lit buttons, deliveries: drawn independently."""
     rng = np.random.default_rng(2)
     where = columns(layout)
-    states = rng.integers(0, 256, (3000, play(layout, 1, 1, rng)["state"].shape[1])).astype(np.uint8)
+    states = rng.integers(0, 256, (3000, random_history(layout, 1, 1, rng)["state"].shape[1])).astype(np.uint8)
     states[:, where.positions] = rng.choice(np.flatnonzero(layout.walkable), (3000, 2))
     states[:, where.facings] %= 4
     states[:, where.delivered] %= 2
@@ -41,7 +41,7 @@ def test_states_that_play_seldom_reaches(layout):
 )
 def test_records_that_the_rules_exclude(column, value):
     layout = get_layout("coord_simple")
-    states = play(layout, 4, 20, np.random.default_rng(3))["state"]
+    states = random_history(layout, 4, 20, np.random.default_rng(3))["state"]
     states[7, getattr(columns(layout), column)] = value
     out = np.empty((len(states), *layout.obs_shape), np.float32)
     np.testing.assert_array_equal(fast_observe(layout, states, out), observe(layout, states, 0))
@@ -49,7 +49,7 @@ def test_records_that_the_rules_exclude(column, value):
 
 def test_shapes_and_empty_input():
     layout = get_layout("cramped_up")
-    states = play(layout, 2, 6, np.random.default_rng(4))["state"].reshape(3, 4, -1)
+    states = random_history(layout, 2, 6, np.random.default_rng(4))["state"].reshape(3, 4, -1)
     out = fast_observe(layout, states, np.empty((3, 4, *layout.obs_shape), np.uint8))
     np.testing.assert_array_equal(out, observe(layout, states, 0))
     assert fast_observe(layout, states[:0], np.empty((0, 4, *layout.obs_shape), np.uint8)).shape[0] == 0

@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
 from icrl4aht_data.overcooked.state import columns, faults, pack, record_size, start, unpack
-from tests.helpers.scenes import random_records, scene
+from tests.helpers.states import random_records, state_record
 
 CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_ring", "test_simple", "test_wide"))
 
@@ -157,7 +157,7 @@ def test_values_are_0_to_19_in_every_state_that_a_step_leads_to(layout):
 
 def test_a_complete_scene_seen_by_the_ego():
     """Every channel that is not 0; from (1, 1) the window reaches x = -1..3, y = -1..3."""
-    record = scene(
+    record = state_record(
         CRAMPED,
         (1, 1, "left"),
         (3, 2, "down"),
@@ -192,7 +192,7 @@ def test_a_complete_scene_seen_by_the_ego():
 
 def test_the_same_scene_seen_by_the_teammate():
     """From (3, 2) the window reaches x = 1..5, y = 0..4: now pile 1 and the indicator (4, 2) are in it."""
-    record = scene(
+    record = state_record(
         CRAMPED,
         (1, 1, "left"),
         (3, 2, "down"),
@@ -220,18 +220,18 @@ def test_the_same_scene_seen_by_the_teammate():
 
 
 def test_rows_come_before_columns():
-    view = observe(CRAMPED, scene(CRAMPED, (2, 1, "up"), (3, 2, "up")), 0)[0]
+    view = observe(CRAMPED, state_record(CRAMPED, (2, 1, "up"), (3, 2, "up")), 0)[0]
     other = 9  # first of the other agent's channels, n = 2
     assert view[2, 2, 0] == 1
     assert np.argwhere(view[..., other]).tolist() == [[3, 3]]
-    view = observe(CRAMPED, scene(CRAMPED, (2, 1, "up"), (2, 2, "up")), 0)[0]
+    view = observe(CRAMPED, state_record(CRAMPED, (2, 1, "up"), (2, 2, "up")), 0)[0]
     assert np.argwhere(view[..., other]).tolist() == [[3, 2]]
 
 
 @pytest.mark.parametrize(("facing", "channel"), [("up", 1), ("down", 2), ("right", 3), ("left", 4)])
 def test_facings_have_their_channels(facing, channel):
     other = "left" if facing != "left" else "up"
-    record = scene(CRAMPED, (2, 1, facing), (2, 2, other))
+    record = state_record(CRAMPED, (2, 1, facing), (2, 2, other))
     both = observe_both(CRAMPED, record)[0]
     assert np.flatnonzero(both[0, 2, 2, :5]).tolist() == [0, channel]
     assert np.flatnonzero(both[1, 1, 2, 9:14]).tolist() == [0, channel]
@@ -277,7 +277,7 @@ def test_the_other_agent_is_seen_only_within_the_window(layout):
 
 def test_the_other_agent_at_and_beyond_the_windows_corner():
     for x, y, visible in ((3, 3, True), (4, 3, False), (3, 4, False)):
-        found = seen(RING, scene(RING, (1, 1, "up"), (x, y, "left")), 0)
+        found = seen(RING, state_record(RING, (1, 1, "up"), (x, y, "left")), 0)
         expected = {"other position": at(1, (x, y)), "other left": at(1, (x, y))} if visible else {}
         assert part(found, "other") == expected
 
@@ -285,13 +285,13 @@ def test_the_other_agent_at_and_beyond_the_windows_corner():
 def test_the_recipe_shows_on_indicators_always_and_on_buttons_while_lit():
     """coord_ring: indicators (0, 4) and (4, 0) among others, buttons (4, 2) and (4, 6)."""
     for timer, shown in ((0, [(4, 0)]), (1, [(4, 0), (4, 2)]), (9, [(4, 0), (4, 2)])):
-        record = scene(RING, (4, 1, "down"), (3, 5, "up"), buttons=[timer, 0], recipe=RECIPE_111)
+        record = state_record(RING, (4, 1, "down"), (3, 5, "up"), buttons=[timer, 0], recipe=RECIPE_111)
         found = seen(RING, record, 0)
         assert part(found, "recipe") == {"recipe 1": at(3, *shown)}
         assert part(found, "R", "L") == {"R": at(1, (4, 0)), "L": at(1, (4, 2))}
         below = seen(RING, record, 1)  # the other button is in view and not lit
         assert part(below, "recipe", "L") == {"L": at(1, (4, 6))}
-    record = scene(RING, (1, 4, "up"), (3, 4, "up"), buttons=[0, 5], recipe=2 * ZERO + ONE)
+    record = state_record(RING, (1, 4, "up"), (3, 4, "up"), buttons=[0, 5], recipe=2 * ZERO + ONE)
     assert part(seen(RING, record, 0), "recipe") == {"recipe 0": at(2, (0, 4)), "recipe 1": at(1, (0, 4))}
     assert part(seen(RING, record, 1), "recipe") == {"recipe 0": at(2, (4, 6)), "recipe 1": at(1, (4, 6))}
 
@@ -307,7 +307,7 @@ def test_plate_and_cooked_of_the_recipe_stay_0(layout):
 
 @pytest.mark.parametrize("timer", [1, 10, 19])
 def test_a_pots_content_and_timer(timer):
-    record = scene(CRAMPED, (2, 1, "up"), (3, 2, "up"), pot_items=[ZERO + 2 * ONE], pot_timers=[timer])
+    record = state_record(CRAMPED, (2, 1, "up"), (3, 2, "up"), pot_items=[ZERO + 2 * ONE], pot_timers=[timer])
     found = seen(CRAMPED, record, 0)
     assert part(found, "item", "pot timer") == {
         "item 0": at(1, (2, 0)),
@@ -323,7 +323,7 @@ def test_a_pots_content_and_timer(timer):
 def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, deliverer):
     hands, actions = [0, 0], [STAY, STAY]
     hands[deliverer], actions[deliverer] = RECIPE_000 + PLATE + COOKED, INTERACT
-    record = scene(layout, *poses, hands=hands)
+    record = state_record(layout, *poses, hands=hands)
     next_recipe = np.array([RECIPE_111], np.uint8)
     assert "delivery" not in seen(layout, record, deliverer)
     after = rules.step(layout, record, np.array([actions]), next_recipe)
@@ -335,7 +335,7 @@ def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, 
 
 
 def test_other_layouts_have_no_delivery_channel():
-    record = scene(CRAMPED, (2, 2, "down"), (3, 2, "down"), hands=[0, RECIPE_000 + PLATE + COOKED])
+    record = state_record(CRAMPED, (2, 2, "down"), (3, 2, "down"), hands=[0, RECIPE_000 + PLATE + COOKED])
     after = rules.step(CRAMPED, record, np.array([[STAY, INTERACT]]), np.array([RECIPE_000], np.uint8))
     assert (after.reward, unpack(CRAMPED, after.state).delivered) == (20, 1)
     goal_only = {name for name, cells in seen(CRAMPED, after.state, 0).items() if (3, 3) in cells}
@@ -356,7 +356,7 @@ def test_a_type_without_a_pile_has_empty_channels_and_the_next_keeps_its_own(nam
 
 def test_ingredient_3_of_test_wide_shows_as_3():
     three = WIDE.ingredient_item(3)
-    record = scene(
+    record = state_record(
         WIDE, (2, 1, "up"), (2, 4, "up"), hands=[0, three], recipe=2 * three + ZERO, pot_items=[0, 2 * three]
     )
     found = seen(WIDE, record, 1)
@@ -438,14 +438,14 @@ IMPOSSIBLE = {
 
 @pytest.mark.parametrize(("kind", "change"), [(kind, change) for kind in IMPOSSIBLE for change in IMPOSSIBLE[kind]])
 def test_each_impossible_value_is_found(kind, change):
-    record = scene(CRAMPED, (1, 1, "up"), (3, 2, "up"), **change)
+    record = state_record(CRAMPED, (1, 1, "up"), (3, 2, "up"), **change)
     assert faults(CRAMPED, record) == [kind]
-    good = scene(CRAMPED, (1, 1, "up"), (3, 2, "up"))
+    good = state_record(CRAMPED, (1, 1, "up"), (3, 2, "up"))
     assert faults(CRAMPED, np.concatenate([good, record, good])) == [kind]
 
 
 def test_an_impossible_button_timer_and_several_faults_are_found():
-    record = scene(RING, (1, 1, "up"), (3, 3, "up"), buttons=[10, 11])
+    record = state_record(RING, (1, 1, "up"), (3, 3, "up"), buttons=[10, 11])
     assert faults(RING, record) == ["a button timer above its limit"]
     record[:, columns(RING).facings] = 7
     assert faults(RING, record) == ["an unknown facing", "a button timer above its limit"]

@@ -13,7 +13,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, INDICATOR, LAYOUTS, PLATE, WALL
 from icrl4aht_data.overcooked.render import draw_frame, save_episode, save_frame
 from icrl4aht_data.overcooked.state import columns
-from tests.helpers.scenes import random_records, scene
+from tests.helpers.states import random_records, state_record
 
 CELL = 32
 COORD = LAYOUTS["coord_simple"]  # it has everything: a pot, a button, an indicator, three ingredients
@@ -22,7 +22,7 @@ DISH = 3 * ONION | PLATE | COOKED
 
 
 def frame_of(ego=(2, 2, "down"), teammate=(5, 3, "up"), **fields) -> np.ndarray:
-    return draw_frame(COORD, scene(COORD, ego, teammate, **fields)[0], cell=CELL, view=False)
+    return draw_frame(COORD, state_record(COORD, ego, teammate, **fields)[0], cell=CELL, view=False)
 
 
 def cell_pixels(frame: np.ndarray, layout, cell: int) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_every_layout_draws_with_a_blue_ego_and_a_red_teammate(layout):
 
 
 def test_the_picture_grows_with_the_cell_and_keeps_its_proportions():
-    record = scene(COORD, (2, 2, "up"), (5, 2, "up"))[0]
+    record = state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0]
     assert [draw_frame(COORD, record, cell=cell).shape[1] for cell in (16, 33, 48)] == [128, 264, 384]
 
 
@@ -150,7 +150,7 @@ def test_walls_that_no_agent_can_face_are_plain_and_counters_are_not():
 
 def test_the_view_is_outlined_only_on_request():
     layout = LAYOUTS["coord_ring"]
-    record = scene(layout, (4, 3, "up"), (1, 1, "up"))[0]
+    record = state_record(layout, (4, 3, "up"), (1, 1, "up"))[0]
     with_view, without = (draw_frame(layout, record, cell=CELL, view=view).astype(int) for view in (True, False))
     rows, columns_ = np.any(with_view != without, axis=-1).nonzero()
     assert (rows.min(), columns_.min()) == (1 * CELL, 2 * CELL)
@@ -160,7 +160,7 @@ def test_the_view_is_outlined_only_on_request():
 
 
 def test_the_caption_is_written_into_the_footer_and_fits_even_if_long():
-    record = scene(COORD, (2, 2, "up"), (5, 2, "up"))[0]
+    record = state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0]
     none, short, long = (draw_frame(COORD, record, caption=text) for text in ("", "step 1", "step 1 " * 30))
     assert not np.array_equal(none, short)
     rows, columns_ = np.any(none != long, axis=-1).nonzero()
@@ -170,7 +170,7 @@ def test_the_caption_is_written_into_the_footer_and_fits_even_if_long():
 
 
 def test_save_frame_writes_what_draw_frame_gives(tmp_path):
-    record = scene(COORD, (2, 2, "up"), (5, 2, "up"))[0]
+    record = state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0]
     save_frame(tmp_path / "frame.png", COORD, record, cell=20, caption="x")
     with Image.open(tmp_path / "frame.png") as image:
         assert image.format == "PNG"
@@ -179,7 +179,7 @@ def test_save_frame_writes_what_draw_frame_gives(tmp_path):
 
 
 def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
-    records = np.repeat(scene(COORD, (2, 2, "up"), (5, 2, "up")), 6, axis=0)
+    records = np.repeat(state_record(COORD, (2, 2, "up"), (5, 2, "up")), 6, axis=0)
     records[3:, columns(COORD).hands] = DISH
     path = tmp_path / "episode.gif"
     save_episode(path, COORD, records, np.array([0, 0, 20, 0, -5, 0.0]), cell=24, fps=10)
@@ -203,7 +203,7 @@ def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
 
 
 def test_an_episode_without_rewards_or_of_one_step_draws_too(tmp_path):
-    save_episode(tmp_path / "one.gif", COORD, scene(COORD, (2, 2, "up"), (5, 2, "up")), cell=16)
+    save_episode(tmp_path / "one.gif", COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up")), cell=16)
     with Image.open(tmp_path / "one.gif") as image:
         assert getattr(image, "n_frames", 0) == 1
 
@@ -218,12 +218,12 @@ def test_a_failed_write_leaves_the_old_file_and_no_partial_one(tmp_path, monkeyp
 
     monkeypatch.setattr(Image.Image, "save", fail)
     with pytest.raises(OSError, match="disk full"):
-        save_frame(path, COORD, scene(COORD, (2, 2, "up"), (5, 2, "up"))[0])
+        save_frame(path, COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0])
     assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("frame.png", "old")]
 
 
 def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
-    records = scene(COORD, (2, 2, "up"), (5, 2, "up"))
+    records = state_record(COORD, (2, 2, "up"), (5, 2, "up"))
     size, path = records.shape[-1], tmp_path / "episode.gif"
     off_the_floor = records[0].copy()
     off_the_floor[0] = 0
@@ -246,4 +246,4 @@ def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
 def test_without_pillow_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[plot\]'"):
-        draw_frame(COORD, scene(COORD, (2, 2, "up"), (5, 2, "up"))[0])
+        draw_frame(COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0])

@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, RIGH
 from icrl4aht_data.overcooked.layouts import FACING_OF, FACINGS, LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, unpack
-from tests.helpers.scenes import scene
+from tests.helpers.states import state_record
 
 CRAMPED, ASYMM, RING, DEMO = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring", "demo_simple"))
 
@@ -83,8 +83,8 @@ def slot(request: pytest.FixtureRequest) -> int:
 def solo(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
     """A scene with the agent of that slot at pose `at` with an item in hand, the other one aside with none."""
     if slot == 0:
-        return scene(layout, at, aside, hands=[hand, 0], **fields)
-    return scene(layout, aside, at, hands=[0, hand], **fields)
+        return state_record(layout, at, aside, hands=[hand, 0], **fields)
+    return state_record(layout, aside, at, hands=[0, hand], **fields)
 
 
 def act_alone(
@@ -127,7 +127,7 @@ def test_an_agent_only_turns_before_anything_but_floor(slot, at):
 @pytest.mark.parametrize("action", [STAY, INTERACT])
 def test_stay_and_interact_neither_turn_nor_move(action):
     for facing in FACINGS:
-        after = act(CRAMPED, scene(CRAMPED, (2, 2, facing), (3, 1, "left")), action)
+        after = act(CRAMPED, state_record(CRAMPED, (2, 2, facing), (3, 1, "left")), action)
         assert after.poses == [(2, 2, facing), (3, 1, "left")]
 
 
@@ -151,7 +151,7 @@ def test_stay_and_interact_neither_turn_nor_move(action):
 )
 def test_agents_in_each_others_way(cells, actions, moved):
     ego, teammate = ((x, y, "up") for x, y in cells)
-    after = act(CRAMPED, scene(CRAMPED, ego, teammate), *actions)
+    after = act(CRAMPED, state_record(CRAMPED, ego, teammate), *actions)
     facings = [ACTIONS[action] if action in DELTA else "up" for action in actions]
     assert after.poses == [(x, y, facing) for (x, y), facing in zip(moved, facings, strict=True)]
 
@@ -172,7 +172,7 @@ def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
         cells.append(before)
         wanted_cells.append([y * layout.width + x for x, y in wanted])
         actions.append(pair)
-    records = np.repeat(scene(layout, (1, 1, "up"), (1, 1, "up")), len(cells), axis=0)
+    records = np.repeat(state_record(layout, (1, 1, "up"), (1, 1, "up")), len(cells), axis=0)
     where = columns(layout)
     records[:, where.positions] = [[y * layout.width + x for x, y in pair] for pair in cells]
     records[:, where.facings] = facings = np.random.default_rng(0).integers(0, 4, (len(cells), 2))
@@ -261,7 +261,7 @@ def test_wrong_mixes_cook_too(slot, content):
 
 
 def test_pots_that_cook_tick_and_others_do_not():
-    record = scene(ASYMM, (1, 1, "up"), (7, 3, "up"), pot_items=[RECIPE_000, 2 * ONE], pot_timers=[2, 0])
+    record = state_record(ASYMM, (1, 1, "up"), (7, 3, "up"), pot_items=[RECIPE_000, 2 * ONE], pot_timers=[2, 0])
     after = act(ASYMM, record, STAY)
     assert after.pots == [(RECIPE_000, 1), (2 * ONE, 0)]
     assert act(ASYMM, after.record, STAY).pots == [(SOUP_000, 0), (2 * ONE, 0)]
@@ -317,7 +317,7 @@ def test_a_wrong_delivery_costs_20_and_the_recipe_stays(slot, recipe, dish):
     ],
 )
 def test_two_deliveries_in_one_step_both_count(dishes, reward):
-    record = scene(ASYMM, (3, 2, "up"), (7, 1, "right"), hands=dishes, recipe=RECIPE_000)
+    record = state_record(ASYMM, (3, 2, "up"), (7, 1, "right"), hands=dishes, recipe=RECIPE_000)
     after = act(ASYMM, record, INTERACT, INTERACT, next_recipe=RECIPE_111)
     assert (after.reward, after.hands) == (reward, [0, 0])
     assert (after.recipe, after.delivered) == ((RECIPE_111, 1) if DISH_000 in dishes else (RECIPE_000, 0))
@@ -362,9 +362,9 @@ def test_full_hands_press_no_button(slot, hand, lit):
 
 
 def test_what_both_agents_earn_in_one_step_adds_up():
-    after = act(RING, scene(RING, *AT_BUTTON), INTERACT, INTERACT)
+    after = act(RING, state_record(RING, *AT_BUTTON), INTERACT, INTERACT)
     assert (after.reward, after.buttons) == (-10, [9, 0])
-    record = scene(RING, (1, 4, "right"), AT_BUTTON[1], hands=[DISH_000, 0], recipe=RECIPE_000)
+    record = state_record(RING, (1, 4, "right"), AT_BUTTON[1], hands=[DISH_000, 0], recipe=RECIPE_000)
     after = act(RING, record, INTERACT, INTERACT)
     assert (after.reward, after.recipe, after.buttons) == (20 - 5, RECIPE_111, [9, 0])
 
@@ -384,7 +384,7 @@ def test_what_both_agents_earn_in_one_step_adds_up():
     ],
 )
 def test_agent_0_interacts_first_on_a_shared_counter(hands, item, hands_after, counter_after):
-    record = scene(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): item})
+    record = state_record(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): item})
     after = act(RING, record, INTERACT, INTERACT)
     assert (after.hands, after.counters) == (hands_after, {(3, 2): counter_after} if counter_after else {})
 
@@ -401,7 +401,7 @@ def test_agent_0_interacts_first_on_a_shared_counter(hands, item, hands_after, c
     ],
 )
 def test_agent_0_interacts_first_on_a_shared_pot(hands, pot, hands_after, pot_after):
-    record = scene(ASYMM, (3, 2, "right"), (5, 2, "left"), hands=hands, pot_items=[pot, 0])
+    record = state_record(ASYMM, (3, 2, "right"), (5, 2, "left"), hands=hands, pot_items=[pot, 0])
     after = act(ASYMM, record, INTERACT, INTERACT)
     assert (after.hands, after.pots) == (hands_after, [pot_after, (0, 0)])
 
@@ -464,7 +464,7 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
 def test_taking_a_plate_pays_3_if_it_is_needed(slot, pots, other_hand, counters, reward):
     poses, hands = list(AWAY), [other_hand, other_hand]
     poses[slot], hands[slot] = AT_PLATES_ASYMM[slot], 0
-    record = scene(ASYMM, poses[0], poses[1], hands=hands, pot_items=pots, counters=counters)
+    record = state_record(ASYMM, poses[0], poses[1], hands=hands, pot_items=pots, counters=counters)
     after = interact(slot, record, ASYMM)
     assert (after.hands[slot], after.reward) == (PLATE, 0)
     assert after.shaped == own(slot, reward)
@@ -472,41 +472,41 @@ def test_taking_a_plate_pays_3_if_it_is_needed(slot, pots, other_hand, counters,
 
 @pytest.mark.parametrize("pots", [[0, 0], [ZERO, 0], [ZERO, ONE]])
 def test_a_plate_taken_off_a_counter_pays_nothing(slot, pots):
-    record = scene(ASYMM, *AWAY, pot_items=pots, counters={(AWAY[slot][0], 4): PLATE})
+    record = state_record(ASYMM, *AWAY, pot_items=pots, counters={(AWAY[slot][0], 4): PLATE})
     after = interact(slot, record, ASYMM)
     assert (after.hands[slot], after.counters, after.shaped) == (PLATE, {}, [0, 0])
 
 
 def test_plates_in_hands_count_as_before_the_steps_interactions():
-    both = scene(ASYMM, *AT_PLATES_ASYMM, pot_items=[ZERO, 0])
+    both = state_record(ASYMM, *AT_PLATES_ASYMM, pot_items=[ZERO, 0])
     assert act(ASYMM, both, INTERACT, INTERACT).shaped == [3, 3]  # the ego's new plate does not count yet
 
-    served = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[SOUP_001, ONE])
+    served = state_record(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[SOUP_001, ONE])
     after = act(ASYMM, served, INTERACT, INTERACT)
     # The plate that the ego used still counts, against the one pot left.
     assert (after.hands, after.shaped) == ([DISH_001, PLATE], [0, 0])
 
 
 def test_pots_and_counters_are_as_agent_0_left_them():
-    filled = scene(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[ONE, 0], recipe=RECIPE_000)
+    filled = state_record(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[ONE, 0], recipe=RECIPE_000)
     assert act(ASYMM, filled, INTERACT, INTERACT).shaped == [0, 3]  # the ego's ingredient makes the plate useful
 
-    cleared = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], pot_items=[ZERO, ONE], counters={(2, 4): PLATE})
+    cleared = state_record(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], pot_items=[ZERO, ONE], counters={(2, 4): PLATE})
     assert act(ASYMM, cleared, INTERACT, INTERACT).shaped == [0, 3]  # the ego took the plate from the counter
 
-    dropped = scene(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[ZERO, ONE])
+    dropped = state_record(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[ZERO, ONE])
     assert act(ASYMM, dropped, STAY, INTERACT).shaped == [0, 3]
     assert act(ASYMM, dropped, INTERACT, INTERACT).shaped == [0, 0]  # now the ego's plate is on a counter
 
 
 def test_shaped_rewards_are_each_agents_own():
     poses = (3, 2, "right"), (5, 3, "left")
-    record = scene(ASYMM, *poses, hands=[ZERO, PLATE], pot_items=[ZERO, SOUP_000], recipe=RECIPE_000)
+    record = state_record(ASYMM, *poses, hands=[ZERO, PLATE], pot_items=[ZERO, SOUP_000], recipe=RECIPE_000)
     after = act(ASYMM, record, INTERACT, INTERACT)
     assert (after.shaped, after.reward) == ([3, 5], 0)
 
 
 def test_a_move_turns_to_its_facing():
-    record = scene(CRAMPED, (1, 1, "up"), ASIDE)
+    record = state_record(CRAMPED, (1, 1, "up"), ASIDE)
     turned = [FACINGS.index(act(CRAMPED, record, move).poses[0][2]) for move in (UP, DOWN, LEFT, RIGHT)]
     assert turned == FACING_OF.tolist()

@@ -11,8 +11,8 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import columns
-from tests.helpers.published_readers import TO_PEER_ACTION, from_peer_state, peer_step, to_peer_state
-from tests.helpers.scenes import random_records
+from tests.helpers.jaxmarl_peer import TO_PEER_ACTION, from_peer_state, peer_step, to_peer_state
+from tests.helpers.states import random_records
 
 BATCH, STEPS, SCENES = 512, 20, 20  # trajectories: 10,240 steps; single steps from random states: 10,240
 

@@ -35,7 +35,7 @@ from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.dataset_card import dataset_card, evaluated_on, size_category
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.paths import ROOT
-from tests.helpers.random_play import play, random_release
+from tests.helpers.random_releases import random_history, random_release
 
 DAY = datetime.date(2026, 1, 2)
 
@@ -79,7 +79,7 @@ def with_learned(tmp_path_factory) -> Path:
     theta = {"checkpoint": "demo_wide/fcp/m1/c4", "sha256": digest}
     teammate = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0, "theta": theta}
     task = make_task("teammate", "train", "demo_wide", teammate, 0)
-    arrays = play(get_layout("demo_wide"), 6, 20, np.random.default_rng(0))
+    arrays = random_history(get_layout("demo_wide"), 6, 20, np.random.default_rng(0))
     files = {f"teammates/{digest}/{path.name}": path for path in (weights, folder / "policy.json")}
     new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, arrays)], files)
     return write_release(folder / "release", "lite", [new], data_version="0.0.1", kept_steps=20)

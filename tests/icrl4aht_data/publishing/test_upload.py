@@ -22,7 +22,7 @@ from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.utils.templates import fill_template
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 from tests.servers.common import Hub, Request, Slow, Status, hub_server, uploads
 
 pytestmark = uploads

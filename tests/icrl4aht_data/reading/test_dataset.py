@@ -11,7 +11,7 @@ from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.errors import LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.batches import assert_equal
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_positions_ids_and_iteration(lite):
         dataset.history(99)
 
 
-def test_other_options_share_index_and_shards(lite, ours):
+def test_other_options_share_index_and_shards(lite, converted_release):
     dataset = load_icrl4aht(lite[0], layout="demo_wide", threads=1)
     dataset[0].actions[:]
     states = dataset.with_options(obs="state", cache="stream")
@@ -65,7 +65,7 @@ def test_other_options_share_index_and_shards(lite, ours):
     with pytest.raises(OptionError, match="threads = 0"):
         dataset.with_options(threads=0)
     with pytest.raises(OptionError, match=r'obs = "state": .* has observations only'):
-        load_icrl4aht(ours).with_options(obs="state")
+        load_icrl4aht(converted_release).with_options(obs="state")
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_lazy_array_out_of_range(lite):
 
 
 @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-def test_observations_as_the_option_says(either, obs):
-    root, written = either
+def test_observations_as_the_option_says(lite_or_full, obs):
+    root, written = lite_or_full
     history = load_icrl4aht(root, layout="demo_wide", obs=obs)[0]
     state = written[history.entry.history_id]["state"]
     expected = state if obs == "state" else observe(get_layout("demo_wide"), state, 0)

@@ -24,13 +24,13 @@ from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.batches import CACHES, assert_equal
 from tests.helpers.published_files import KEPT, SHARD
-from tests.helpers.random_play import long_index, make_tasks, play, random_release
+from tests.helpers.random_releases import long_index, make_tasks, random_history, random_release
 
 
 class TestConversion:
-    def test_arrays_and_index_are_those_of_the_files(self, theirs, ours):
-        folder, written = theirs
-        dataset = load_icrl4aht(ours, obs="uint8")
+    def test_arrays_and_index_are_those_of_the_files(self, published_folder, converted_release):
+        folder, written = published_folder
+        dataset = load_icrl4aht(converted_release, obs="uint8")
         assert dataset.info.kind == "observations"
         lines = [json.loads(line) for line in (folder / "histories_index.jsonl").read_text().splitlines()]
         by_stream = {history.entry.env_idx: history for history in dataset}
@@ -47,48 +47,48 @@ class TestConversion:
                 np.testing.assert_array_equal(history.read(name), array, err_msg=name)
             assert len(history.returns()) == history.entry.episodes
             np.testing.assert_array_equal(history.obs[3:7, 2], arrays["obs"][3:7, 2])
-        assert load_icrl4aht(ours)[0].obs[:5].dtype == np.float32
+        assert load_icrl4aht(converted_release)[0].obs[:5].dtype == np.float32
         statistics = dataset.info.statistics["demo_wide"]
         assert (statistics.history_length, statistics.teammates) == ((50, 130), None)
 
-    def test_plain_hdf5_readers_find_the_papers_fields(self, theirs, ours):
-        entry = load_icrl4aht(ours).entries[0]
-        with h5py.File(ours / entry.shard) as file:
+    def test_plain_hdf5_readers_find_the_papers_fields(self, published_folder, converted_release):
+        entry = load_icrl4aht(converted_release).entries[0]
+        with h5py.File(converted_release / entry.shard) as file:
             group: Any = file[entry.h5_group]
-            assert set(group) == set(theirs[1][0])
+            assert set(group) == set(published_folder[1][0])
             assert (group["rewards"].dtype, group["actions"].dtype) == ("float32", "int32")
-            np.testing.assert_array_equal(group["obs"][()], theirs[1][0]["obs"])
+            np.testing.assert_array_equal(group["obs"][()], published_folder[1][0]["obs"])
 
-    def test_files_made_of_a_release_give_the_same_release(self, ours, tmp_path):
-        to_published(load_icrl4aht(ours), tmp_path / "files")
+    def test_files_made_of_a_release_give_the_same_release(self, converted_release, tmp_path):
+        to_published(load_icrl4aht(converted_release), tmp_path / "files")
         assert not (tmp_path / "files" / "tasks.jsonl").exists()
         from_published(tmp_path / "files", tmp_path / "back", kept_steps=KEPT)
         for name in ("meta/histories.jsonl", "meta/tasks.jsonl", "meta/info.json", SHARD):
-            assert (tmp_path / "back" / name).read_bytes() == (ours / name).read_bytes(), name
+            assert (tmp_path / "back" / name).read_bytes() == (converted_release / name).read_bytes(), name
 
-    def test_a_part(self, ours, tmp_path):
-        part = load_icrl4aht(ours, layout="demo_wide")
+    def test_a_part(self, converted_release, tmp_path):
+        part = load_icrl4aht(converted_release, layout="demo_wide")
         to_release(part, tmp_path / "part", "observations")
         assert verify_release(tmp_path / "part", level="deep").ok
         for old, new in zip(part, load_icrl4aht(tmp_path / "part"), strict=True):
             np.testing.assert_array_equal(old.obs[:], new.obs[:])
 
     @pytest.mark.parametrize("kind", KINDS)
-    def test_states_cannot_be_made(self, theirs, ours, tmp_path, kind):
+    def test_states_cannot_be_made(self, published_folder, converted_release, tmp_path, kind):
         with pytest.raises(OptionError, match=rf"has observations only, and a {kind} release is made of state records"):
-            to_release(load_icrl4aht(ours), tmp_path / "out", kind)
+            to_release(load_icrl4aht(converted_release), tmp_path / "out", kind)
         with pytest.raises(
             PublishedFormatError, match=r"group /0: missing state, episode_end_state: .* `--to observations`"
         ):
-            from_published(theirs[0], tmp_path / "out", kind, kept_steps=KEPT)
+            from_published(published_folder[0], tmp_path / "out", kind, kept_steps=KEPT)
 
-    def test_states_may_be_left_out(self, lite, twin, tmp_path):
+    def test_states_may_be_left_out(self, lite, reconverted_release, tmp_path):
         """From a lite release at once, and from published files that have them."""
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
         assert from_published(tmp_path / "files", tmp_path / "two", "observations", kept_steps=KEPT) == "observations"
         for root in (tmp_path / "one", tmp_path / "two"):
-            assert (root / SHARD).read_bytes() == (twin / SHARD).read_bytes()
+            assert (root / SHARD).read_bytes() == (reconverted_release / SHARD).read_bytes()
         assert from_published(tmp_path / "files", tmp_path / "three", kept_steps=KEPT) == "lite"
 
     def test_some_groups_with_states(self, lite, tmp_path):
@@ -172,8 +172,8 @@ class TestFaults:
             (edit(3, teammate_family="H9"), r"index\.jsonl, line 4: unknown teammate_family 'H9'"),
         ],
     )
-    def test_files_with_faults(self, theirs, tmp_path, spoil, message):
-        files = shutil.copytree(theirs[0], tmp_path / "files")
+    def test_files_with_faults(self, published_folder, tmp_path, spoil, message):
+        files = shutil.copytree(published_folder[0], tmp_path / "files")
         path = files / "histories_index.jsonl"
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         with h5py.File(files / "histories.h5", "r+") as file:
@@ -189,15 +189,15 @@ class TestFaults:
             from_published(files, tmp_path / "out", kept_steps=KEPT)
         assert not (tmp_path / "out").exists()
 
-    def test_another_episode_length(self, theirs, tmp_path):
+    def test_another_episode_length(self, published_folder, tmp_path):
         with pytest.raises(PublishedFormatError, match=r"group /0: dones: expected an end every 100 steps, found 6"):
-            from_published(theirs[0], tmp_path / "out")
+            from_published(published_folder[0], tmp_path / "out")
         with pytest.raises(OptionError, match="kept_steps = 0"):
-            from_published(theirs[0], tmp_path / "out", kept_steps=0)
+            from_published(published_folder[0], tmp_path / "out", kept_steps=0)
 
     def test_states_need_complete_episodes(self, tmp_path):
         (task,) = make_tasks(["demo_simple"])
-        arrays = play(task.layout, 3, KEPT, np.random.default_rng(0))
+        arrays = random_history(task.layout, 3, KEPT, np.random.default_rng(0))
         cut = {name: array if name == "episode_end_state" else array[:50] for name, array in arrays.items()}
         new = NewTask(
             task, Provenance(), 1, lambda: [NewHistory(0, cut | {"episode_end_state": cut["episode_end_state"][:2]})]
@@ -207,38 +207,40 @@ class TestFaults:
 
 
 class TestTasks:
-    def test_without_tasks_teammates_are_known_by_name(self, ours):
-        dataset = load_icrl4aht(ours)
-        assert (ours / "meta" / "tasks.jsonl").read_text() == ""
+    def test_without_tasks_teammates_are_known_by_name(self, converted_release):
+        dataset = load_icrl4aht(converted_release)
+        assert (converted_release / "meta" / "tasks.jsonl").read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
         with pytest.raises(
             NotStoredError, match=r"tasks\.jsonl: empty: .* family rl and kind some_variant; .* --tasks"
         ):
             dataset.recover_teammate(0)
         assert dataset.recover_environment(0)["layout"] == "demo_wide"
-        assert len(load_icrl4aht(ours, teammate_family="H2", task_id="task_c")) == 1
+        assert len(load_icrl4aht(converted_release, teammate_family="H2", task_id="task_c")) == 1
 
-    def test_with_tasks_they_are_known(self, lite, twin):
-        one, two = load_icrl4aht(lite[0]), load_icrl4aht(twin)
-        assert (twin / "meta" / "tasks.jsonl").read_text() == (lite[0] / "meta" / "tasks.jsonl").read_text()
+    def test_with_tasks_they_are_known(self, lite, reconverted_release):
+        one, two = load_icrl4aht(lite[0]), load_icrl4aht(reconverted_release)
+        assert (reconverted_release / "meta" / "tasks.jsonl").read_text() == (
+            lite[0] / "meta" / "tasks.jsonl"
+        ).read_text()
         assert two.recover_teammate(8) == one.recover_teammate(8)
         assert [entry.seed for entry in two.entries] == [entry.seed for entry in one.entries]
 
-    def test_all_are_given_or_none(self, theirs, tmp_path):
+    def test_all_are_given_or_none(self, published_folder, tmp_path):
         write_tasks(tmp_path / "tasks.jsonl", make_tasks(["demo_wide"]))
         with pytest.raises(PublishedFormatError, match=r"tasks\.jsonl: missing 3 tasks of the index, such as 'task_a'"):
-            from_published(theirs[0], tmp_path / "out", tasks=tmp_path / "tasks.jsonl", kept_steps=KEPT)
+            from_published(published_folder[0], tmp_path / "out", tasks=tmp_path / "tasks.jsonl", kept_steps=KEPT)
         with pytest.raises(PublishedFormatError, match=r"other\.jsonl: missing; give a file"):
-            from_published(theirs[0], tmp_path / "out", tasks=tmp_path / "other.jsonl", kept_steps=KEPT)
+            from_published(published_folder[0], tmp_path / "out", tasks=tmp_path / "other.jsonl", kept_steps=KEPT)
 
 
 class TestWithoutStates:
-    def test_what_needs_states_says_so(self, ours):
+    def test_what_needs_states_says_so(self, converted_release):
         with pytest.raises(
             OptionError, match=r'obs = "state": .* has observations only, no state records; take float32'
         ):
-            load_icrl4aht(ours, obs="state")
-        dataset = load_icrl4aht(ours)
+            load_icrl4aht(converted_release, obs="state")
+        dataset = load_icrl4aht(converted_release)
         for name in ("state", "episode_end_state"):
             with pytest.raises(NotStoredError, match=rf"no {name}: this release has observations only"):
                 getattr(dataset[0], name)
@@ -247,14 +249,14 @@ class TestWithoutStates:
         with pytest.raises(NotStoredError, match="take hf_windows"):
             hf_episodes(dataset)
 
-    def test_missing_teammate_actions(self, ours):
-        dataset = load_icrl4aht(ours, task_id="task_c")
+    def test_missing_teammate_actions(self, converted_release):
+        dataset = load_icrl4aht(converted_release, task_id="task_c")
         with pytest.raises(LabelsMissingError, match=r"no teammate actions: .* has_teammate_actions = false"):
             dataset[0].teammate_actions  # noqa: B018
         with pytest.raises(LabelsMissingError, match="some histories have none"):
             dataset.ad(batch_size=1, length=5, teammate_actions=True)
         for cache in CACHES:
-            mixed = load_icrl4aht(ours, layout="demo_wide", cache=cache)
+            mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)
             assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
 
     def test_a_large_index_says_who_has_them(self, tmp_path, monkeypatch):
@@ -277,11 +279,11 @@ class TestWithoutStates:
 class TestBatches:
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     @pytest.mark.parametrize("cache", CACHES)
-    def test_ad_batches_are_those_of_the_original(self, lite, full, twin, obs, cache):
+    def test_ad_batches_are_those_of_the_original(self, lite, full, reconverted_release, obs, cache):
         options = {"batch_size": 6, "seed": 5, "teammate_actions": True}
         for root in (lite[0], full[0]):
             original = load_icrl4aht(root, layout="demo_wide", obs=obs)
-            dataset = load_icrl4aht(twin, layout="demo_wide", obs=obs, cache=cache, threads=2)
+            dataset = load_icrl4aht(reconverted_release, layout="demo_wide", obs=obs, cache=cache, threads=2)
             for length in (1, 40, 130):  # the last longer than the histories
                 for i in (0, 3, 1000):
                     one, two = (d.ad(length=length, **options)[i] for d in (original, dataset))
@@ -297,10 +299,10 @@ class TestBatches:
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("order", ["contiguous", "random"])
     @pytest.mark.parametrize("options", [{}, {"episodes": (1, 3)}, {"episodes": (-1, None)}])
-    def test_no_context_has_an_episodes_last_step(self, ours, theirs, cache, order, options):
+    def test_no_context_has_an_episodes_last_step(self, converted_release, published_folder, cache, order, options):
         """Nor the last step of an unfinished episode; every other step turns up, with what followed it."""
-        arrays = theirs[1][1]  # 130 steps: six episodes and a half
-        dataset = load_icrl4aht(ours, obs="uint8", cache=cache).select([1])
+        arrays = published_folder[1][1]  # 130 steps: six episodes and a half
+        dataset = load_icrl4aht(converted_release, obs="uint8", cache=cache).select([1])
         sampler = dataset.dpt(batch_size=40, context=15, order=order, seed=2, teammate_actions=True, **options)
         low, high = {(1, 3): (20, 60), (-1, None): (100, 130)}.get(options.get("episodes"), (0, 130))
         met = set()
@@ -317,12 +319,14 @@ class TestBatches:
             np.testing.assert_array_equal(batch.context_teammate_actions, arrays["teammate_actions"][steps])
         assert met == {t for t in range(low, high) if t % KEPT != KEPT - 1 and t != 129}
 
-    def test_queries_are_at_every_step(self, ours):
-        sampler = load_icrl4aht(ours).select([0]).dpt(batch_size=2000, context=1)
+    def test_queries_are_at_every_step(self, converted_release):
+        sampler = load_icrl4aht(converted_release).select([0]).dpt(batch_size=2000, context=1)
         assert set(sampler._draw(0)[1].tolist()) == set(range(120))
 
-    def test_impossible_contexts(self, ours, tmp_path):
-        dataset = load_icrl4aht(ours, task_id="task_a", obs="uint8")  # 120 and 130 steps: 114 and 123 transitions
+    def test_impossible_contexts(self, converted_release, tmp_path):
+        dataset = load_icrl4aht(
+            converted_release, task_id="task_a", obs="uint8"
+        )  # 120 and 130 steps: 114 and 123 transitions
         assert dataset.dpt(batch_size=2, context=114)[0].context_obs.shape == (2, 114, 5, 5, 45)
         with pytest.raises(OptionError, match="context = 115: the shortest history has 114 transitions"):
             dataset.dpt(batch_size=2, context=115)
@@ -332,36 +336,43 @@ class TestBatches:
             with pytest.raises(OptionError, match="the shortest history has 0 transitions"):
                 load_icrl4aht(tmp_path / "o").dpt(batch_size=2, context=1, order=order)
         with pytest.raises(LabelsMissingError, match="DPT needs expert actions, but 1 of 1 histories have none"):
-            load_icrl4aht(ours, task_id="task_b").dpt(batch_size=2, context=5)
+            load_icrl4aht(converted_release, task_id="task_b").dpt(batch_size=2, context=5)
 
-    def test_positions_of_other_contexts_are_not_resumed(self, lite, twin):
-        one, two = (load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5) for root in (lite[0], twin))
+    def test_positions_of_other_contexts_are_not_resumed(self, lite, reconverted_release):
+        one, two = (
+            load_icrl4aht(root, layout="demo_wide").dpt(batch_size=2, context=5)
+            for root in (lite[0], reconverted_release)
+        )
         with one.batches() as batches, pytest.raises(OptionError, match="excluded"):
             two.batches().load_state_dict(batches.state_dict())
 
 
 class TestCombine:
-    def test_like_ones(self, ours, theirs, twin, lite, tmp_path):
-        other = shutil.copytree(theirs[0], tmp_path / "files")
+    def test_like_ones(self, converted_release, published_folder, reconverted_release, lite, tmp_path):
+        other = shutil.copytree(published_folder[0], tmp_path / "files")
         index = other / "histories_index.jsonl"
         index.write_text(index.read_text().replace('": "task_', '": "more_'))
         from_published(other, tmp_path / "more", kept_steps=KEPT)
-        combine_releases(tmp_path / "out", [ours, tmp_path / "more"])
+        combine_releases(tmp_path / "out", [converted_release, tmp_path / "more"])
         assert verify_release(tmp_path / "out", level="deep").ok
         combined = load_icrl4aht(tmp_path / "out", obs="uint8")
         assert len(combined) == 8
         assert not combined.knows_tasks
-        before = {(h.entry.task_id, h.entry.env_idx): h for r in (ours, tmp_path / "more") for h in load_icrl4aht(r)}
+        before = {
+            (h.entry.task_id, h.entry.env_idx): h
+            for r in (converted_release, tmp_path / "more")
+            for h in load_icrl4aht(r)
+        }
         for history in combined:
             old = before[history.entry.task_id, history.entry.env_idx]
             np.testing.assert_array_equal(history.obs[:], old.obs[:])
             np.testing.assert_array_equal(history.actions[:], old.actions[:])
         with pytest.raises(OptionError, match=r"3 of 7 tasks, such as 'task_a', are known by name only: give all"):
-            combine_releases(tmp_path / "mixed", [twin, ours])
+            combine_releases(tmp_path / "mixed", [reconverted_release, converted_release])
         with pytest.raises(OptionError, match=r"kind 'lite'.*combine releases of one kind"):
-            combine_releases(tmp_path / "mixed", [ours, lite[0]])
+            combine_releases(tmp_path / "mixed", [converted_release, lite[0]])
 
-    def test_one_with_tasks_to_the_same_bytes(self, twin, tmp_path):
-        combine_releases(tmp_path / "out", [twin])
+    def test_one_with_tasks_to_the_same_bytes(self, reconverted_release, tmp_path):
+        combine_releases(tmp_path / "out", [reconverted_release])
         for name in (SHARD, "meta/tasks.jsonl", "meta/histories.jsonl", "meta/info.json"):
-            assert (tmp_path / "out" / name).read_bytes() == (twin / name).read_bytes()
+            assert (tmp_path / "out" / name).read_bytes() == (reconverted_release / name).read_bytes()

@@ -16,7 +16,7 @@ import pytest
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from tests.helpers.batches import CACHES, assert_equal
-from tests.helpers.random_play import SHARD
+from tests.helpers.random_releases import SHARD
 
 
 @pytest.fixture

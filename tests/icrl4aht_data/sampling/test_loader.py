@@ -16,7 +16,7 @@ from icrl4aht_data.reading.sources import choose_cache
 from icrl4aht_data.utils.threads import in_slices
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal, samplers
-from tests.helpers.random_play import SHARD, random_release
+from tests.helpers.random_releases import SHARD, random_release
 
 LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 """Layouts with observations of one shape and state records of several sizes."""
@@ -33,8 +33,8 @@ def three(tmp_path_factory):
 
 class TestCaches:
     @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-    def test_the_same_batches_from_each(self, lite, full, twin, obs):
-        for kinds in ((lite[0], full[0]), (twin,)[obs == "state" :]):
+    def test_the_same_batches_from_each(self, lite, full, reconverted_release, obs):
+        for kinds in ((lite[0], full[0]), (reconverted_release,)[obs == "state" :]):
             all_samplers = (
                 samplers(load_icrl4aht(root, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
                 for cache in CACHES
@@ -267,8 +267,8 @@ class TestOptions:
 
 class TestBuffers:
     @pytest.mark.parametrize("kind", ["lite", "twin"])
-    def test_a_batch_is_written_into_out(self, lite, twin, kind):
-        root = lite[0] if kind == "lite" else twin
+    def test_a_batch_is_written_into_out(self, lite, reconverted_release, kind):
+        root = lite[0] if kind == "lite" else reconverted_release
         for sampler in samplers(load_icrl4aht(root, layout="demo_wide", obs="uint8")):
             out = sampler.empty()
             for array in out:

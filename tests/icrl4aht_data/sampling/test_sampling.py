@@ -13,7 +13,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from tests.helpers.batches import digest
 from tests.helpers.paths import ROOT
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 
 LENGTH = 32
 
@@ -22,8 +22,8 @@ def previous(array):
     return np.concatenate([[0], array[:-1]])
 
 
-def test_ad_windows_are_slices_of_histories(either):
-    root, written = either
+def test_ad_windows_are_slices_of_histories(lite_or_full):
+    root, written = lite_or_full
     dataset = load_icrl4aht(root, layout="demo_wide")
     sampler = dataset.ad(batch_size=64, length=LENGTH, seed=3, teammate_actions=True)
     at_the_start = 0
@@ -60,8 +60,8 @@ def test_short_histories_are_padded_at_the_end(lite):
 
 
 @pytest.mark.parametrize("order", ["contiguous", "random"])
-def test_dpt_batches_are_transitions_of_the_same_task(either, order):
-    root, written = either
+def test_dpt_batches_are_transitions_of_the_same_task(lite_or_full, order):
+    root, written = lite_or_full
     dataset = load_icrl4aht(root, layout="demo_wide", obs="state")
     ids: dict[str, list[int]] = {}
     for entry in dataset.entries:

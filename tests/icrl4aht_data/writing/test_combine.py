@@ -14,7 +14,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import FormatTooNewError, OptionError
 from icrl4aht_data.format.schema import INFO, Kind
 from icrl4aht_data.writing.combine import combine_releases
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 
 _FIELDS = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state")
 

@@ -28,11 +28,11 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.paths import ROOT
-from tests.helpers.random_play import make_tasks, play, random_release
+from tests.helpers.random_releases import make_tasks, random_history, random_release
 
 
-def test_our_reader_returns_every_array(either):
-    root, written = either
+def test_our_reader_returns_every_array(lite_or_full):
+    root, written = lite_or_full
     dataset = load_icrl4aht(root)
     assert len(dataset) == len(written) == 12
     for history in dataset:
@@ -46,8 +46,8 @@ def test_our_reader_returns_every_array(either):
         )
 
 
-def test_plain_h5py_reads_every_array(either):
-    root, written = either
+def test_plain_h5py_reads_every_array(lite_or_full):
+    root, written = lite_or_full
     for entry in load_icrl4aht(root).entries:
         with h5py.File(root / entry.shard) as file:
             for name, array in written[entry.history_id].items():
@@ -152,7 +152,7 @@ def write_cramped(root: Path, load: Callable[[], list[NewHistory]], streams: int
 
 def played() -> dict[str, np.ndarray]:
     """Return the arrays of one history of 5 episodes of 10 steps on cramped_up."""
-    return play(get_layout("cramped_up"), 5, 10, np.random.default_rng(0))
+    return random_history(get_layout("cramped_up"), 5, 10, np.random.default_rng(0))
 
 
 def fail() -> list[NewHistory]:
@@ -255,7 +255,7 @@ def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, pause,
 import sys, time
 from pathlib import Path
 from icrl4aht_data.writing import release
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 
 def write_shard(*arguments, write=release.write_shard):
     write(*arguments)

@@ -24,7 +24,7 @@ from icrl4aht_data.remote import partial_file
 from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
 from icrl4aht_data.remote.store import RetryPolicy
-from tests.helpers.random_play import random_release
+from tests.helpers.random_releases import random_release
 from tests.servers.common import Fault, Faults, Flip, Long, Request, Short
 from tests.servers.process import environment
 

@@ -18,7 +18,7 @@ import numpy as np
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.download import ORIGIN
-from tests.helpers.random_play import SHARD
+from tests.helpers.random_releases import SHARD
 from tests.robustness.hostile.spoil import (
     TABLE,
     TERABYTE,

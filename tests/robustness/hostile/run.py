@@ -33,7 +33,7 @@ from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from tests.helpers.random_play import make_tasks, play
+from tests.helpers.random_releases import make_tasks, random_history
 from tests.robustness.hostile.cases import CASES, Case
 from tests.robustness.limits import memory_limit, time_limit
 from tests.servers.common import Faults, http_server
@@ -59,7 +59,7 @@ def make_release(root: Path) -> None:
     rng = np.random.default_rng(0)
     tasks = []
     for task in (heuristic, learned):
-        histories = [NewHistory(k, play(task.layout, 6, 20, rng)) for k in range(2)]
+        histories = [NewHistory(k, random_history(task.layout, 6, 20, rng)) for k in range(2)]
         kept = {f"{TEAMMATES}/{digest}/{name}": root.parent / name for name in files} if task is learned else {}
         tasks.append(NewTask(task, Provenance(streams_recorded=2), 2, lambda histories=histories: histories, kept))
     write_release(root, "lite", tasks, data_version="0.0.1", card="# hostile\n", kept_steps=20)

@@ -15,7 +15,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task, task_id
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from tests.helpers.random_play import SHARD
+from tests.helpers.random_releases import SHARD
 
 TABLE = "meta/chunks/teammate/coord_simple/train-00000-of-00001.npy"
 TERABYTE = 2**40

@@ -63,7 +63,7 @@ def _mostly_full(counts: np.ndarray) -> np.ndarray:
     return weight / weight.sum()
 
 
-def scene(layout: Layout, ego: tuple[int, int, str], teammate: tuple[int, int, str], **fields) -> np.ndarray:
+def state_record(layout: Layout, ego: tuple[int, int, str], teammate: tuple[int, int, str], **fields) -> np.ndarray:
     """uint8 (1, S): a state with agents at (x, y, facing) and the given fields; the rest is empty.
 
     Fields: hands=(ego's, teammate's), recipe, delivered, pot_items, pot_timers, buttons as sequences, and

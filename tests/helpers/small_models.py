@@ -19,7 +19,7 @@ TINY = ModelOptions(layers=2, width=16, heads=2, teammate_actions=True, next_obs
 FLAT = World(lambda dtype: FlatEncoder(8, dtype), (3,), plain_view, 4)
 
 
-def drawn(method: Method) -> Any:
+def random_parameters(method: Method) -> Any:
     """Return random parameters without the method's initialisation, which takes long to compile."""
     rng = np.random.default_rng(1)
 

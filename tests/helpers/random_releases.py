@@ -23,7 +23,7 @@ SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
 """The first shard of `random_release`."""
 
 
-def play(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Return the arrays of one history of random actions, 40% of them `interact`."""
     rooms = layout.rooms
     positions = np.stack([rng.choice(room, episodes) for room in rooms], axis=1)
@@ -86,7 +86,7 @@ def random_release(
     for task in make_tasks(list(layouts), teammates):
         histories = []
         for stream in range(streams):
-            arrays = play(get_layout(task.layout_name), episodes, length, rng)
+            arrays = random_history(get_layout(task.layout_name), episodes, length, rng)
             if not labels:
                 del arrays["expert_actions"]
             written[len(written)] = arrays
