@@ -25,8 +25,8 @@ from baselines.training.trainer import (
     TrainingData,
     TrainState,
     learning_rate_schedule,
-    training_optimizer,
     train,
+    training_optimizer,
 )
 from generation.learners.resume import Checkpoints
 from icrl4aht_data import load_icrl4aht
