@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
 
-from generation.learners.config import Widths
+from generation.cli import cli
+from generation.learners.config import PPOConfig, Widths
 from generation.profiles import FOLDER, load_profile, profile_names
 from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
@@ -111,6 +112,28 @@ def test_ego_hash_is_of_the_ego_alone(changed):
     assert plain.ego_hash == load_profile(changed('"coord_simple", ', "")).ego_hash
     assert plain.ego_hash != load_profile(changed("rollout = 40", "rollout = 80")).ego_hash
     assert plain.ego_hash != load_profile(changed("dense = 8", "dense = 9")).ego_hash
+
+
+def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(changed):
+    profile = load_profile(changed("keep = 8", "keep = 8"))
+    assert profile.with_ego({}) == profile
+    other = profile.with_ego({"learning_rate": 1e-3, "gru": 4})
+    assert (other.ego.learning_rate, other.ego.widths.gru, other.ego.rollout) == (1e-3, 4, profile.ego.rollout)
+    assert other.ego_hash != profile.ego_hash
+    assert other.hash != profile.hash
+    for given, message in (
+        ({"minibatches": 3}, "not a multiple of minibatches = 3"),
+        ({"environments": 4}, r"release\.keep = 8: expected 1\.\.4"),
+    ):
+        with pytest.raises(OptionError, match=rf"profile mine with the given options: .*{message}"):
+            profile.with_ego(given)
+
+
+@pytest.mark.parametrize("command", ["generate", "plan", "speed"])
+def test_every_hyper_parameter_of_the_ego_is_an_option(command):
+    options = {option.name for option in cli.commands[command].params}
+    known = {field.name for kind in (PPOConfig, Widths) for field in fields(kind)} - {"widths"}
+    assert known <= options
 
 
 # Profile files.

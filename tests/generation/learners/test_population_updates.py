@@ -232,7 +232,7 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
     assignment = whole.assignment
     key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]
     keys = jax.random.split(jax.random.fold_in(key, 0), 4)
-    weight = np.asarray(whole._place_weights(before.memory))
+    weight = np.asarray(whole._slot_weights(before.memory))
     (group,) = whole.groups
 
     def sequences_of_all(state, carry, rollout):
@@ -255,7 +255,7 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
 
 def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
     whole, before = lbrdiv.population, lbrdiv.before
-    lowered = np.asarray(whole._place_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
+    lowered = np.asarray(whole._slot_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
     assert 0 < lowered.sum() < lowered.size
     shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
 

@@ -464,7 +464,7 @@ def test_a_tasks_teammate_is_built_and_another_hash_refused(trained, tmp_path):
         np.testing.assert_array_equal(built.params["params"]["actor"]["kernel"], expected)
 
     wrong = tasks[0].teammate | {"theta": tasks[0].teammate["theta"] | {"sha256": "0" * 64}}
-    with pytest.raises(TaskFormatError, match=f"expected {'0' * 64} as the task says"):
+    with pytest.raises(TaskFormatError, match=f"expected {'0' * 64} as in the task"):
         learned.build_learned_entry(LAYOUT, wrong, trained)
     write_tasks(tmp_path / "wrong.jsonl", [replace(tasks[0], teammate=wrong)])
     with pytest.raises(TaskFormatError, match=r"line 1: task_id .* does not match the task's content"):

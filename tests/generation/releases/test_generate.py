@@ -184,6 +184,7 @@ def learned(tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned):
     """The whole recorded episode: what the rebuilt teammate does on its observations is what it did."""
     dataset = load_icrl4aht(learned / "lite")
@@ -201,6 +202,7 @@ def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned
         assert played == history.teammate_actions[:100].tolist()
 
 
+@pytest.mark.slow
 def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_path):
     root = tmp_path / "lite"
     shutil.copytree(learned / "lite", root)
@@ -216,6 +218,7 @@ def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_
     assert "as task 'teammate_train_demo_cook_wide_" in finding.problem
 
 
+@pytest.mark.slow
 def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
     dataset = load_icrl4aht(learned / "lite")
     half = to_release(dataset.filter(teammate_kind="brdiv"), tmp_path / "half", "full")
@@ -227,6 +230,7 @@ def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
         recover_teammate(load_icrl4aht(root), 0)
 
 
+@pytest.mark.slow
 def test_two_rebuilds_whose_teammates_have_the_same_place_in_their_suites(learned, tmp_path, monkeypatch):
     """Another seed, another suite folder; together the releases hold all four teammates."""
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
@@ -244,6 +248,7 @@ def test_two_rebuilds_whose_teammates_have_the_same_place_in_their_suites(learne
     assert len(weights) == 4
 
 
+@pytest.mark.slow
 def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
     dataset = load_icrl4aht(learned / "lite")
     root = to_release(dataset, tmp_path / "lite", "lite")
@@ -281,6 +286,7 @@ class Heard(StringIO):
         return count
 
 
+@pytest.mark.slow
 def test_a_population_that_another_process_trains_is_waited_for(learned, monkeypatch):
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     lock = learned / "suite/demo_wide/.brdiv.lock"
@@ -302,6 +308,7 @@ def test_a_population_that_another_process_trains_is_waited_for(learned, monkeyp
     assert {selection.algorithm for selection in selections} == {"brdiv", "fcp"}
 
 
+@pytest.mark.slow
 def test_the_card_says_who_the_teammates_are(learned):
     card = (learned / "lite" / "README.md").read_text()
     assert "Learned teammates on demo_wide: populations of 2 by fcp, brdiv, 4,000 steps per member" in card
@@ -312,11 +319,13 @@ def test_the_card_says_who_the_teammates_are(learned):
     assert "in place of the learned teammates" not in card
 
 
+@pytest.mark.slow
 def test_the_card_says_which_teammates_are_missing(learned, tmp_path):
     part = to_release(load_icrl4aht(learned / "lite", teammate_kind="fcp"), tmp_path / "part", "lite")
     assert "than its profile asks for: brdiv on demo_wide (0 of 1)." in (part / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
     def never(*arguments):
         raise AssertionError("something was done again")
@@ -329,6 +338,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
     assert output.getvalue().count("finished before") == 4
 
 
+@pytest.mark.slow
 def test_teammates_that_are_all_too_bad(learned, tmp_path):
     shutil.copytree(learned / "suite", tmp_path / "suite")
     with pytest.raises(
@@ -338,6 +348,7 @@ def test_teammates_that_are_all_too_bad(learned, tmp_path):
     assert not (tmp_path / "lite").exists()
 
 
+@pytest.mark.slow
 def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
     shutil.copytree(learned / "suite", tmp_path / "suite")
     path = tmp_path / "suite/demo_wide/fcp/m0/c3/policy.json"

@@ -194,7 +194,12 @@ def many_params(name: str) -> dict:
     return params
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+DEFAULT_LAYOUTS = ("coord_ring", "demo_wide", "cramped_up")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in DEFAULT_LAYOUTS else pytest.param(name, marks=pytest.mark.slow) for name in LAYOUTS]
+)
 def test_every_family_plays_every_layout_from_both_seats(name):
     """Row i is a game of family i % 4 with itself, at which the others look."""
     layout = LAYOUTS[name]
