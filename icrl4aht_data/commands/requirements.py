@@ -11,8 +11,8 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = "icrl4aht-data"
 
-_DEVELOPER_EXTRAS = ("dev", "peers", "all")
-"""Extras that install what work on this project needs, not what its use needs."""
+_UNNAMED_EXTRAS = ("dev", "peers", "all", "baselines")
+"""Extras that are never suggested: three for work on this project; `baselines` installs what `generation` does."""
 
 _DISTRIBUTIONS = {"PIL": "pillow"}
 """Module -> distribution, where the names differ."""
@@ -43,7 +43,7 @@ def dependencies() -> list[Dependency]:
     about = metadata(PACKAGE)
     listed = [Requirement(line) for line in about.get_all("Requires-Dist") or []]
     listed = [one for one in listed if canonicalize_name(one.name) != PACKAGE]  # an extra may include another
-    extras = [name for name in about.get_all("Provides-Extra") or [] if name not in _DEVELOPER_EXTRAS]
+    extras = [name for name in about.get_all("Provides-Extra") or [] if name not in _UNNAMED_EXTRAS]
     needed = {
         extra: [one for one in listed if one.marker is None or one.marker.evaluate({"extra": extra})]
         for extra in ("", *extras)

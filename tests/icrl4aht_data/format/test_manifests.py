@@ -67,14 +67,13 @@ def test_bundled_manifests_are_the_published_tasks(track):
 
 
 def test_check_fails_on_a_difference(monkeypatch, tmp_path):
-
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
     assert CliRunner().invoke(cli, ["manifests", "--check"]).exit_code == 0
-    monkeypatch.setattr(tasks, "manifest_path", lambda track, split: short)
+    monkeypatch.setattr("generation.cli.manifest_path", lambda track, split: short)
     result = CliRunner().invoke(cli, ["manifests", "--check"])
     assert result.exit_code == 1
-    assert "differs from the parameter tables" in str(result.exception)
+    assert "differs from the parameter sets" in str(result.exception)
 
 
 def test_unknown_manifest():
