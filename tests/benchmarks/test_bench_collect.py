@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from click.testing import CliRunner
 
 from benchmarks.bench_collect import main
 
 
+@pytest.mark.slow
 def test_speed_and_bytes(built):
     arguments = ["speed", "bytes", "--profile", str(built / "tiny.toml"), "--updates", "3", "--streams", "1"]
     result = CliRunner().invoke(main, arguments, catch_exceptions=False)
