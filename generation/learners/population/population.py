@@ -169,7 +169,7 @@ class Population:
 
     @cached_property
     def assignment(self) -> Assignment:
-        """Who plays with whom."""
+        """The pairing of policies in all environments."""
         return self.algorithm.assignment(self.config.environments)
 
     @property
