@@ -27,7 +27,7 @@ BatchView = Callable[[Array, Array | None], Array]
 
 
 class StepInput(NamedTuple):
-    """Input of an ego before an action. Before a history's first step all of `prev_*` is zero (paper, App. E.2).
+    """Input of an ego before an action. Before a history's first step all `prev_*` fields are zero (paper, App. E.2).
 
     Attributes:
         obs: (*B, ..), the ego's observation, uint8 or float.
@@ -69,7 +69,7 @@ def state_view(layouts: Sequence[Layout]) -> BatchView:
     """Returns the view of batches that hold state records: uint8 (B, .., S) -> the ego's observations (B, .., 5, 5, C).
 
     Args:
-        layouts: those that a batch's `layouts` (B,) index; their observations have one shape.
+        layouts: the layouts that `layouts` (B,) of a batch refers to by index, with observations of one shape.
     """
 
     def view(records: Array, which: Array | None) -> Array:
@@ -93,7 +93,7 @@ def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
 
 
 def percept_step(percept: Any) -> StepInput:
-    """Returns the step that an acting ego is given as an `agents.Percept`."""
+    """Returns the input of an acting ego, converted from an `agents.Percept`."""
     return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
 
 
