@@ -23,7 +23,7 @@ from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 
 BatchView = Callable[[Array, Array | None], Array]
-"""(what a batch holds of each step, its `layouts` or None) -> observations."""
+"""Function (stored observations or state records of a batch, `layouts` of the batch or None) -> observations."""
 
 
 class StepInput(NamedTuple):
@@ -31,9 +31,9 @@ class StepInput(NamedTuple):
 
     Attributes:
         obs: (*B, ..), the ego's observation, uint8 or float.
-        prev_action: int32 (*B,), the ego's last action.
-        prev_reward: float32 (*B,), the team's last reward, unscaled.
-        prev_teammate_action: int32 (*B,), or None without +TA.
+        prev_action: int32 (*B,), the ego's action in the previous step.
+        prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
+        prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.
     """
 
     obs: Num[Array, "*B ..."]
@@ -47,10 +47,10 @@ class Transition(NamedTuple):
 
     Attributes:
         obs: (*B, ..), the ego's observation before the action.
-        action: int32 (*B,), the ego's.
-        reward: float32 (*B,), the team's, unscaled.
+        action: int32 (*B,), the ego's action.
+        reward: float32 (*B,), the team's reward, unscaled.
         next_obs: (*B, ..), the ego's observation after the action.
-        teammate_action: int32 (*B,), or None without +TA.
+        teammate_action: int32 (*B,), the teammate's action in the same step; None without +TA.
     """
 
     obs: Num[Array, "*B ..."]

@@ -134,7 +134,7 @@ def teammate_card(folder: Path) -> str:
             checkpoint=f"{facts['checkpoint']:d}",
             step=f"{facts['step']:,d}",
             sha256=folder.name,
-            seats=", ".join(f"{slot:d}" for slot in facts["seats"]),
+            agents=", ".join(f"{slot:d}" for slot in facts["seats"]),
             own_return=f"{facts['return']:.1f}",
             teammate_return=f"{facts['teammate_return']:.1f}",
             seed=f"{facts['seed']:d}",

@@ -74,11 +74,11 @@ def card(**changes: Any) -> str:
 @pytest.mark.parametrize(
     ("policy", "weights", "message"),
     [
-        (card(widths={"gru": 2**40}), None, "positive whole numbers up to"),
-        (card(widths={"spatial": [1] * 10**6}), None, "positive whole numbers up to"),
+        (card(widths={"gru": 2**40}), None, "gru = 1099511627776: expected an integer at least 1 and at most 8192"),
+        (card(widths={"spatial": [1] * 10**6}), None, "expected at most 16 layers"),
         (card(widths=[8]), None, "not a checkpoint"),
         (card(shapes={"params/a": [2**40]}), None, "the card states"),
-        ("[]", None, "expected an object"),
+        ("[]", None, "policy.json is not an object"),
         ("[" * 10**5, None, "not a checkpoint"),
         (card(), (2**63 - 1).to_bytes(8, "little") + b"{}", "not a checkpoint"),
         (
