@@ -1,4 +1,4 @@
-"""The protocol that agents and teammates share."""
+"""The policy type that egos and teammates share."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Key
 
 Noise = Literal["fixed", "seeded"]
-"""Source of a heuristic's randomness: `fixed` is the published PRNGKey(slot) in every episode, so that numbers compare
-with the paper's; `seeded` is the episode's own key."""
+"""Source of a heuristic teammate's randomness: "fixed", the published PRNGKey(slot) in every episode, for results that
+compare with the paper's; or "seeded", a new key in every episode."""
 
 
 class Policy(NamedTuple):
-    """Anything that can play an agent: one instance, unbatched; roll-outs vmap it.
+    """A policy for one agent of one environment, as pure functions without a batch axis; roll-outs vmap them.
 
     Attributes:
-        params: pytree of arrays, apart from the functions, so that policies of one family share one compilation.
-        init: (params, episode key) -> memory at the start of an episode.
-        act: (params, memory, view, key) -> action, int32 scalar, and the memory after the step.
-        sees: what `view` is: "state", the state record uint8 (S,); "observation", uint8 (5, 5, C); "percept", only for
-            egos, the observation with the outcome of the last step (`baselines.agents.egos.Percept`).
+        params: pytree of arrays that the functions take as an argument, so that policies which differ only in their
+            parameters share one compilation.
+        init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, of a task.
+        act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
+        sees: content of `view`: "state" for the state record, uint8 (S,); "observation" for uint8 (5, 5, C); "percept",
+            for egos in evaluation only, for the observation with the outcome of the previous step
+            (`baselines.agents.Percept`).
     """
 
     params: Any
@@ -32,5 +34,5 @@ class Policy(NamedTuple):
 
 
 def stacked(trees: Iterable[Any]) -> Any:
-    """Returns pytrees of one structure stacked on a new leading axis."""
+    """Returns one pytree whose leaves are those of all trees, stacked on a new first axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

@@ -40,23 +40,25 @@ def load_icrl4aht(
     cache: CacheMode = "auto",
     threads: int | None = None,
 ) -> Dataset:
-    """Open a release and select histories.
+    """Open a release and return a selection of its histories.
 
     Args:
         root: a release folder, or an address: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://..., or any
             other that fsspec opens; the bundled mini release by default. Opening a remote release downloads its index,
             everything else is downloaded when it is read.
-        split: "train", "test" or "heldout".
-        layout: a short name (coord_simple) or an environment name (grounded_coord_simple); or several.
-        track: "teammate" or "layout".
-        teammate_family: "rl" or "H1".."H4".
-        teammate_kind: an algorithm or a heuristic, such as "utility_greedy".
-        task_id: the id of one task, or several ids.
-        obs: how observations are presented: "float32", "uint8" (the same integers) or "state" (state records); see
-            `history.OBS`.
-        cache: how samplers hold the selection. "ram" and "mmap" decode it once, "stream" reads what a batch needs;
-            "auto" chooses by size and free memory. The batches are the same. See `sources.CACHE_MODES`.
-        threads: how many threads decode and render; by default one for each usable core.
+        split: "train", "test" or "heldout". This and each of the following filters is one value, a sequence of values,
+            or None for any.
+        layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
+        track: what the test tasks vary: "teammate" or "layout".
+        teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
+        teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
+        task_id: id of a task; a task is a layout, a teammate and a seed.
+        obs: dtype of observations: "float32", "uint8" (the same integers), or "state" for state records instead of
+            observations; see `history.OBS`.
+        cache: "ram" and "mmap" (files that processes share) decode the selection once for all batches, "stream" reads
+            the chunks that a batch needs, "auto" chooses by size and free memory. The batches are the same. See
+            `sources.CACHE_MODES`.
+        threads: number of threads that decode and render; by default one for each usable core.
 
     Raises:
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
@@ -77,7 +79,7 @@ def load_icrl4aht(
 
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
-    """All histories of a release; see `load_icrl4aht` for the errors."""
+    """Return all histories of a release; see `load_icrl4aht` for the errors."""
     index = read_index(location.folder)
     return Dataset(location, index, Shards(location, index), options)
 
@@ -85,7 +87,8 @@ def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
 class Dataset(Selection):
     """A selection of learning histories that can be sampled; `load_icrl4aht` opens one.
 
-    `len(dataset)` counts histories, `dataset[i]` is the i-th, `dataset[a:b]` a part, iteration yields them in order.
+    `len(dataset)` is the number of histories, `dataset[i]` the i-th `History`, `dataset[a:b]` a smaller selection;
+    iteration yields the histories in order. `filter` and `select` narrow a selection, `ad` and `dpt` sample it.
     """
 
     @property
@@ -102,7 +105,7 @@ class Dataset(Selection):
         return read_provenance(self.origin.file(PROVENANCE))
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
-        """Parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
+        """Return the parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -118,13 +121,14 @@ class Dataset(Selection):
         }
 
     def recover_teammate(self, history_id: int) -> dict[str, Any]:
-        """Parameters that rebuild the teammate of a history.
+        """Return the parameters that rebuild the teammate of a history.
 
         Args:
             history_id: a history of the release, whether selected or not.
 
         Returns:
-            The task's teammate entry (`kind`, `family`, `theta` and others), and how it played: `slot` and `noise`.
+            The task's teammate entry (`kind`, `family`, `theta` and others), the teammate's agent number (`slot`) and
+            the source of its randomness (`noise`).
 
         Raises:
             NotStoredError: if the release was made without its tasks.
@@ -141,11 +145,14 @@ class Dataset(Selection):
         return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
-        """Sampler of windows for Algorithm Distillation; see `ADSampler` for the options."""
+        """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options."""
         return ADSampler(self, batch_size=batch_size, length=length, **options)
 
     def dpt(
         self, *, batch_size: int, context: int, order: ContextOrder = "contiguous", **options: Unpack[SamplerOptions]
     ) -> DPTSampler:
-        """Sampler of queries with contexts for Decision-Pretrained Transformers; see `DPTSampler` for the options."""
+        """Return a sampler of queries with contexts of `context` transitions for Decision-Pretrained Transformers.
+
+        See `DPTSampler` for the options.
+        """
         return DPTSampler(self, batch_size=batch_size, context=context, order=order, **options)

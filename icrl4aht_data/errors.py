@@ -1,4 +1,4 @@
-"""Every error this package raises on bad input, from one base class.
+"""Errors that this package raises on bad input, with one base class.
 
 Messages name the file or value, what was expected, what was found, and what to do next.
 """
@@ -10,7 +10,7 @@ from difflib import get_close_matches
 
 
 class Icrl4ahtError(Exception):
-    """Base class: catch this to catch every error of the package that is about input, not about a bug."""
+    """Base class of every error that this package raises on bad input."""
 
 
 class UnknownNameError(Icrl4ahtError, ValueError):
@@ -34,7 +34,7 @@ class NotStoredError(Icrl4ahtError):
 
 
 class ReleaseError(Icrl4ahtError):
-    """A release folder cannot be read as it is: the base of the errors below."""
+    """A release cannot be read; base class of the errors that say why."""
 
 
 class RootNotFoundError(ReleaseError, FileNotFoundError):
@@ -66,7 +66,7 @@ class ShardMismatchError(ReleaseError):
 
 
 class PublishedFormatError(ReleaseError):
-    """Files of the published code are missing, malformed, or without what a release needs."""
+    """Files in the published format are missing or malformed, or do not contain what a release needs."""
 
 
 class FormatTooNewError(ReleaseError):
@@ -78,7 +78,7 @@ class FormatTooOldError(ReleaseError):
 
 
 class RemoteError(ReleaseError, OSError):
-    """A remote failed after all retries, or returned something else than its manifest lists.
+    """A remote failed after all retries, or returned content that differs from its manifest.
 
     Args:
         message: names the address.
@@ -95,11 +95,11 @@ class OfflineError(ReleaseError):
 
 
 class UnsafePathError(ReleaseError):
-    """A path in a release leads out of it."""
+    """A path in a release points outside its folder."""
 
 
 class UploadError(Icrl4ahtError):
-    """A Hub repository refused a release, or contains something else than it; names the repository."""
+    """Uploading a release failed, or the repository's content differs from it; names the repository."""
 
 
 class TaskFormatError(Icrl4ahtError, ValueError):
@@ -110,7 +110,7 @@ _LISTED, _COMPARED = 50, 1000  # names that an error lists, and names compared t
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
-    """The error for a name that does not exist: lists the valid names and the nearest one."""
+    """Return the error for a name that does not exist; it lists the valid names and the nearest one."""
     names = list(dict.fromkeys(valid))
     nearest = get_close_matches(str(found), names[:_COMPARED], n=1, cutoff=0.4)
     hint = f" Did you mean {nearest[0]!r}?" if nearest else ""

@@ -3,7 +3,7 @@
 A sampler is a sequence of batches, each a pure function of its number, so most loaders accept it directly:
 
     plain loop     for batch in sampler.batches(): ...
-    Grain          grain.MapDataset.source(sampler); the sampler itself shuffles
+    Grain          grain.MapDataset.source(sampler); no shuffling is needed, batches are random already
     PyTorch        torch_loader(sampler, workers=4); needs the extra `torch`
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
 """
@@ -34,10 +34,10 @@ def torch_loader(
     context: str = "spawn",
     **options: Any,
 ) -> DataLoader:
-    """A DataLoader over batches start..stop as named tuples of tensors, in order for any number of workers.
+    """Return a DataLoader over batches start..stop as named tuples of tensors, in order for any number of workers.
 
-    With workers, load the dataset with cache="mmap" or "stream": for "ram" each spawned worker decodes its own copy.
-    The sampler itself shuffles; to resume, give the number of the next batch as `start`.
+    With workers, load the dataset with cache="mmap" or "stream": with "ram" each spawned worker decodes its own copy.
+    Batches are random already, so DataLoader must not shuffle. To resume, pass the number of the next batch as `start`.
 
     Args:
         sampler: makes the batches.

@@ -20,18 +20,18 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 Acting = Literal["cached", "exact"]
 ACTING: tuple[Acting, ...] = ("cached", "exact")
-"""How a trained model remembers: `cached` keeps what was computed for each step, `exact` computes everything from the
-window in every step. Both act alike until the window is full; from then on the cache also holds effects of steps that
-have left the window."""
+"""Ways of acting of a trained model: `cached` keeps the keys and values of each step, `exact` recomputes the window at
+every step. Both are equal until the window is full; afterwards cached values still depend on steps that have left the
+window."""
 
 
 class NamedEgo(NamedTuple):
     """An ego that was chosen by name.
 
     Attributes:
-        name: as reports show it.
+        name: name of the ego in reports.
         make: layout -> policy.
-        details: what results depend on in addition to the name; None for reference egos.
+        details: settings that results depend on in addition to the name; None for reference egos.
     """
 
     name: str
@@ -40,12 +40,12 @@ class NamedEgo(NamedTuple):
 
 
 def stay(layout: Layout) -> Policy:
-    """Returns an ego that always stays: what a cell of the benchmark yields without an ego."""
+    """Returns an ego that always takes the action "stay", and so measures the teammate's return without help."""
     return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(STAY), carry), "observation")
 
 
 def random(layout: Layout) -> Policy:
-    """Returns an ego that acts uniformly at random over the six actions: the paper's `Rnd` column."""
+    """Returns an ego that draws uniformly from the six actions: the column `Rnd` of the paper."""
 
     def act(params, carry, view, key):
         return jax.random.randint(key, (), 0, len(ACTIONS)), carry
@@ -57,11 +57,11 @@ def learned(method: Method, params: Any, context: int, acting: Acting = "cached"
     """Returns the ego of a trained model, whose memory lasts for the complete task.
 
     Args:
-        method: as it was trained.
-        params: its parameters, float32.
-        context: K, the steps or transitions that it remembers.
-        acting: see `ACTING`.
-        greedy: whether it takes the likeliest action, as published, or draws one from the policy.
+        method: the method with which the model was trained.
+        params: parameters of the model, float32.
+        context: K, number of steps or transitions in the memory.
+        acting: "cached" or "exact", see `ACTING`.
+        greedy: whether to take the most probable action, as published, or to draw one from the policy.
 
     Raises:
         UnknownNameError: if there is no such way of acting.
@@ -78,11 +78,11 @@ def learned(method: Method, params: Any, context: int, acting: Acting = "cached"
 
 
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
-"""Name of a reference ego -> its maker, layout -> policy."""
+"""Reference egos: name -> function from a layout to the policy."""
 
 
 def get_agent(name: str) -> Callable[[Layout], Policy]:
-    """Returns the maker of a reference ego.
+    """Returns the function that makes a reference ego, layout -> policy.
 
     Raises:
         UnknownNameError: if there is no such ego; lists the valid names and the nearest.
@@ -93,7 +93,11 @@ def get_agent(name: str) -> Callable[[Layout], Policy]:
 
 
 def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
-    """Returns the reference ego of a name, or the trained model of a run folder that `python -m baselines train` made.
+    """Returns the reference ego with a name, or the trained model in a run folder of `python -m baselines train`.
+
+    Args:
+        name: name of a reference ego, or path of a run folder.
+        acting: way of acting of a trained model, see `ACTING`.
 
     Raises:
         UnknownNameError: if the name is neither.

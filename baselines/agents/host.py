@@ -15,17 +15,18 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 
 class Percept(NamedTuple):
-    """Input of an ego with memory (`sees = "percept"`): its observation and the outcome of its last step.
+    """Input of an ego with memory: its observation and the outcome of the previous step.
 
-    As in training, the last step before an episode's first is the previous episode's last. Before a task's first step
-    all of `prev_*` is zero. Arrays have a leading axis (B,) for host agents.
+    As in training, the step before the first step of an episode is the last step of the previous episode. Before the
+    first step of a task all `prev_*` fields are zero. A `HostAgent` receives arrays of B tasks, with a leading axis
+    (B,).
 
     Attributes:
         obs: uint8 (5, 5, C), the ego's observation.
-        prev_action: int32 (), the ego's last action.
-        prev_reward: float32 (), the team's last reward.
-        prev_teammate_action: int32 (), the teammate's last action.
-        prev_done: bool (), whether the last step ended an episode.
+        prev_action: int32 (), the ego's action in the previous step, 0..5.
+        prev_reward: float32 (), the team's reward in the previous step.
+        prev_teammate_action: int32 (), the teammate's action in the previous step, 0..5.
+        prev_done: bool (), whether the previous step ended an episode.
     """
 
     obs: Any
@@ -36,13 +37,13 @@ class Percept(NamedTuple):
 
 
 class HostPolicy(NamedTuple):
-    """A `generation.policy.Policy` whose functions take a complete batch, for agents that cannot be vmapped.
+    """A `generation.policy.Policy` whose functions take a batch of B tasks, for agents that cannot be vmapped.
 
     Attributes:
         params: pytree of parameters.
-        init: (params, keys (B,)) -> carry of the batch.
-        act: (params, carry, views of the batch, keys (B,)) -> (int32 (B,) actions, carry).
-        sees: what `act` is given.
+        init: (params, keys (B,)) -> memory of the batch.
+        act: (params, memory, views of the batch, keys (B,)) -> actions, int32 (B,), and the memory.
+        sees: content of the views, as in `Policy`.
     """
 
     params: Any
@@ -52,21 +53,21 @@ class HostPolicy(NamedTuple):
 
 
 class HostAgent(Protocol):
-    """An ego outside JAX. It plays B tasks at once and keeps its own memory."""
+    """Interface of an ego outside JAX. It plays B tasks in parallel and keeps its own memory."""
 
     def reset(self, batch: int) -> None:
-        """Forget everything: a new set of `batch` tasks begins."""
+        """Clear the memory: a new set of `batch` tasks begins."""
         ...
 
     def act(self, percept: Percept) -> np.ndarray:
-        """Returns integers (B,) in 0..5 for a `Percept` of arrays with leading axis B: obs uint8 (B, 5, 5, C), ..."""
+        """Returns actions, integers (B,) in 0..5, for a `Percept` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
         ...
 
 
 def from_host(agent: HostAgent) -> Callable[[Layout], HostPolicy]:
-    """Returns the evaluator's ego of a `HostAgent`.
+    """Returns the `make_ego` argument of `baselines.evaluate.evaluate` for a `HostAgent`.
 
-    The agent's `act` is called once per step, in order, with all tasks of one layout and teammate family.
+    For each layout and teammate family `reset` is called once, then `act` once per step with all their tasks.
 
     Raises:
         OptionError: during evaluation, if `act` does not return B integers.

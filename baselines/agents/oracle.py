@@ -132,11 +132,11 @@ def _hindrance(paths: Paths) -> np.ndarray:
 
 
 class OracleMemory(NamedTuple):
-    """Memory of the ego, which lasts over the ends of episodes.
+    """Memory of the ego, which is kept from one episode to the next.
 
     Attributes:
-        record: uint8 (S,), state record before the last step.
-        action: int32 (), the ego's last action.
+        record: uint8 (S,), state record before the previous step.
+        action: int32 (), the ego's action in the previous step.
         calm: int32 (), steps since the pots or the recipe changed.
         still: int32 (), steps since the teammate moved.
         bumps: int32 (), consecutive steps in which the ego failed to move.
@@ -156,7 +156,7 @@ class OracleMemory(NamedTuple):
 
 
 def oracle(layout: Layout) -> Policy:
-    """Returns the scripted ego of a layout, without parameters; its `act` takes the state record uint8 (S,)."""
+    """Returns the scripted ego for a layout, a policy without parameters that sees the state record, uint8 (S,)."""
     facts = _study_layout(layout)
     matters = facts.serves or bool(np.isin(layout.kinds[facts.shared], [POT, WALL]).any())
 
@@ -202,9 +202,9 @@ class OracleView(NamedTuple):
     """One state as the ego reads it; arrays are traced.
 
     Attributes:
-        facts: of the layout.
-        scene: the state, from the ego's side.
-        memory: the ego's.
+        facts: facts of the layout.
+        scene: the state from the ego's point of view.
+        memory: memory of the ego.
         origin: index into `LayoutFacts.time` and `action`: the obstacle, the ego's cell and facing.
         time: int32 (cells,), steps until the ego faces a cell, around the teammate.
         items: uint8 (cells,), items on counters.
@@ -350,8 +350,8 @@ class Subgoal(NamedTuple):
     """One thing to do: go to the cheapest cell and interact.
 
     Attributes:
-        when: bool (), whether it applies.
-        cost: int32 (cells,).
+        when: bool (), whether the subgoal applies.
+        cost: int32 (cells,), cost of going to each cell in steps; NEVER for cells that do not serve it.
     """
 
     when: Bool[Array, ""]

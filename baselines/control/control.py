@@ -31,7 +31,7 @@ DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
 
 @dataclass(frozen=True)
 class ControlSize:
-    """ControlSize of a control; the defaults take about ten minutes on two cores.
+    """Size of a control; the defaults take about ten minutes on two cores.
 
     Attributes:
         bandit_steps: steps of a bandit task, and of a context.
@@ -39,8 +39,8 @@ class ControlSize:
         rows: histories to train on, or tasks of DPT.
         tasks: tasks to play.
         updates: training steps of DPT on bandits, AD on bandits, AD in Dark Room.
-        learning_rates: of the same three.
-        batch_size: of all three.
+        learning_rates: learning rates of these three trainings.
+        batch_size: batch size of all three trainings.
     """
 
     bandit_steps: int = 100

@@ -19,11 +19,11 @@ from icrl4aht_data.benchmark.tasks import Task
 
 
 class Drift(NamedTuple):
-    """Comparison of both policies in one episode of T steps of B tasks.
+    """Comparison of `cached` and `exact` acting in one episode of T steps of B tasks.
 
     Attributes:
-        distance: float32 (B, T), total variation between the policies, 0..1.
-        same: bool (B, T), whether both would take the same action.
+        distance: float32 (B, T), total variation between both policies, 0..1.
+        same: bool (B, T), whether both choose the same action.
     """
 
     distance: Float[np.ndarray, "B T"]

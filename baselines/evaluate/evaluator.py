@@ -1,4 +1,4 @@
-"""The evaluator: any ego on any tasks, under a named protocol (paper, Sec. 4.3).
+"""Evaluation of an ego on tasks under a named protocol (paper, Sec. 4.3).
 
 A task is 100 episodes of 100 steps in sequence. The ego's memory lasts for the task, the teammate's for an episode. An
 episode's key is a function of (seed, task_id, episode) alone, so a task's result does not depend on what else is
@@ -33,7 +33,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.threads import usable_cores
 
 MakeEgo = Callable[[Layout], Policy | HostPolicy]
-"""Layout -> ego."""
+"""Function from a layout to the ego that plays on it."""
 
 
 def evaluate(
@@ -48,24 +48,21 @@ def evaluate(
     details: dict[str, Any] | None = None,
     done: Callable[[int], None] = lambda tasks: None,
 ) -> list[Result]:
-    """Evaluate an ego.
+    """Evaluate an ego and return one result per task, in the order of `tasks`.
 
     Args:
-        agent: its name, part of the settings.
-        make_ego: the ego for a layout.
-        tasks: any tasks; those of one layout and teammate family run together.
-        protocol: see `PROTOCOLS`.
-        seeds: each plays every task once, all in one batch.
-        suite: folder of learned teammates' checkpoints.
-        out: folder for one JSON file per task; results of the same settings found there are not computed again.
-        details: further settings that the ego's results depend on.
-        done: called with the number of tasks just finished, for progress.
-
-    Returns:
-        One result per task, in the order of `tasks`.
+        agent: name of the ego in results and reports.
+        make_ego: layout -> ego, such as `baselines.agents.from_host(my_agent)`.
+        tasks: the tasks, such as those of `generation.teammates.instances.published_tasks`.
+        protocol: rules of the evaluation, from `get_protocol`.
+        seeds: seeds of the episodes; the ego plays every task once per seed.
+        suite: folder with the checkpoints of learned teammates, if tasks have any.
+        out: folder for one JSON file per task. Results found there under the same settings are not computed again.
+        details: further settings that the results depend on, as JSON; stored and compared with the results.
+        done: called with the number of tasks finished since the last call, for progress.
 
     Raises:
-        OptionError: if `out` holds results of other settings, or the ego's action is not one integer.
+        OptionError: if `out` has results of other settings, or the ego's actions are not integers in 0..5.
         TaskFormatError: if a teammate's parameters are impossible; names the task.
     """
     for task in tasks:
@@ -141,8 +138,8 @@ class PreparedRollout(NamedTuple):
     """Tasks of one layout and teammate family, ready to play.
 
     Attributes:
-        rollout: the tasks' rollout.
-        state: before the first episode.
+        rollout: the rollout of all tasks.
+        state: the state before the first episode.
         episode: compiled `EvaluationRollout.episode`.
     """
 

@@ -17,11 +17,12 @@ class Protocol:
     """Rules of an evaluation.
 
     Attributes:
-        name: as in `PROTOCOLS`.
-        noise: randomness of heuristic teammates, see `generation.policy.Noise`.
-        four_recipes: whether Track 2 draws from four recipes, as for the published numbers, or from its layouts' two.
-        episodes: of each task.
-        steps: of each episode.
+        name: name of the protocol, "published" or "seeded".
+        noise: source of the randomness of heuristic teammates: "fixed" or "seeded", see `generation.policy.Noise`.
+        four_recipes: whether the layouts of the layout track draw from four recipes, as for the published numbers, and
+            not from their own two.
+        episodes: number of episodes of each task.
+        steps: number of steps of each episode.
     """
 
     name: str
@@ -35,11 +36,11 @@ PROTOCOLS = {
     "published": Protocol("published", noise="fixed", four_recipes=True),
     "seeded": Protocol("seeded", noise="seeded", four_recipes=False),
 }
-"""`published` compares with the paper's numbers; `seeded`, the default, is what to report."""
+"""Protocols by name: `published`, to compare with the paper's numbers, and `seeded`, the default, to report."""
 
 
 def get_protocol(name: str, episodes: int | None = None) -> Protocol:
-    """Returns the protocol of a name, with another number of episodes per task if one is given.
+    """Returns the protocol with a name, with another number of episodes per task if one is given.
 
     Raises:
         UnknownNameError: if there is no such protocol; lists the valid names and the nearest.

@@ -13,12 +13,12 @@ from icrl4aht_data.utils.files import atomic_write, json_hash
 
 @dataclass(frozen=True)
 class Result:
-    """Outcome of one task.
+    """Result of an ego on one task.
 
     Attributes:
-        task_id: of the task.
-        settings: agent, seeds, protocol, version and details that the outcome depends on.
-        returns: team return of each episode, one list per seed.
+        task_id: id of the task.
+        settings: agent, seeds, protocol, version and details that the result depends on.
+        returns: return of the team in each episode: one list per seed with one number per episode.
     """
 
     task_id: str
@@ -26,7 +26,7 @@ class Result:
     returns: list[list[float]]
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the content of the result's file."""
+        """Returns the content of the result's JSON file."""
         return {"settings_hash": json_hash(self.settings), **asdict(self)}
 
 

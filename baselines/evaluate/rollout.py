@@ -29,12 +29,12 @@ _EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # streams of keys within an episode, next to
 
 
 class RolloutState(NamedTuple):
-    """State between two steps of B tasks.
+    """State of B tasks between two steps.
 
     Attributes:
-        env: the environments.
-        ego: the egos' memories, batched.
-        before: outcome of the last step, without its `obs`.
+        env: states of the B environments.
+        ego: memories of the egos, a pytree of arrays (B, ...).
+        before: outcome of the previous step, arrays (B,); its `obs` is not used.
     """
 
     env: EnvState
@@ -47,8 +47,8 @@ class Episode(NamedTuple):
 
     Attributes:
         record: uint8 (B, T, S), state record before each step.
-        actions: int32 (B, T, 2), of both agent slots.
-        reward: float32 (B, T), the team's.
+        actions: int32 (B, T, 2), actions of ego and teammate, 0..5.
+        reward: float32 (B, T), reward of the team.
     """
 
     record: UInt8[Array, "B T S"]
@@ -61,10 +61,10 @@ class EvaluationRollout:
     """Episodes of B tasks that share a layout and a teammate family.
 
     Attributes:
-        layout: of all tasks.
-        ego: plays all tasks.
-        teammates: B policies of one family.
-        protocol: see `Protocol`.
+        layout: the layout of all tasks.
+        ego: the ego, which plays all tasks.
+        teammates: the B teammates, policies of one family.
+        protocol: rules of the evaluation.
     """
 
     layout: Layout
@@ -86,7 +86,7 @@ class EvaluationRollout:
 
     @cached_property
     def batched_ego(self) -> HostPolicy:
-        """The ego as functions of a batch."""
+        """The ego with functions that take a batch of B tasks."""
         if isinstance(self.ego, HostPolicy):
             return self.ego
         init, act = jax.vmap(self.ego.init, in_axes=(None, 0)), jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))
@@ -126,7 +126,7 @@ class EvaluationRollout:
         return state, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), played)
 
     def ego_view(self, state: RolloutState) -> Any:
-        """Returns what the egos see now, batched."""
+        """Returns the input of the egos, with a leading axis (B,): state records, observations or percepts."""
         if self.ego.sees == "percept":
             return state.before._replace(obs=self._view("observation", state.env, EGO))
         return self._view(self.ego.sees, state.env, EGO)

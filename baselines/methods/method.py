@@ -34,7 +34,7 @@ class World(NamedTuple):
     Attributes:
         encoder: dtype -> module from observations to features.
         obs_shape: shape of one observation.
-        view: how observations are read from batches.
+        view: function that returns the observations of a batch.
         actions: number of actions.
     """
 
@@ -50,8 +50,8 @@ class Method:
 
     Attributes:
         name: as in `registry.METHODS`.
-        label: as shown in reports.
-        data: sampler whose batches it takes.
+        label: name in reports.
+        data: sampler of the batches to train on, "ad" or "dpt".
         model: module with the methods `start` and `act`.
         example: arguments that the model's parameters are made for.
         loss: see `Loss`.

@@ -9,7 +9,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 Positions = Literal["none", "rope"]
-"""How a token's position enters the transformer: not at all, as published, or by rotary embedding (Su et al. 2021)."""
+"""Position embedding of tokens: none, as published, or rotary (Su et al. 2021)."""
 
 SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 768, 100_000)}
 """Size name -> layers, width, training steps (paper, Sec. 4.4, "Model Scale and Training Budget")."""

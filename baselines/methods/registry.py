@@ -21,11 +21,11 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "hybrid_ad": hybrid_ad,
     "amago_offline": amago_offline,
 }
-"""Method name -> maker."""
+"""Methods: name -> function from (ModelOptions, World) to the method."""
 
 
 def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
-    """Returns the maker of a method.
+    """Returns the function that makes a method from (ModelOptions, World).
 
     Raises:
         UnknownNameError: if there is no such method; lists the valid names and the nearest.
@@ -36,10 +36,10 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
 
 
 def overcooked_world(layouts: Sequence[Layout], view: BatchView | None = None) -> World:
-    """Returns OvercookedV2 in layouts with observations of one shape.
+    """Returns the world of OvercookedV2 on layouts with observations of one shape.
 
     Args:
-        layouts: those that batches hold.
-        view: how observations are read from batches; rendered from state records by default.
+        layouts: the layouts in batches.
+        view: function that returns the observations of a batch; by default it renders state records.
     """
     return World(lambda dtype: GridEncoder(dtype=dtype), layouts[0].obs_shape, view or state_view(layouts))

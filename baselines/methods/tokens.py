@@ -23,17 +23,17 @@ from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 
 BatchView = Callable[[Array, Array | None], Array]
-"""(what a batch holds of each step, its `layouts` or None) -> observations."""
+"""Function (stored observations or state records of a batch, `layouts` of the batch or None) -> observations."""
 
 
 class StepInput(NamedTuple):
-    """Input of an ego before an action. Before a history's first step all of `prev_*` is zero (paper, App. E.2).
+    """Input of an ego before an action. Before a history's first step all `prev_*` fields are zero (paper, App. E.2).
 
     Attributes:
         obs: (*B, ..), the ego's observation, uint8 or float.
-        prev_action: int32 (*B,), the ego's last action.
-        prev_reward: float32 (*B,), the team's last reward, unscaled.
-        prev_teammate_action: int32 (*B,), or None without +TA.
+        prev_action: int32 (*B,), the ego's action in the previous step.
+        prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
+        prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.
     """
 
     obs: Num[Array, "*B ..."]
@@ -47,10 +47,10 @@ class Transition(NamedTuple):
 
     Attributes:
         obs: (*B, ..), the ego's observation before the action.
-        action: int32 (*B,), the ego's.
-        reward: float32 (*B,), the team's, unscaled.
+        action: int32 (*B,), the ego's action.
+        reward: float32 (*B,), the team's reward, unscaled.
         next_obs: (*B, ..), the ego's observation after the action.
-        teammate_action: int32 (*B,), or None without +TA.
+        teammate_action: int32 (*B,), the teammate's action in the same step; None without +TA.
     """
 
     obs: Num[Array, "*B ..."]
@@ -69,7 +69,7 @@ def state_view(layouts: Sequence[Layout]) -> BatchView:
     """Returns the view of batches that hold state records: uint8 (B, .., S) -> the ego's observations (B, .., 5, 5, C).
 
     Args:
-        layouts: those that a batch's `layouts` (B,) index; their observations have one shape.
+        layouts: the layouts that `layouts` (B,) of a batch refers to by index, with observations of one shape.
     """
 
     def view(records: Array, which: Array | None) -> Array:
@@ -93,7 +93,7 @@ def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
 
 
 def percept_step(percept: Any) -> StepInput:
-    """Returns the step that an acting ego is given as an `agents.Percept`."""
+    """Returns the input of an acting ego, converted from an `agents.Percept`."""
     return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
 
 

@@ -115,7 +115,7 @@ def _restore(source: ResultSource) -> Callable[[Layout], Policy] | Icrl4ahtError
 
 
 def restore_ego(source: ResultSource) -> Callable[[Layout], Policy]:
-    """Returns the maker of the ego that results are of.
+    """Returns the function that makes the ego of some results, layout -> policy.
 
     Raises:
         OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.

@@ -34,11 +34,11 @@ class ResultSource(NamedTuple):
     """Origin of results.
 
     Attributes:
-        folder: that they were read from.
-        layouts: that were played.
-        settings: of the evaluation, see `evaluate.results.Result`.
+        folder: folder that the results were read from.
+        layouts: layouts that were played.
+        settings: settings of the evaluation, see `evaluate.results.Result`.
         trained: content of run.json, see `note_results`; None for an agent that was not trained here.
-        tasks: cell -> the first task of it that was played.
+        tasks: cell -> the first task of the cell that was played.
     """
 
     folder: str
@@ -53,12 +53,12 @@ class EvaluationRun:
     """One agent's results under one protocol.
 
     Attributes:
-        agent: its name.
+        agent: name of the agent.
         protocol: name of the protocol.
-        cells: cell -> team returns float64 (instances, episodes), means over the seeds.
-        variant: of a sweep: what is varied and this run's value, such as ("K", 250).
-        note: distinguishes results of one agent on the same cells.
-        sources: of the results.
+        cells: (layout, family) -> returns of the team, float64 (instances, episodes), means over the seeds.
+        variant: name and value of the varied quantity in a sweep, such as ("K", 250); None otherwise.
+        note: text that distinguishes results of one agent on the same cells; usually empty.
+        sources: origins of the results.
     """
 
     agent: str
@@ -89,12 +89,12 @@ class EvaluationRun:
 
     @cached_property
     def name(self) -> str:
-        """The label and the protocol."""
+        """The label with the protocol in parentheses."""
         return f"{self.label} ({self.protocol})"
 
 
 def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
-    """Store with results what a report needs to know of them.
+    """Store the settings and tasks of results next to them, for reports.
 
     Args:
         results: folder of the results.
@@ -144,13 +144,13 @@ def read_run(folder: Path) -> EvaluationRun:
 def as_run(
     results: Sequence[Result], where: str = "results", tasks: Sequence[Task] = (), trained: dict[str, Any] | None = None
 ) -> EvaluationRun:
-    """Returns results of one agent as a run.
+    """Returns the results of one agent as a run, which reports take.
 
     Args:
-        results: of one agent, under the same settings.
-        where: their folder, for messages.
-        tasks: those played that are not among the published test tasks.
-        trained: content of run.json.
+        results: results of `baselines.evaluate.evaluate`, all under the same settings.
+        where: folder of the results, for messages.
+        tasks: the tasks that were played, if they are not the published test tasks.
+        trained: content of run.json, see `note_results`; None for an agent that was not trained here.
 
     Raises:
         OptionError: if the settings differ, or a result's task is neither published nor in `tasks`.
@@ -179,9 +179,9 @@ def as_run(
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
-    """Returns runs with one agent's results on different cells, such as models of each layout, merged into one run.
+    """Returns the runs with those of one agent on different cells, such as models of each layout, merged into one run.
 
-    Runs that played the same cell stay apart; the later ones are noted with their folder.
+    Runs that played the same cell are not merged; the `note` of the later ones is their folder.
     """
     merged: list[EvaluationRun] = []
     for run in runs:

@@ -37,7 +37,7 @@ def bootstrap_interval(means: np.ndarray, rng: np.random.Generator) -> tuple[flo
 
 
 def rows(run: EvaluationRun) -> list[dict[str, Any]]:
-    """Returns one row per cell: return, interval, the same agent's published numbers, gain and normalized return."""
+    """Returns one row per cell of a run: mean return, 95 % interval, published numbers of the agent, gain, ..."""
     published: dict[str, Any] = {} if run.variant else published_cells(run.agent)
     headroom = read_headroom(run.protocol)
     rng = np.random.default_rng(0)
@@ -71,7 +71,7 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
 
 
 def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
-    """Write report.md, report.csv and curves.png into a folder. Returns their paths."""
+    """Write report.md, report.csv and curves.png of some runs into the folder `out`. Returns their paths."""
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / "report.md", out / "report.csv", out / "curves.png"]
     paths[0].write_text(markdown(runs), encoding="utf-8")
@@ -81,7 +81,7 @@ def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
 
 
 def markdown(runs: list[EvaluationRun]) -> str:
-    """Returns a Markdown report with one block per run and track."""
+    """Returns a Markdown report with one table per run and track: returns by layout and teammate family."""
     lines = [
         "# Returns per layout and teammate family",
         "",

@@ -54,11 +54,11 @@ PAPER_TABLES = (
 
 
 class TableScore(NamedTuple):
-    """One entry of a table.
+    """Score of an agent on a group of cells, one entry of a table.
 
     Attributes:
-        mean: return; None if nothing was played.
-        std: over instances of a single cell, or over cells.
+        mean: mean return; None if nothing was played.
+        std: standard deviation over the instances of a single cell, or over cells.
         published: the paper's mean, and its std if it states one.
         normalised: (return - stay) / (oracle - stay), mean over the cells with headroom.
         headroom: (number of measured cells with headroom, number of measured cells).
@@ -74,12 +74,12 @@ class TableScore(NamedTuple):
 
 
 class TableRow(NamedTuple):
-    """One agent's scores.
+    """Scores of one agent, a row of a table.
 
     Attributes:
-        label: the family, `AVERAGE`, or empty.
-        agent: its name.
-        scores: one per column.
+        label: the teammate family, `AVERAGE`, or empty.
+        agent: name of the agent.
+        scores: scores of the agent, one per column.
     """
 
     label: str
@@ -92,8 +92,8 @@ def fill_table(table: PaperTable, runs: Sequence[EvaluationRun], protocol: str) 
 
     Args:
         table: one of `PAPER_TABLES`.
-        runs: of one protocol, none of them of a sweep.
-        protocol: its name.
+        runs: runs under one protocol, none of a sweep.
+        protocol: name of the protocol.
     """
     covers_track = table.columns in (_TEAMMATE, _LAYOUT)
     others = [

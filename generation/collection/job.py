@@ -1,4 +1,4 @@
-"""What every executor does with a task, and what it reports."""
+"""The job that every executor runs for a task, and its outcome."""
 
 from __future__ import annotations
 

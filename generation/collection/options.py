@@ -11,7 +11,7 @@ from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 @dataclass(frozen=True)
 class CollectOptions:
-    """How tasks are collected. See the fields' help texts."""
+    """Options of collecting tasks; the help text of each field describes it."""
 
     executor: Literal["local", "ray"] = option_field("local", "Run one task at a time here, or use Ray.")
     address: str | None = option_field(

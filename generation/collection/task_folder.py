@@ -46,17 +46,17 @@ def partial_folder(folder: Path) -> Path:
 
 
 def artefact_settings(task: Task, profile: Profile) -> dict[str, Any]:
-    """What an artefact depends on: if any of it changes, the artefact is made again."""
+    """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
     return {"task": asdict(task), "ego_hash": profile.ego_hash, "code_version": version("icrl4aht-data")}
 
 
 def resumable_settings(task: Task, profile: Profile) -> dict[str, Any]:
-    """What must agree for a resumed task to give the bits of an uninterrupted one."""
+    """Returns the settings that must not change for a resumed task to give the bits of an uninterrupted one."""
     return artefact_settings(task, profile) | software_versions()
 
 
 def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
-    """Whether the folder holds this task's artefact under these settings, with all its files unchanged."""
+    """Returns whether a folder has this task's artefact under these settings, with all its files unchanged."""
     try:
         metadata = parse_json(read_text(folder / METADATA))
         wanted = artefact_settings(task, profile)

@@ -91,7 +91,7 @@ class GRU(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """Observations over time -> action logits and values.
+    """Recurrent actor-critic: sequences of observations to action logits and values.
 
     Args:
         widths: layer widths.

@@ -1,9 +1,10 @@
-"""The one recurrent PPO (paper, App. B.1 and C.2): updates a policy from the sequences that it played.
+"""Recurrent PPO for egos and populations (paper, App. B.1 and C.2).
 
-T denotes the steps of a roll-out, M the agent slots of one policy. A sequence is one slot's T steps; minibatches
-consist of complete sequences, because the recurrent state is recomputed from the one before the first step. Sequences
-hold state records, which are much smaller than the observations that the loss renders from them. The algorithms for
-egos and populations differ only in who the partner was and in the weight of each sequence's advantage.
+T denotes the steps of a roll-out, M the agent slots of one policy: pairs of an environment and one of its two agents
+that the policy controls. A sequence is the T steps of one slot. Minibatches consist of complete sequences, because the
+recurrent state is recomputed from the one before the first step. Sequences hold state records, which are much smaller
+than the observations that the loss renders from them. The algorithms for egos and populations differ only in the
+partner and in the weight of each sequence's advantage.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from icrl4aht_data.overcooked.observe import observe
 
 
 def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam under a linear warm-up and a cosine decay (paper, App. C.2.3), gradients clipped by global norm."""
+    """Returns Adam with linear warm-up, cosine decay (paper, App. C.2.3) and gradients clipped by global norm."""
     steps = config.updates * config.epochs * config.minibatches
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, config.learning_rate, max(1, round(config.warmup * steps)), steps
@@ -35,25 +36,25 @@ def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
 
 
 def shaping_weight(config: PPOConfig, update: Int[Array, ""]) -> Float[Array, ""]:
-    """The weight of shaped rewards in an update: linearly from 1 to 0 (paper, App. B.1)."""
+    """Returns the weight of shaped rewards in an update, which decreases linearly from 1 to 0 (paper, App. B.1)."""
     return jnp.maximum(0.0, 1.0 - update * config.steps_per_update / config.shaping_horizon)
 
 
 class Sequences(NamedTuple):
-    """T steps in the M agent slots of one policy; every array has the slots on axis 1.
+    """T steps in the M agent slots of one policy. Slots are on axis 1 of every array.
 
     Attributes:
         record: uint8 (T, M, S), state records with the policy's own agent first.
         reset: bool (T, M), whether the record starts an episode.
-        action: int32 (T, M), ids 0..5.
+        action: int32 (T, M), the actions taken, 0..5.
         log_prob: float32 (T, M), log-probability of the action when it was played.
         value: float32 (T, M), the critic's estimate when it was played.
-        reward: float32 (T, M), the team's reward plus the agent's own shaped one times its weight.
+        reward: float32 (T, M), the team's reward plus the agent's shaped reward times its weight.
         done: bool (T, M), whether the step ended an episode.
         hidden: float32 (1, M, H), recurrent state before the first step.
-        partner: int32 (1, M), number of the other agent's policy, for the critic.
-        weight: float32 (1, M), factor of the advantage; negative where the return is to be lowered.
-        last_value: float32 (1, M), estimate for the observation after the last step.
+        partner: int32 (1, M), number of the other agent's policy, an input of the critic.
+        weight: float32 (1, M), factor of the advantage; negative to minimise the return.
+        last_value: float32 (1, M), the critic's estimate for the observation after the last step.
     """
 
     record: UInt8[Array, "T M S"]
@@ -72,14 +73,14 @@ class Sequences(NamedTuple):
 def sequences(
     rollout: Rollout, player: int, agent_slots: np.ndarray, hidden: Array, last_value: Array, shaping: Array
 ) -> Sequences:
-    """Returns the sequences of one player's slots, with partner 0 and weight 1 everywhere.
+    """Returns the sequences in one player's agent slots, all with partner 0 and weight 1.
 
     Args:
         rollout: the roll-out.
-        player: number of the player.
-        agent_slots: int (M,), the player's slots.
-        hidden: float32 (M, H), its memory before the roll-out.
-        last_value: float32 (M,), its estimates for the observations after the roll-out.
+        player: number of the player in the roll-out.
+        agent_slots: int (M,), the player's slots; slot a * N + n is agent a of environment n.
+        hidden: float32 (M, H), the player's recurrent state before the roll-out.
+        last_value: float32 (M,), the critic's estimates for the observations after the roll-out.
         shaping: float32 scalar or (M,), weight of shaped rewards.
     """
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
@@ -116,12 +117,18 @@ class PPO:
     def learn(
         self, params: Any, optimizer: optax.OptState, played: Sequences, key: Key[Array, ""]
     ) -> tuple[Any, optax.OptState, dict[str, Array]]:
-        """Runs the epochs over one roll-out.
+        """Updates a policy with `config.epochs` passes over the sequences of one roll-out.
 
-        Minibatches have one size, so an epoch skips the sequences that remain, others in every epoch.
+        Minibatches are of equal size; the remaining sequences are skipped, different ones in every epoch.
+
+        Args:
+            params: parameters of the network.
+            optimizer: state of `ppo_optimizer`.
+            played: the sequences.
+            key: shuffles the sequences.
 
         Returns:
-            Parameters, optimiser state, and the mean of each loss over all minibatches.
+            New parameters and optimiser state, and loss -> mean over all minibatches, float32 ().
         """
         config, optimiser = self.config, ppo_optimizer(self.config)
         count = played.done.shape[1] - played.done.shape[1] % config.minibatches
@@ -145,7 +152,7 @@ class PPO:
         return params, optimizer, jax.tree.map(jnp.mean, losses)
 
     def loss(self, params: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
-        """Returns the loss of a minibatch and its parts: clipped surrogate, clipped value error, entropy.
+        """Returns the loss of a minibatch, and its parts by name: clipped surrogate, clipped value error, entropy.
 
         Source: paper, App. B.1, table of PPO hyper-parameters; Schulman et al. 2017, eq. 7.
         """
@@ -170,7 +177,7 @@ class PPO:
 
 
 class Batch(NamedTuple):
-    """Sequences with what the loss needs; every array has the agent slots on axis 1.
+    """Sequences with their advantages and targets. Agent slots are on axis 1 of every array.
 
     Attributes:
         played: the sequences.
@@ -190,7 +197,10 @@ def generalised_advantage(
     last_value: Float[Array, " M"],
     config: PPOConfig,
 ) -> Float[Array, "T M"]:
-    """GAE (Schulman et al. 2016, eq. 16); an episode's end cuts both the bootstrap and the trace."""
+    """Returns generalised advantage estimates (Schulman et al. 2016, eq. 16).
+
+    The end of an episode cuts both the bootstrap and the trace.
+    """
     following = jnp.concatenate([value[1:], last_value[None]])
     continues = 1.0 - done
     delta = reward + config.discount * following * continues - value
@@ -204,7 +214,7 @@ def generalised_advantage(
 
 
 def episode_metrics(rollout: Rollout) -> dict[str, Array]:
-    """Returns scalars about a roll-out's episodes and rewards; `return` is 0 if no episode ended."""
+    """Returns scalar metrics of a roll-out by name; `return` is the mean over ended episodes, 0 if there are none."""
     ended = jnp.sum(rollout.done)
     return {
         "episodes": ended,

@@ -102,7 +102,7 @@ class SaveInterval:
         self._saved = time.monotonic()
 
     def due(self, update: int) -> bool:
-        """Whether to save after this many updates; a positive answer starts the next interval."""
+        """Returns whether to save after this many updates; a positive answer starts the next interval."""
         now = time.monotonic()
         due = (
             update == self._last
@@ -197,7 +197,7 @@ class StateFile:
                 raise self._unreadable(
                     f"{name}: expected {expected.get(name, 'nothing')}, found {found.get(name, 'nothing')}"
                 )
-        leaves = [_place(saved[name], leaf) for name, leaf in wanted.items()]
+        leaves = [_with_sharding(saved[name], leaf) for name, leaf in wanted.items()]
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
     def _unreadable(self, problem: str) -> OptionError:
@@ -347,8 +347,8 @@ def _host_array(leaf: Any) -> np.ndarray:
     return np.require(np.asarray(data), requirements="C")
 
 
-def _place(array: np.ndarray, like: Any) -> Any:
-    """A loaded array with the sharding of `like`, if it has one."""
+def _with_sharding(array: np.ndarray, like: Any) -> Any:
+    """Returns a loaded array on the devices of `like`, if `like` has a sharding."""
     sharding = getattr(like, "sharding", None)
     if _is_key(like):
         wrap: Any = jax.random.wrap_key_data

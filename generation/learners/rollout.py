@@ -24,7 +24,7 @@ from icrl4aht_data.overcooked.state import swapped
 
 
 class Choice(NamedTuple):
-    """What a player does in one step in its M agent slots.
+    """Actions of a player in one step in its M agent slots.
 
     Attributes:
         action: int32 (M,), action ids 0..5.
@@ -52,7 +52,7 @@ class Player(NamedTuple):
 
 
 class RolloutCarry(NamedTuple):
-    """What one roll-out passes on to the next one.
+    """State between two roll-outs.
 
     Attributes:
         env: states of the N environments.

@@ -55,10 +55,29 @@ class LearnerSpeed(NamedTuple):
 
 @dataclass(frozen=True)
 class RebuildCost:
-    """Cost of a profile.
+    """Estimated cost of rebuilding a profile.
 
-    Hours are of learning and recording: one process trains the populations one after the other, then `devices` devices
-    share the tasks, one task at a time each. Rates are per second, sizes in bytes; `compile_seconds` are per task.
+    Hours include learning and recording: one process trains the populations one after the other, then `devices` devices
+    share the tasks, one task at a time each.
+
+    Attributes:
+        profile: name of the profile.
+        populations: number of populations of learned teammates.
+        teammate_steps: environment steps of all populations.
+        tasks: number of tasks.
+        environment_steps: environment steps of all tasks.
+        recorded_transitions: transitions of all streams, before the stream filter.
+        kept_transitions: transitions after the stream filter.
+        artefact_bytes: size of the artefacts of all tasks.
+        lite_bytes, full_bytes: sizes of a lite and of a full release.
+        device: description of the measured device.
+        teammate_steps_per_second: measured speed of training populations; None without populations.
+        steps_per_second: measured speed of training egos.
+        compile_seconds: time to compile a task.
+        teammate_hours_on_one: hours to train all populations on one device.
+        hours_on_one: hours of the complete rebuild on one device.
+        devices: number of devices.
+        hours_on_devices: hours of the complete rebuild on this number of devices.
     """
 
     profile: str

@@ -90,7 +90,7 @@ def training_layouts() -> list[str]:
 
 
 def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bool:
-    """Whether the population is finished now; False if another process trains it."""
+    """Returns whether the population is finished now; False if another process trains it."""
     label = f"{run.algorithm} on {run.layout.name}"
     last: dict[str, float] = {}
     with progress_bars(console) as bars:

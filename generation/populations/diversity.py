@@ -1,5 +1,5 @@
-"""How differently policies act: pairwise Hamming distances on common states (paper, App. "Teammate Policy Diversity
-Analysis")."""
+"""Diversity of policies: pairwise Hamming distances of their actions on common states (paper, App. "Teammate Policy
+Diversity Analysis")."""
 
 from __future__ import annotations
 

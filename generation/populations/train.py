@@ -99,7 +99,7 @@ class PopulationRun:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the population depends on."""
+        """The settings that the population depends on."""
         return {
             "layout": self.layout.name,
             "algorithm": self.algorithm,
@@ -116,7 +116,7 @@ class PopulationRun:
 
     @cached_property
     def stages(self) -> list[Population]:
-        """What is trained one after the other; CoMeDi adds a member in each."""
+        """The stages of training, one after the other; CoMeDi adds one member in each."""
         env = Environment(self.layout)
         if self.algorithm == "comedi":
             first = Population(env, FCP(1), self.config, partners=2)
@@ -141,7 +141,7 @@ class PopulationRun:
 
 
 def is_population_finished(folder: Path, run: PopulationRun) -> bool:
-    """Whether the folder holds this population under these settings, with all its files unchanged."""
+    """Returns whether a folder has this population under these settings, with all its files unchanged."""
     try:
         content = json.loads((folder / _POPULATION).read_text(encoding="utf-8"))
         same = content["settings_hash"] == run.settings_hash
@@ -214,7 +214,7 @@ class _PopulationTraining:
         return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
 
     def _difference(self) -> str:
-        """How a finished population differs from this run's."""
+        """Returns a text that names the settings in which a finished population differs from this run."""
         try:
             found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
             other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
@@ -332,7 +332,7 @@ class SuiteCheckpoint:
 
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
-    """Whether a suite has this population, finished."""
+    """Returns whether a suite has this population and it is finished."""
     return (suite / layout / algorithm / _POPULATION).is_file()
 
 

@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.hashes import file_hash
 
 Action = Literal["greedy", "sampled"]
-"""How a checkpoint acts: its most probable action, as the dataset's teammates do, or a draw from its distribution."""
+"""Ways of acting of a checkpoint: its most probable action, as in the dataset, or a draw from its distribution."""
 
 _CRITIC = ("critic", "critic_hidden")
 

@@ -1,4 +1,4 @@
-"""From a task's teammate entry to a playing teammate, and back."""
+"""Conversion of a task's teammate entry to a policy, and back."""
 
 from __future__ import annotations
 

@@ -11,16 +11,17 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
     "teammate": {"train": _TEAMMATE_LAYOUTS, "test": _TEAMMATE_LAYOUTS, "heldout": _TEAMMATE_LAYOUTS},
     "layout": {"train": _LAYOUT_LAYOUTS, "test": ("asymm_right", "cramped_down"), "heldout": _LAYOUT_LAYOUTS},
 }
-"""track -> split -> layouts (paper, App. A)."""
+"""Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
 """Every layout of the benchmark, in the paper's order; the position in this tuple enters seeds."""
 
 SPLITS = ("train", "test", "heldout")
-"""`heldout` has the training layouts and learned teammates that `train` does not have (paper, App. F)."""
+"""Splits of the tasks. `heldout` combines training layouts with learned teammates that are not in `train` (paper, App.
+F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
-"""Teammate families: learned policies, and the four heuristics (paper, App. B)."""
+"""Families of teammates: "rl" (learned policies) and the heuristics "H1".."H4" (paper, App. B)."""
 
 HEURISTIC_KINDS = {
     "recipe_aware_button": "H1",

@@ -37,15 +37,15 @@ class Report:
         root: the release, folder or address.
         level: depth of the verification.
         findings: problems, in the order in which they were found.
-        notes: requested checks that were impossible, which are not problems.
+        notes: remarks that are not problems, such as checks that were impossible and shards that were not selected.
         repaired: files that `icrl4aht-data verify --repair` replaced.
         replayed: whether every step was replayed under the rules.
         files: number of files checked.
         chunks: number of chunks decoded.
         histories: number of histories checked.
-        transitions: number of their steps.
+        transitions: number of steps of these histories.
         fetched_bytes: bytes fetched from a remote.
-        requests: requests to it.
+        requests: number of requests to the remote.
     """
 
     root: str
@@ -72,10 +72,11 @@ class Report:
         return {finding.file for finding in self.findings}
 
     def to_json(self) -> dict[str, Any]:
+        """Return the report as JSON: its fields, `ok`, and the level also as booleans `deep` and `quick`."""
         return {"ok": self.ok, **asdict(self), "deep": self.level == "deep", "quick": self.level == "quick"}
 
     def add(self, file: str, problem: str) -> None:
-        """Add a finding; beyond a limit only one that says that there are more."""
+        """Add a finding; after 100,000 of them, one that says that there are more."""
         if len(self.findings) < _FINDINGS:
             self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:

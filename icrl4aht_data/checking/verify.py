@@ -36,16 +36,16 @@ def verify_release(
     advance: NamedProgress = lambda what, done, total: None,
     **wanted: FilterValues,
 ) -> Report:
-    """Check a release; problems of the release are reported, never raised.
+    """Check a release and return a report; problems of the release are reported, never raised.
 
     Args:
         root: a release folder, or an address as in `load_icrl4aht`; the bundled mini release by default. Files of a
             remote release are downloaded before they are checked, except at level "quick".
         level: "quick" checks names, sizes and the index, no contents. "full" checks every byte, count and range. "deep"
             also checks that observations are what the states show, that every recorded step follows from the previous
-            one under the rules, with the recorded reward, and that every episode starts as the environment starts;
-            without state records only that every observation shows the layout, which a note says.
-        advance: progress.
+            one under the rules, with the recorded reward, and that every episode starts as the environment starts.
+            Without state records it checks only that every observation shows the layout, and adds a note to the report.
+        advance: called with the name of a stage, the number of items done, and their total.
         wanted: check only the shards of these histories; see `load_icrl4aht`. In a folder that `download` filled with a
             part of a release, only that part has to exist.
 

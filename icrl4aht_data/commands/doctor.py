@@ -44,7 +44,12 @@ _JAX_TIMEOUT = 120  # seconds
 
 
 class Problem(NamedTuple):
-    """Something wrong, and how to correct it."""
+    """A problem of the installation.
+
+    Attributes:
+        problem: description of the problem.
+        next_step: advice on how to correct it.
+    """
 
     problem: str
     next_step: str

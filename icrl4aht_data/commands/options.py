@@ -72,7 +72,7 @@ class Names(click.ParamType):
     """Choice of one name; the valid names are computed when needed, and errors suggest the nearest one.
 
     Args:
-        name: what the names stand for, such as "layout".
+        name: singular noun for the names, such as "layout".
         valid: returns the valid names.
         offered: how many of them, the first ones, completion offers; all by default.
     """

@@ -96,7 +96,7 @@ def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
 
 
 def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
-    """The reverse of `encode_chunk`.
+    """Return the bytes of a chunk's elements from its stored bytes.
 
     Args:
         data: stored bytes.

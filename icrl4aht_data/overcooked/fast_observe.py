@@ -1,6 +1,6 @@
 """Renders the ego's observations from state records at the speed of memory, with NumPy into reusable buffers.
 
-`observe` defines what an observation is, for NumPy and JAX. This module asks `observe` once for every value that one
+`observe` defines what an observation is, for NumPy and JAX. This module calls `observe` once for every value that one
 element of a record can have, keeps the answers as lookup tables, and renders a step as a copy of a background and a few
 small patches: the background by the ego's cell, recipe and delivery; both agents by facing and item; and what is on
 counters, in pots and on lit buttons.

@@ -50,12 +50,12 @@ _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """One layout. Every property is derived from the arguments.
+    """A map with its recipes; every property is derived from these arguments.
 
     Args:
-        name: the paper's short name.
-        alias: the environment name used by OvercookedV2 and by the published manifests.
-        rows: the map, one string per row, all of one width.
+        name: the paper's short name, such as coord_simple.
+        alias: the environment name in OvercookedV2 and in the published manifests, such as grounded_coord_simple.
+        rows: the map, one string per row, all of one width; docs/format.md explains the letters.
         recipes: triples of ingredient ids; the current recipe is drawn uniformly from them.
         indicates_delivery: whether the observation has the delivery channel.
 
@@ -93,14 +93,17 @@ class Layout:
 
     @property
     def width(self) -> int:
+        """Number of the map's columns."""
         return len(self.rows[0])
 
     @property
     def height(self) -> int:
+        """Number of the map's rows."""
         return len(self.rows)
 
     @property
     def cells(self) -> int:
+        """Number of cells; a cell's number is y * width + x."""
         return self.width * self.height
 
     @cached_property
@@ -136,6 +139,7 @@ class Layout:
 
     @property
     def obs_shape(self) -> tuple[int, int, int]:
+        """(5, 5, C), the shape of an observation."""
         return (WINDOW, WINDOW, self.channels)
 
     def ingredient_item(self, ingredient: int) -> int:
@@ -291,13 +295,13 @@ _ALL = (
 )
 
 LAYOUTS: dict[str, Layout] = {layout.name: layout for layout in _ALL}
-"""Every layout of the benchmark by its short name."""
+"""The ten layouts of the benchmark: short name -> layout."""
 
 _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 
 
 def get_layout(name: str) -> Layout:
-    """The layout with this short name or environment name.
+    """Return the layout with a short name (coord_simple) or environment name (grounded_coord_simple).
 
     Raises:
         UnknownNameError: lists the valid names and the nearest.

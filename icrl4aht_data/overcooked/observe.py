@@ -64,7 +64,7 @@ class _Lookup(NamedTuple):
 
 
 def observe(layout: Layout, record: Array, agent: int) -> Array:
-    """Observations of one agent.
+    """Return the observations of one agent, its window of 5 x 5 cells.
 
     Args:
         layout: the layout.
@@ -78,7 +78,7 @@ def observe(layout: Layout, record: Array, agent: int) -> Array:
 
 
 def observe_both(layout: Layout, record: Array) -> Array:
-    """Observations uint8 (B, 2, 5, 5, C) of ego and teammate; see `observe`."""
+    """Return the observations of ego and teammate, uint8 (B, 2, 5, 5, C); see `observe`."""
     xp = record.__array_namespace__()
     ego, teammate = (_words(layout, record, agent) for agent in (0, 1))
     return _expand(layout, *(xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True)))

@@ -68,7 +68,7 @@ _OTHER_INGREDIENT = (_INK, (1.6, _STEEL, (0, 0)))
 def draw_frame(
     layout: Layout, record: np.ndarray, *, cell: int = 48, caption: str = "", view: bool = True
 ) -> np.ndarray:
-    """A picture of one state: ego blue, teammate red, and a footer with the current recipe and a one-line caption.
+    """Return a picture of one state: ego blue, teammate red, a footer with the current recipe and a one-line caption.
 
     Args:
         layout: the layout.

@@ -58,7 +58,7 @@ class StepResult(NamedTuple):
 
 
 def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> StepResult:
-    """One step of the game.
+    """Return the result of one step of the game.
 
     Args:
         layout: the layout.

@@ -58,8 +58,8 @@ def build_release(
     Args:
         source: a release folder; the bundled mini release by default.
         target: the folder to write; a release there is replaced when the new one is complete.
-        link: hard-link the files of `source` instead of copying them, which saves space; editing one in place then
-            changes both.
+        link: hard-link the files of `source` instead of copying them, which saves space; changing a file then
+            changes its copy too.
         published: the date for Croissant; today by default.
         advance: progress of verifying and of copying.
 
@@ -134,7 +134,7 @@ def teammate_card(folder: Path) -> str:
             checkpoint=f"{facts['checkpoint']:d}",
             step=f"{facts['step']:,d}",
             sha256=folder.name,
-            seats=", ".join(f"{slot:d}" for slot in facts["seats"]),
+            agents=", ".join(f"{slot:d}" for slot in facts["seats"]),
             own_return=f"{facts['return']:.1f}",
             teammate_return=f"{facts['teammate_return']:.1f}",
             seed=f"{facts['seed']:d}",

@@ -26,6 +26,8 @@ _KIND = "dataset"
 
 
 class _File(NamedTuple):
+    """Size in bytes and SHA-256, hexadecimal, of a file of the release."""
+
     size: int
     sha256: str
 

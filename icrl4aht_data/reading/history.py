@@ -16,19 +16,22 @@ from icrl4aht_data.utils.memory import new_array
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
-"""How observations are presented: as float32 (the paper's interface), as uint8 (the same integers), or as the state
-records that `icrl4aht_data.overcooked.observe` renders, if the release has them."""
+"""Presentations of observations: float32 (the paper's interface), uint8 (the same integers), or the state records that
+`icrl4aht_data.overcooked.observe` renders, if the release has them."""
 
 
 class History:
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
-    `history.actions`, `.rewards`, `.obs` and so on are lazy arrays: slicing reads only the chunks it needs.
+    `history.actions`, `.rewards`, `.obs` and so on are lazy arrays: indexing them reads only the chunks it needs.
 
     Args:
-        entry: the history's line of the index.
-        shard: the shard that stores it.
-        obs: how `History.obs` presents observations; see `OBS`.
+        entry: the history's entry of the index.
+        shard: the shard that stores the history.
+        obs: presentation of observations in `History.obs`; see `OBS`.
+
+    Attributes:
+        entry: the history's entry of the index: ids, layout, teammate, T, returns and others.
     """
 
     def __init__(self, entry: Entry, shard: Shard, obs: Obs) -> None:
@@ -52,7 +55,7 @@ class History:
         return self._shard.kind
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
+        """Return rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
 
         Args:
             name: the field.
@@ -112,7 +115,7 @@ class History:
 
     @property
     def rewards(self) -> LazyArray:
-        """(T,) float32: the team's reward without shaping."""
+        """(T,) float32: the team's reward of each step, without shaping."""
         return LazyArray(self, "rewards")
 
     @property
@@ -127,7 +130,7 @@ class History:
 
     @property
     def expert_actions(self) -> LazyArray:
-        """(T,) int32: the actions of the converged ego at the same steps (paper, App. D.1)."""
+        """(T,) int32: greedy actions of the final ego at the same steps, 0..5 (paper, App. D.1)."""
         return LazyArray(self, "expert_actions")
 
     @property
@@ -136,17 +139,17 @@ class History:
         return LazyArray(self, "episode_end_state")
 
     def returns(self) -> np.ndarray:
-        """float64 (E,): the return of each episode over its kept steps, which is the learning curve."""
+        """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
         return episode_returns(self.read("rewards"), self.read("dones"))
 
 
 class LazyArray:
-    """One field of one history, read when it is indexed, with the indices that a NumPy array takes.
+    """One field of a history that is read when it is indexed. Supports NumPy indexing.
 
     Args:
         history: the history.
         name: the field, one of `schema.FIELDS`.
-        obs: for the field `obs`, whether rows are float32 or uint8.
+        obs: for the field `obs`, "float32" or "uint8".
 
     Attributes:
         dtype: the rows' dtype.

@@ -42,9 +42,9 @@ class ReadOptions:
     """Options of reading histories.
 
     Args:
-        obs: how observations are presented; see `history.OBS`.
-        cache: how samplers hold a selection; see `sources.CACHE_MODES`.
-        threads: how many threads decode and render; by default one for each usable core.
+        obs: presentation of observations; see `history.OBS`.
+        cache: cache mode of samplers; see `sources.CACHE_MODES`.
+        threads: number of threads that decode and render; by default one for each usable core.
 
     Raises:
         UnknownNameError, OptionError: for values that do not exist.
@@ -63,17 +63,23 @@ class ReadOptions:
 
 
 class Selection:
-    """Histories of a release in some order. Only the index has been read; arrays are read when they are needed.
+    """Histories of a release in some order. Opening reads only the index; arrays are read when they are used.
 
     `len(selection)` counts histories, `selection[i]` is the i-th, `selection[a:b]` a part, iteration yields them in
     order. Selections of one release share its index and opened shards.
 
     Args:
         location: the release.
-        index: its index.
-        shards: its shards.
-        options: how histories are read.
+        index: the release's index.
+        shards: the release's opened shards.
+        options: options of reading.
         ids: int (H,), the histories' ids; all of the release by default.
+
+    Attributes:
+        ids: int (H,), ids of the histories in the release, in the order of the selection.
+        index: the release's index.
+        origin: the release: its folder on this machine, and its remote if it has one.
+        options: presentation of observations, cache and threads.
 
     Raises:
         OptionError: for obs="state" of a release without state records.
@@ -160,7 +166,7 @@ class Selection:
         )
 
     def history(self, history_id: int) -> History:
-        """One history of the release, whether selected or not.
+        """Return one history of the release, whether selected or not.
 
         Raises:
             UnknownNameError: if the release has no history with that id.
@@ -169,7 +175,10 @@ class Selection:
         return History(entry, self._shards.open(entry.shard), self.obs)
 
     def column(self, name: str) -> np.ndarray:
-        """(H,): a field of every selected history's index entry; for names, their codes (see `Index.values`)."""
+        """Return one index field of the selected histories, shape (H,).
+
+        Numbers are returned as they are, text fields as integer codes (decode with `Index.values`).
+        """
         return self.index.entries.column(name)[self.ids]
 
     @cached_property
@@ -181,7 +190,7 @@ class Selection:
 
     @cached_property
     def layout_numbers(self) -> np.ndarray:
-        """int32 (H,): the position of each history's layout in `layouts`."""
+        """int32 (H,): the index of each history's layout in `layouts`."""
         names = self.index.values("layout")
         number = np.zeros(len(names), np.int32)
         number[[names.index(layout.name) for layout in self.layouts]] = np.arange(len(self.layouts))
@@ -200,7 +209,7 @@ class Selection:
 
     @cached_property
     def cache(self) -> CacheChoice:
-        """The way in which samplers hold the selection, and the reason; see `sources.CACHE_MODES`."""
+        """The cache mode that samplers use for this selection, and the reason; see `sources.CACHE_MODES`."""
         absent = [name for name in self.shards if not self.origin.is_here(name)]
         if self.options.cache == "auto" and absent:
             return CacheChoice("stream", f"{len(absent)} of {len(self.shards)} shards are not downloaded")
@@ -213,7 +222,7 @@ class Selection:
 
     @property
     def storage(self) -> HistorySource:
-        """The selection's rows, held as `cache` says; `ram` and `mmap` decode them at the first access."""
+        """Source of the selection's rows in the mode `cache`; `ram` and `mmap` decode them at the first access."""
         with self._lock:
             return self._storage
 
@@ -224,13 +233,13 @@ class Selection:
         return open_source(self.cache.cache, self.entries, self._shards.open, self.threads)
 
     def forget_chunks(self) -> None:
-        """Drop the decoded chunks that reading has kept, for all selections of this release."""
+        """Clear the cache of decoded chunks that all selections of this release share."""
         self._shards.cache.clear()
 
     def with_options(
         self, *, obs: Obs | None = None, cache: CacheMode | None = None, threads: int | None = None
     ) -> Self:
-        """This selection read with other options; None keeps an option. Index and shards are not opened again.
+        """Return this selection with other reading options, without opening the release again; None keeps an option.
 
         Raises:
             UnknownNameError, OptionError: for impossible options, such as obs="state" for a release of observations.
@@ -240,10 +249,11 @@ class Selection:
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 
     def filter(self, **wanted: FilterValues) -> Self:
-        """The histories of this selection whose index fields have one of the wanted values.
+        """Return the histories of this selection whose index fields have one of the wanted values.
 
         Args:
-            wanted: field -> value, several values or None for any; the fields are those of `load_icrl4aht`.
+            wanted: field=value, several values, or None for any: split, layout, track, teammate_family, teammate_kind
+                or task_id, as in `load_icrl4aht`.
 
         Raises:
             UnknownNameError: for a field or value that does not exist.
@@ -256,7 +266,7 @@ class Selection:
         return type(self)(self.origin, self.index, self._shards, self.options, ids)
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
-        """The histories of this selection with these ids, in this order.
+        """Return the histories of this selection with these ids, in this order.
 
         Raises:
             EmptySelectionError: if no id is given.

@@ -121,7 +121,7 @@ class Shard:
         return self._remote is not None
 
     def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
-        """Rows start..stop of a field, in the field's dtype. The range must lie within the history.
+        """Rows start..stop of a field, in the field's dtype. The range must be within the history.
 
         Raises:
             ShardCorruptError: names the chunk whose checksum or size is wrong.
@@ -238,7 +238,15 @@ class Shard:
 
 
 class RowRange(NamedTuple):
-    """Rows start..stop of one field of a history."""
+    """Rows start..stop of one field of a history.
+
+    Attributes:
+        shard: the shard that stores the history.
+        history_id: id of the history.
+        field: the field.
+        start: first row.
+        stop: row after the last one.
+    """
 
     shard: Shard
     history_id: int
@@ -251,7 +259,7 @@ def fetch_rows(ranges: Iterable[RowRange]) -> None:
     """Download the chunks with these rows that are missing on this machine, from all shards in parallel.
 
     Raises:
-        RemoteError: if a chunk cannot be had.
+        RemoteError: if a chunk cannot be downloaded.
     """
     of_shard: dict[Shard, list[RowRange]] = {}
     for one in ranges:

@@ -35,11 +35,11 @@ _STEPS = 8192  # for fewer steps another thread costs more than it saves
 
 
 class CacheChoice(NamedTuple):
-    """The way in which a selection is held.
+    """The cache mode of a selection.
 
     Attributes:
         cache: "ram", "mmap" or "stream".
-        reason: why, in words.
+        reason: the reason for this mode, as text.
     """
 
     cache: CacheMode
@@ -64,20 +64,20 @@ class ReadRequest(NamedTuple):
 
 
 class HistorySource(Protocol):
-    """Rows of the histories of a selection, which requests name by their positions in it."""
+    """Reader of rows of the histories of a selection; requests refer to histories by their positions in it."""
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
         """Carry out requests, in parallel. Chunks of a remote release that they need are downloaded first, all at once.
 
         Raises:
             ShardCorruptError: names the chunk whose checksum is wrong.
-            RemoteError: if a chunk cannot be had.
+            RemoteError: if a chunk cannot be downloaded.
         """
         ...
 
 
 def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
-    """The way to hold arrays of `size` bytes."""
+    """Return the cache mode for arrays of `size` bytes."""
     if cache != "auto":
         return CacheChoice(cache, "as the option says")
     memory = free_memory()

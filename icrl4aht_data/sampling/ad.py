@@ -16,18 +16,20 @@ from icrl4aht_data.sampling.observer import ArraySpec
 class ADBatch(NamedTuple):
     """Windows of learning histories (paper, App. D.4).
 
-    All arrays are 0 on padding, which follows the last step of a history or range shorter than L.
+    Rows are padded with zeros if the history, or the part selected by `episodes` or `curriculum`, is shorter than L.
+    The `prev_*` fields hold the values of the previous step of the history, also at the first step of a window.
 
     Attributes:
-        obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations. With obs="state" uint8 (B, L, S): state records.
-        prev_actions: int32 (B, L): the ego's actions one step earlier, 0..5; 0 at a history's first step.
-        prev_rewards: float32 (B, L): the team's rewards one step earlier; 0 at a history's first step.
+        obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
+        prev_actions: int32 (B, L): the ego's actions in the previous steps, 0..5; 0 at a history's first step.
+        prev_rewards: float32 (B, L): the team's rewards in the previous steps; 0 at a history's first step.
         target_actions: int32 (B, L): the ego's actions, 0..5, which a model learns to predict.
         dones: bool (B, L): True at the last step of an episode.
         attention_mask: bool (B, L): False on padding.
-        prev_teammate_actions: int32 (B, L): the teammate's actions one step earlier, 0..5; None unless the sampler was
-            made with teammate_actions=True.
-        layouts: int32 (B,): positions in `sampler.layouts`; None unless obs="state" and there are several layouts.
+        prev_teammate_actions: int32 (B, L): the teammate's actions in the previous steps, 0..5, and 0 at a history's
+            first step; None unless the sampler was made with teammate_actions=True.
+        layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
+            several layouts.
     """
 
     obs: np.ndarray
@@ -40,18 +42,19 @@ class ADBatch(NamedTuple):
     layouts: np.ndarray | None = None
 
     def describe(self) -> str:
-        """Fields, dtypes and shapes, one per line."""
+        """Return the fields with dtypes and shapes as text, one per line."""
         return describe_batch(self)
 
 
 class ADSampler(Sampler[ADBatch]):
     """Windows for Algorithm Distillation: a sequence of batches, each a pure function of (selection, options, seed, i).
 
-    A history is drawn uniformly from the selection, a start uniformly from 0..T - L. Windows cross episode boundaries;
-    a history shorter than L is padded at the end. `prev_*` is what preceded each step in the history.
+    A history is drawn uniformly from the selection (or by `weights`), a start uniformly from 0..T - L. Windows cross
+    episode boundaries. Rows are padded with zeros at the end if the history, or the part selected by `episodes` or
+    `curriculum`, is shorter than L.
 
-    `sampler[i]` is the same in any process, on any number of workers and threads, however the data are held, and from
-    a lite or a full release; resuming means continuing with the next i.
+    `sampler[i]` does not depend on the process, the number of workers and threads, the cache, or whether the release is
+    lite or full. To resume, continue with the next i.
 
     Args:
         dataset: a selection whose layouts have observations of one shape.
@@ -59,10 +62,12 @@ class ADSampler(Sampler[ADBatch]):
         length: L, in steps.
         seed: any non-negative integer below 2**63.
         teammate_actions: whether batches have `prev_teammate_actions`.
-        weights: how likely each history is drawn: "uniform", "length" (by its steps) or one number for each history.
+        weights: probabilities of the histories: "uniform", "length" (proportional to the steps that windows may
+            contain) or one number per history, float (H,), to which they are proportional.
         episodes: windows stay inside these episodes of each history, such as (0, 10) or (-10, None).
-        curriculum: windows stay inside a part of each history that moves with i.
-        process_index, process_count: this process gets its share of every batch's rows.
+        curriculum: windows stay inside a part of each history that moves with i; see `Curriculum`.
+        process_index, process_count: number of this process and of all processes; each gets batch_size / process_count
+            rows of every batch.
 
     Raises:
         OptionError: for impossible options, or a selection with observations of several shapes.
@@ -86,7 +91,7 @@ class ADSampler(Sampler[ADBatch]):
         }
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """The windows of batch i: history ids and first steps, int64 (B,) each."""
+        """Return the windows of batch i: history ids and first steps, int64 (B,) each."""
         position, starts, _ = self._draw(i)
         return self.dataset.ids[position].astype(np.int64), starts
 

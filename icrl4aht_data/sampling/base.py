@@ -35,10 +35,17 @@ class SamplerOptions(TypedDict, total=False):
 class Sampler(Generic[B]):
     """A sequence of batches, each a pure function of its number; see `ADSampler` and `DPTSampler` for the options.
 
-    `len(sampler)` batches have as many steps as the selection; batches beyond exist as well.
+    `len(sampler)` is the number of batches that together have as many steps as the selection; larger batch numbers are
+    valid too.
 
     Attributes:
-        layouts: the layouts of the selection.
+        dataset: the selection.
+        layouts: its layouts, in order of first appearance.
+        batch_size: rows of a batch, over all processes.
+        length: steps of a window, or transitions of a context.
+        seed: seed of the draws.
+        teammate_actions: whether batches have the teammate's actions.
+        process_index, process_count: number of this process and of all processes.
     """
 
     batch_type: type[B]
@@ -91,7 +98,7 @@ class Sampler(Generic[B]):
         return self.batch_size // self.process_count
 
     def batch(self, i: int, out: B | None = None) -> B:
-        """Batch i, written into `out`, a batch from `empty()`, if it is given.
+        """Return batch i; it is written into `out`, a batch from `empty()`, if that is given.
 
         Raises:
             OptionError: if `out` is of another kind, shape or dtype.
@@ -99,17 +106,17 @@ class Sampler(Generic[B]):
         raise NotImplementedError
 
     def empty(self) -> B:
-        """A batch of unset arrays, to be filled again and again: new memory costs more than filling it."""
+        """Return a batch of uninitialised arrays to pass to `batch` as `out`: reuse is faster than new memory."""
         return self.batch_type(**{name: np.empty(spec.shape, spec.dtype) for name, spec in self.specs.items()})
 
     def batches(
         self, start: int = 0, stop: int | None = None, *, prefetch: int = 2, device: Any = None, reuse: bool = False
     ) -> Batches[B]:
-        """An iterator over batches start, start + 1, .. that a thread makes ahead; see `Batches`."""
+        """Return an iterator over batches start, start + 1, .. that prefetches on a thread; see `Batches`."""
         return Batches(self, start, stop, prefetch=prefetch, device=device, reuse=reuse)
 
     def options(self) -> dict[str, Any]:
-        """All options that determine the batches, as JSON; stored with a position and compared when resuming."""
+        """Return all options that determine the batches, as JSON; `Batches` compares them when it resumes."""
         return {
             "sampler": type(self).__name__,
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),

@@ -1,4 +1,4 @@
-"""Batches made ahead of their use on a thread, and optionally copied to a JAX device."""
+"""Prefetching of batches on a thread, and optionally copies on a JAX device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class BatchSource(Protocol[B]):
         ...
 
     def empty(self) -> B:
-        """A batch of unset arrays for `out`."""
+        """A batch of uninitialised arrays for `out`."""
         ...
 
     def options(self) -> dict[str, Any]:
@@ -31,25 +31,25 @@ class BatchSource(Protocol[B]):
 
 
 class Batches(Iterator[B], Generic[B]):
-    """An iterator over `sampler[start]`, `sampler[start + 1]`, .., made ahead by a thread.
+    """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
 
-    An exception in making a batch is raised by `next`. Leaving a `with` block, `close()` or the end of the iterator
-    stops the thread.
+    An exception of the thread is raised by `next`. The thread stops at the end of a `with` block, after `close()` and
+    at the end of the iterator.
 
     Args:
         sampler: makes the batches.
         start: number of the first batch.
         stop: number after the last batch; None for an endless iterator.
-        prefetch: how many batches are made ahead; with 0 each one is made by `next`, without a thread.
-        device: a jax.Device or Sharding. Batches become JAX arrays there, the next one's transfer running while the
-            last one is used. If a sharding spans processes, each process gives its share of the rows. Needs JAX.
-        reuse: write into the same few buffers again and again, since new memory costs more than filling it. A batch is
-            then valid until the next one is taken. With a device, host buffers are always reused.
+        prefetch: number of batches prepared in advance; with 0 `next` makes each one itself, without a thread.
+        device: a jax.Device or Sharding to which batches are copied as JAX arrays, while the previous batch is in use.
+            If a sharding spans processes, each process contributes its share of the rows. Needs JAX.
+        reuse: fill the same few buffers instead of allocating memory, which is slower. A batch is then valid only until
+            the next one is taken. With a device, host buffers are always reused.
 
     Attributes:
         next: number of the next batch.
-        served: how many batches were taken.
-        waited: seconds that `next` has waited for them.
+        served: number of batches taken.
+        waited: seconds that `next` has waited for batches.
 
     Raises:
         OptionError: for impossible options, or a device without JAX.
@@ -100,7 +100,7 @@ class Batches(Iterator[B], Generic[B]):
         return batch
 
     def _take(self) -> B:
-        """The next batch, while the thread makes the ones after it."""
+        """Return the next batch, and have the thread make the following ones."""
         if not self._prefetch:
             buffer = self._buffer()
             batch = _make(self._sampler, self.next, buffer, self._put)
@@ -126,7 +126,7 @@ class Batches(Iterator[B], Generic[B]):
             self._submitted = i + 1
 
     def _buffer(self) -> B | None:
-        """The buffer for one more batch; None for new memory."""
+        """Return a buffer for one more batch; None to allocate new memory."""
         if not self._reuse:
             return None
         buffer = self._free.pop() if self._free else self._sampler.empty()
@@ -135,7 +135,7 @@ class Batches(Iterator[B], Generic[B]):
         return buffer
 
     def close(self) -> None:
-        """Stop the thread and drop what it has made. The iterator is then at its end."""
+        """Stop the thread and discard prefetched batches; afterwards the iterator is exhausted."""
         self._closed = True
         self._stop_thread()
 
@@ -154,14 +154,14 @@ class Batches(Iterator[B], Generic[B]):
         self.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """The consumer's position, as JSON: the number of the next batch, and the sampler's options."""
+        """Return the position as JSON: the number of the next batch, and the sampler's options."""
         return {"next": self.next, **self._sampler.options()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where `state_dict` was taken.
+        """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if it was taken from a sampler with other options or another selection; names them.
+            OptionError: if the state is of a sampler with other options or another selection; names them.
         """
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]

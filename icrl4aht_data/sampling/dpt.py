@@ -16,7 +16,7 @@ from icrl4aht_data.sampling.observer import ArraySpec
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
-"""How a context's transitions are drawn: one after the other (as published), or independently."""
+"""Valid orders of a context's transitions: consecutive steps (as published), or independent draws."""
 
 
 class DPTBatch(NamedTuple):
@@ -27,14 +27,15 @@ class DPTBatch(NamedTuple):
 
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
-        query_target: int32 (B,): the expert's action there, 0..5, which a model learns to predict.
+        query_target: int32 (B,): the expert's action at the query step, 0..5, which a model learns to predict.
         context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
-        context_actions: int32 (B, K): the ego's actions in them, 0..5.
-        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations that followed in the same episode.
-        context_rewards: float32 (B, K): the team's rewards.
-        context_teammate_actions: int32 (B, K): the teammate's actions, 0..5; None unless the sampler was made with
-            teammate_actions=True.
-        layouts: int32 (B,): positions in `sampler.layouts`; None unless obs="state" and there are several layouts.
+        context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
+        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations after them, in the same episode.
+        context_rewards: float32 (B, K): the team's rewards in them.
+        context_teammate_actions: int32 (B, K): the teammate's actions in them, 0..5; None unless the sampler was made
+            with teammate_actions=True.
+        layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
+            several layouts.
     """
 
     query_obs: np.ndarray
@@ -47,33 +48,34 @@ class DPTBatch(NamedTuple):
     layouts: np.ndarray | None = None
 
     def describe(self) -> str:
-        """Fields, dtypes and shapes, one per line."""
+        """Return the fields with dtypes and shapes as text, one per line."""
         return describe_batch(self)
 
 
 class DPTSampler(Sampler[DPTBatch]):
     """Queries with contexts: a sequence of batches, each a pure function of (selection, options, seed, i).
 
-    The task is drawn uniformly, then the query's history and the context's independently within the task, the query
-    step uniformly, and K transitions of the context's history: `contiguous` (as published) or `random` (independent and
-    unordered, as in the original DPT).
+    For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for
+    the query, whose step is drawn uniformly, and one for the context of K transitions. These are `contiguous` (as
+    published) or `random` (independent and unordered, as in the original DPT).
 
-    A release of observations does not store what followed an episode's last step. Contexts are made of the other
-    transitions there, and in contiguous ones an episode's last but one step is followed by the next episode's first.
+    In releases of kind `observations`, contexts skip the last kept step of each episode, whose next observation is not
+    stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
 
     Args:
         dataset: a selection whose histories all have expert actions, of layouts with observations of one shape.
         batch_size: B, over all processes.
         context: K, in transitions.
         order: "contiguous" or "random".
-        options: as of `ADSampler`: `seed`; `teammate_actions`, whether batches have `context_teammate_actions`;
-            `weights`, how likely each history of a task is drawn; `episodes` and `curriculum`, the part of their
-            histories that query and context stay inside; `process_index` and `process_count`.
+        options: options shared with `ADSampler`: `seed`; `teammate_actions`, whether batches have
+            `context_teammate_actions`; `weights`, probabilities of the histories of a task; `episodes` and
+            `curriculum`, the part of each history that queries and contexts are drawn from; `process_index` and
+            `process_count`.
 
     Raises:
         LabelsMissingError: if a history has no expert actions.
-        OptionError: for impossible options, a selection with observations of several shapes, or K beyond the shortest
-            range.
+        OptionError: for impossible options, a selection with observations of several shapes, or contiguous contexts
+            longer than some history, or than the part of it that `episodes` or `curriculum` selects.
     """
 
     batch_type = DPTBatch
@@ -202,5 +204,5 @@ class DPTSampler(Sampler[DPTBatch]):
         return steps if self.dataset.has_states else steps - -(-steps // self._draws.kept_steps)
 
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
-        """The step that a transition is, both counted from the history's first."""
+        """Numbers of steps from numbers of transitions, both counted from the first one of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)

@@ -17,7 +17,7 @@ from icrl4aht_data.utils.validation import check_int
 
 Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
 WEIGHTS = ("uniform", "length")
-"""How histories are weighted in a draw: equally, or by the steps they offer. Or one number for each history."""
+"""Named weights of histories in a draw: equal, or proportional to the steps to draw from. Other weights are numbers."""
 
 Episodes = tuple[int | None, int | None]
 """The first episode and the one after the last, as in a slice: (None, 10) the first ten, (-10, None) the last ten."""
@@ -25,15 +25,15 @@ Episodes = tuple[int | None, int | None]
 
 @dataclass(frozen=True)
 class Curriculum:
-    """The part of every history that windows come from, moving with the number of the batch.
+    """A part of every history from which windows are drawn; it moves linearly with the batch number.
 
-    Parts are fractions of a history's episodes (of those in `episodes`, if that option is given). Between batch 0 and
-    batch `batches` the part moves linearly from `first` to `last`, and stays there.
+    Parts are fractions of a history's episodes, or of those that the sampler's option `episodes` selects. The part
+    moves from `first` at batch 0 to `last` at batch `batches` and does not change afterwards.
 
     Args:
         batches: number of the batch from which the part is `last`, at least 1.
-        first: (low, high), the part at batch 0.
-        last: (low, high), the final part.
+        first: the part at batch 0: fractions (low, high), such as (0.0, 0.25) for the first quarter.
+        last: the final part: fractions (low, high).
 
     Raises:
         OptionError: unless 0 <= low < high <= 1 for both parts.
@@ -50,7 +50,7 @@ class Curriculum:
                 raise OptionError(f"curriculum {name} = {part}: expected fractions 0 <= low < high <= 1")
 
     def part(self, i: int) -> tuple[float, float]:
-        """Low and high fraction at batch i."""
+        """Return the part at batch i: low and high fraction."""
         share = min(1.0, i / self.batches)
         low, high = (a + (b - a) * share for a, b in zip(self.first, self.last, strict=True))
         return low, high
@@ -88,7 +88,7 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray, first: Any = 0, sto
 
 
 class HistoryDraws:
-    """From which steps of each history a sampler draws at batch i, and how likely each history is drawn.
+    """Steps of each history that a sampler draws from at batch i, and the weights of the histories.
 
     Args:
         selection: the histories.

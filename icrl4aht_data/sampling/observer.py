@@ -17,7 +17,12 @@ _STEPS = 8192  # steps of several layouts rendered at a time, so that the copies
 
 
 class ArraySpec(NamedTuple):
-    """Declared dtype and shape of an array of a batch."""
+    """Declared dtype and shape of an array of a batch.
+
+    Attributes:
+        dtype: name of the dtype, such as "float32".
+        shape: shape of the array.
+    """
 
     dtype: str
     shape: tuple[int, ...]
@@ -61,7 +66,7 @@ class Observer:
         return np.empty((*out.shape[:-3], self._size), np.uint8) if self._renders else out
 
     def observe(self, histories: np.ndarray, records: np.ndarray, out: np.ndarray) -> None:
-        """Render what egos saw, unless the records were read into `out` directly.
+        """Render the observations of egos, unless the records were read into `out` directly.
 
         Args:
             histories: int (B,), positions in the selection.

@@ -26,15 +26,23 @@ _KEY = "option"
 
 
 class FieldBounds(NamedTuple):
-    """Metadata of a field: what its option shows and which values are valid. A bound of None does not apply."""
+    """Metadata of an option field: its help text and valid values. A bound of None does not apply.
+
+    Attributes:
+        help: help text of the option.
+        at_least, above: lower bounds, inclusive and exclusive.
+        at_most, below: upper bounds, inclusive and exclusive.
+        flags: further names of the option, such as "--ta".
+        default_text: text shown as the default, for a default that says nothing, such as None.
+    """
 
     help: str
     at_least: float | None = None
     above: float | None = None
     at_most: float | None = None
     below: float | None = None
-    flags: tuple[str, ...] = ()  # further names of the option, such as "--ta"
-    default_text: str | None = None  # shown as the default, for a default that says nothing, such as None
+    flags: tuple[str, ...] = ()
+    default_text: str | None = None
 
     def describe(self) -> str:
         """Returns the bounds in words, such as "at least 0 and below 1"."""
@@ -54,14 +62,24 @@ class FieldBounds(NamedTuple):
 
 
 class OptionField(NamedTuple):
-    """A field with its annotation taken apart: `tuple[float, ...]` has the type float and is repeated."""
+    """An option field with its parsed annotation: `tuple[float, ...]` has the type float and is repeated.
+
+    Attributes:
+        name: name of the field.
+        default: default value.
+        type: int, float, bool, str or Path.
+        choices: values of a Literal; empty for other types.
+        repeated: whether the field is a tuple.
+        optional: whether None is valid.
+        bounds: metadata of the field.
+    """
 
     name: str
     default: Any
-    type: Any  # int, float, bool, str, Path
-    choices: tuple[Any, ...]  # the values of a Literal, empty for other types
+    type: Any
+    choices: tuple[Any, ...]
     repeated: bool
-    optional: bool  # None is valid, too
+    optional: bool
     bounds: FieldBounds
 
 

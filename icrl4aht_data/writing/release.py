@@ -166,7 +166,13 @@ def _write_meta(
 
 
 class _LoadedHistory(NamedTuple):
-    """One history to write, with its index entry, which has no id and no position in a shard yet."""
+    """One history to write.
+
+    Attributes:
+        task: the task of the history.
+        entry: the index entry, without id and position in a shard.
+        arrays: field -> array (T, ...), or (E, S) for `episode_end_state`.
+    """
 
     task: Task
     entry: Entry

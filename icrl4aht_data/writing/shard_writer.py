@@ -62,8 +62,8 @@ def write_shard(
             checksums += [zlib.crc32(chunk.data) for chunk in chunks]
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = checksums
-        places = [place for entry in entries for place in chunk_locations(file, kind, entry)]
-        table["offset"], table["size"], table["rows"] = np.array(places, np.uint64).T
+        locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
+        table["offset"], table["size"], table["rows"] = np.array(locations, np.uint64).T
     np.save(table_path, np.concatenate([table, _metadata_lines(path, table)]), allow_pickle=False)
 
 

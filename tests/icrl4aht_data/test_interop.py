@@ -101,7 +101,7 @@ COMBINATIONS = [
     ],
 )
 def test_pytorch_workers(lite, tmp_path, combinations):
-    """In a separate process, since a process that has run JAX must not fork."""
+    """Runs in a separate process, since a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
     run = subprocess.run(

@@ -76,7 +76,7 @@ def test_snippets(page, tmp_path, monkeypatch):
 
 @EVERY_PAGE
 def test_commands_are_accepted(page, tmp_path, monkeypatch):
-    """Most of them would run too long here."""
+    """The commands are not run: most of them would take too long here."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "shared" / "lite").mkdir(parents=True)
     for line in "".join(blocks("sh", PAGES[page])).splitlines():
@@ -91,7 +91,7 @@ def test_commands_are_accepted(page, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", commands("ray", PAGES["scale"]), ids=" ".join)
 def test_ray_has_the_commands(arguments):
-    """In a process of their own, because importing Ray reads the environment."""
+    """The commands run in a process of their own, because importing Ray reads the environment."""
     ray = Path(sys.executable).with_name("ray")
     process = subprocess.run([ray, *arguments, "--help"], capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr

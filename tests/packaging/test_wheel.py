@@ -145,7 +145,7 @@ def find_python(version: str) -> str | None:
 
 @pytest.fixture(scope="module")
 def environments(wheel, tmp_path_factory) -> dict[str, Future[Path]]:
-    """For each installed version of Python, an environment with the wheel and its dependencies only."""
+    """Environments with only the wheel and its dependencies, one for each installed version of Python."""
 
     def make(python: str, folder: Path) -> Path:
         made = call(python, "-m", "venv", "--without-pip", folder)

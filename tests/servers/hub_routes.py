@@ -117,7 +117,7 @@ def create(call: Call) -> Answer:
 
 
 def preupload(call: Call) -> Answer:
-    """Which of the announced files are to be uploaded to the CDN, and which are unchanged."""
+    """For each announced file: whether to upload it to the CDN, and whether it is unchanged."""
     call.require_token()
     commit, listed = call.repo.resolve(call.names["revision"]), []
     for announced in call.json()["files"]:

@@ -76,10 +76,10 @@ class Assignment(NamedTuple):
 
 
 class Algorithm(Protocol):
-    """The part in which the algorithms differ. `memory` is a pytree of the algorithm, such as multipliers."""
+    """Interface of the population algorithms. `memory` is a pytree of the algorithm, such as multipliers."""
 
     def assignment(self, environments: int) -> Assignment:
-        """Returns who plays with whom, with so many environments per member."""
+        """Returns the pairing of policies, with this number of environments per member."""
         ...
 
     def init(self) -> Any:
@@ -87,7 +87,7 @@ class Algorithm(Protocol):
         ...
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
-        """Returns the weight of each term in the objective that is maximised; negative to lower a return."""
+        """Returns the weight of each term in the objective that is maximised; negative to minimise a return."""
         ...
 
     def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:
@@ -169,7 +169,7 @@ class Population:
 
     @cached_property
     def assignment(self) -> Assignment:
-        """Who plays with whom."""
+        """The pairing of policies in all environments."""
         return self.algorithm.assignment(self.config.environments)
 
     @property

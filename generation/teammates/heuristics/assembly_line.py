@@ -53,7 +53,7 @@ def _off_beat(scene: Scene) -> Array:
 
 
 def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether the action is exempt from slips, and the action: rules in order of priority."""
+    """Returns whether the action is exempt from slips, and the action; rules are in order of priority."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
@@ -117,7 +117,7 @@ def _or_else(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -> Bool[
 
 
 def _makes_room(scene: Scene) -> Bool[Array, ""]:
-    """Whether agent 1 is empty-handed and adjacent to a partner who carries something."""
+    """Returns whether agent 1 is empty-handed and adjacent to a partner who carries something."""
     if scene.slot == 0:
         return jnp.asarray(False)
     adjacent = jnp.asarray(scene.paths.manhattan)[scene.me, scene.partner] == 1

@@ -80,7 +80,7 @@ class Heuristic:
         return Policy(params, init, act, "state")
 
     def is_valid(self, name: str, value: Any) -> bool:
-        """Whether a parameter may have this value."""
+        """Returns whether a parameter may have this value."""
         if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
             return False
         integral = isinstance(self.defaults[name], float) or float(value).is_integer()

@@ -1,4 +1,4 @@
-"""What heuristic teammates read from a state: shortest paths of the layout, masks over cells, and moves made of them.
+"""Features of a state for heuristic teammates: shortest paths of the layout, masks over cells, and moves made of them.
 
 `cells` denotes the cells of the layout, row by row. Teammates see the complete state. The partner never blocks a path;
 ties resolve in the order right, down, left, up (first steps) and above, below, left, right (access cells), scanning
@@ -127,22 +127,22 @@ class Paths:
 
 
 def is_dish(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
-    """Whether the item is a plate with a cooked soup."""
+    """Returns whether an item is a plate with a cooked soup."""
     return (item & (PLATE | COOKED)) == (PLATE | COOKED)
 
 
 def is_ingredient(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
-    """Whether the item has ingredients and no plate."""
+    """Returns whether an item has ingredients and no plate."""
     return (item >> 2 > 0) & ((item & PLATE) == 0)
 
 
 class Rule(NamedTuple):
-    """If a condition holds and one of the targets can be reached, go to the nearest of them.
+    """Rule of a teammate: if a condition holds and a target can be reached, go to the nearest one.
 
     Attributes:
         when: bool scalar, the condition.
-        targets: bool (cells,).
-        waits: next to the target, face it and wait instead of interacting.
+        targets: bool (cells,), cells to go to.
+        waits: Python bool, whether to face the target and wait, instead of interacting with it.
     """
 
     when: Bool[Array, ""]
@@ -340,7 +340,7 @@ class Scene:
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """Whether the target is adjacent, and what to do then: turn to it, or `when_facing`."""
+        """Returns whether the target is adjacent, and the action in that case: turn to it, or `when_facing`."""
         adjacent = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
         direction = jnp.argmax(jnp.asarray(self.paths.neighbours)[self.me] == target)  # up, down, left, right
         return adjacent, jnp.where(self.facing_action == direction, when_facing, direction)
@@ -387,7 +387,7 @@ class Scene:
 
     @cached_property
     def free(self) -> Bool[Array, " 4"]:
-        """Which of the `ways` lead onto a floor cell without the partner."""
+        """Mask of the `ways` that lead onto a floor cell without the partner."""
         return (self.ways != self.me) & (self.ways != self.partner)
 
     def sidestep(self, otherwise: Int[Array, ""] | int) -> Int[Array, ""]:

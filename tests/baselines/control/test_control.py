@@ -49,7 +49,7 @@ def test_sources_learn():
 
 
 def test_a_part_of_the_control_trains_and_fails(tmp_path):
-    """Without its context no model can have twice the regret of the algorithm within four steps."""
+    """A model without its context cannot have twice the regret of the algorithm within four steps."""
     checks = control.ad_on_bandits(tmp_path, TINY, lambda step, loss: None)
     full, cut = control.format_checks(checks).splitlines()[1:]
     assert full.split()[1:3] == ["bandits", "AD"]

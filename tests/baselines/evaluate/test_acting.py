@@ -66,7 +66,7 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
 
 @pytest.mark.slow
 def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
-    """With one layer there is no drift at all: a step's cache is computed from that step alone."""
+    """A model of one layer has no drift at all: a step's cache is computed from that step alone."""
     two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
     params, found, protocol = random_parameters(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
 
@@ -133,7 +133,7 @@ class TestBadRuns:
 
 
 def test_the_train_command(lite, tmp_path, monkeypatch):
-    """From an address, as from a folder."""
+    """Trains from the address of a release."""
     monkeypatch.setitem(SIZES, "small", (1, 16, 5))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]

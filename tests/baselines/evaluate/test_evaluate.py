@@ -178,7 +178,7 @@ def test_invalid_actions_of_host_agents(actions, message):
     ],
 )
 def test_host_agents_return_one_integer_per_task(actions, message):
-    """Without the environment, whose compilation takes seconds."""
+    """The ego acts without the environment, whose compilation takes seconds."""
     policy, keys = from_host(Watcher(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
     percept = Percept(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)

@@ -280,7 +280,7 @@ def test_next_observations_are_of_the_same_episode():
 
 
 class TestOvercooked:
-    """On real batches."""
+    """Models on batches of OvercookedV2."""
 
     @pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
     def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite, name):

@@ -97,7 +97,7 @@ class TestVerify:
         (found,) = problems(root, level="deep")
         assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
 
-    def test_an_index_that_lies(self, copy):
+    def test_an_index_with_wrong_numbers(self, copy):
         path = copy / "meta" / "histories.jsonl"
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         lines[0]["score"] += 1

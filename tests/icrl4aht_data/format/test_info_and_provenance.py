@@ -23,7 +23,7 @@ def test_the_bundled_release_is_written_as_it_was_read(tmp_path):
 
 
 def test_unknown_fields_of_a_provenance_are_kept():
-    note = {"seed": 3, "laboratory": {"place": "elsewhere"}, "other": [1]}
+    note = {"seed": 3, "laboratory": {"city": "elsewhere"}, "other": [1]}
     assert Provenance.from_json(note).to_json() == note
 
 

@@ -158,7 +158,7 @@ def test_agents_in_each_others_way(cells, actions, moved):
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
-    """Against steps 1 to 3 of the specification, written out cell by cell."""
+    """Compares with steps 1 to 3 of the specification, written out cell by cell."""
     cells, wanted_cells, actions = [], [], []
     starts = [pair for pair in product(*layout.rooms) if pair[0] != pair[1]]
     for old, pair in product(starts, product(range(6), repeat=2)):

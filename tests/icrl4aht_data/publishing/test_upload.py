@@ -241,7 +241,7 @@ def test_a_card_that_the_hub_refuses(hub, published, tmp_path):
 
 def test_cards_are_valid_to_the_hub(hub, published):
     DatasetCard.load(published / "README.md", ignore_metadata_errors=False).validate()
-    names = "algorithm layout member checkpoint step sha256 seats own_return teammate_return seed widths code_version"
+    names = "algorithm layout member checkpoint step sha256 agents own_return teammate_return seed widths code_version"
     teammate = fill_template("teammate.md", **dict.fromkeys([*names.split(), "return_of"], "fcp"))
     ModelCard(teammate).validate()
     names = "method dataset data_version selection code_version settings protocol results limits"

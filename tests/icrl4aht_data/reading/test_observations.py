@@ -83,7 +83,7 @@ class TestConversion:
             from_published(published_folder[0], tmp_path / "out", kind, kept_steps=KEPT)
 
     def test_states_may_be_left_out(self, lite, reconverted_release, tmp_path):
-        """From a lite release at once, and from published files that have them."""
+        """A lite release can be converted directly, and published files with states can, too."""
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
         assert from_published(tmp_path / "files", tmp_path / "two", "observations", kept_steps=KEPT) == "observations"
