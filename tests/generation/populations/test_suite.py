@@ -239,10 +239,13 @@ def test_the_play_matrix_pairs_best_responses_with_members(trained):
     np.testing.assert_array_equal(play_matrix(trained("lbrdiv"), LAYOUT, "lbrdiv"), expected)
 
 
-@pytest.mark.parametrize("algorithms", [["lbrdiv"], pytest.param(ALGORITHMS, marks=pytest.mark.slow)])
-def test_every_checkpoint_acts_as_either_agent(trained, algorithms):
+@pytest.mark.parametrize(
+    ("agents", "algorithms"),
+    [([TEAMMATE], ["lbrdiv"]), pytest.param([EGO, TEAMMATE], ALGORITHMS, marks=pytest.mark.slow)],
+)
+def test_every_checkpoint_acts_as_either_agent(trained, agents, algorithms):
     env, envs, root = Environment(LAYOUT), 3, trained(*algorithms)
-    for agent in (EGO, TEAMMATE):
+    for agent in agents:
         first = learned.build_learned(LAYOUT, population(root, algorithms[0]) / "m0/c0")
 
         def play(params, agent=agent, policy=first):
