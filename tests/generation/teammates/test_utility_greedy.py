@@ -17,7 +17,6 @@ from generation.teammates.heuristics.heuristic import next_key
 from generation.teammates.heuristics.paths import UNREACHABLE, Paths
 from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY, GreedyMemory
 from generation.teammates.registry import build_teammate, heuristic_teammate
-from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, PUBLISHED_ACTIONS, RIGHT, STAY, TEAMMATE, UP
 from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL, Layout
@@ -465,46 +464,3 @@ def test_rooms_are_out_of_each_others_reach():
     pile_0 = 5 * OPEN.width + 6  # between the rooms: both agents reach it
     assert paths.access[pile_0].tolist() == [-1, -1, pile_0 - 1, pile_0 + 1]
     assert paths.target_distance[pile_0 - 1, pile_0] == paths.target_distance[pile_0 + 1, pile_0] == 0
-
-
-# The registry.
-
-
-def test_presets_are_the_published_ones():
-    published = {
-        "default": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.3, 0.5),
-        "delivery_focused": (15, 12, 8, 3, 2, 1, 4, 2, 0.3, 0.4, 0.3),
-        "prep_focused": (8, 5, 3, 10, 8, 4, 12, 5, 0.4, 0.5, 0.7),
-        "high_inertia": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.7, 0.5),
-        "distance_sensitive": (10, 8, 5, 6, 4, 2, 7, 3, 1.0, 0.3, 0.5),
-    }
-    assert tuple(UTILITY_GREEDY.defaults) == NAMES
-    assert set(UTILITY_GREEDY.presets) == set(published)
-    for name, values in published.items():
-        entry = heuristic_teammate("utility_greedy", name, 3)
-        theta = dict(zip(NAMES, values, strict=True))
-        rest = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 3, "base_seed": 0}
-        assert list(entry.items()) == [*rest.items(), ("theta", theta)], name
-
-
-def test_unknown_family():
-    with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
-        heuristic_teammate("utility_gredy", "default", 0)
-    with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
-        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_gredy", "theta": UTILITY_GREEDY.defaults})
-
-
-def test_unknown_preset():
-    with pytest.raises(
-        UnknownNameError, match=r"preset of utility_greedy 'prep_focussed'.*Did you mean 'prep_focused'"
-    ):
-        heuristic_teammate("utility_greedy", "prep_focussed", 0)
-
-
-def test_missing_and_unknown_parameters():
-    theta = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "inertia"} | {"w_inertia": 0.3}
-    with pytest.raises(TaskFormatError, match=r"missing parameters \['inertia'\], unknown parameters \['w_inertia'\]"):
-        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": theta})
-    with pytest.raises(TaskFormatError, match=r"missing parameters \['w_deliver'\], unknown parameters \[\]"):
-        without = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "w_deliver"}
-        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": without})
