@@ -1,4 +1,4 @@
-"""The JAX environment, and the rules and observations in JAX beside NumPy."""
+"""The JAX environment, and the rules and observations in JAX compared with NumPy."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.
 N, MAX_STEPS, STEPS = 2000, 5, 13  # every test steps the same two batches: 2,000 environments and one
 
 quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles in half the time
+
+DEFAULT_LAYOUTS = ("coord_ring", "demo_wide", "asymm_right")
+"""Three contrasting layouts; tests of the others are slow."""
 
 FLOOR = {  # the rooms' floor cells (x, y), ego's and teammate's, read off the maps
     "cramped_up": ([(x, y) for y in (1, 2) for x in (1, 2, 3)],) * 2,
@@ -62,7 +65,7 @@ def some_keys(number: int) -> jax.Array:
 
 
 def at_goal(state: EnvState) -> EnvState:
-    """Environments of cramped_up changed: the teammate stands at the goal with the dish of the current recipe."""
+    """Environments of cramped_up changed: the teammate is at the goal with the dish of the current recipe."""
     where, recipes = columns(CRAMPED), fields(CRAMPED, state.record).recipe
     records = np.repeat(state_record(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
     records[:, where.recipe] = recipes
@@ -71,7 +74,7 @@ def at_goal(state: EnvState) -> EnvState:
 
 
 class Life(NamedTuple):
-    """What happened to a batch: per step the state before, what the step gave, and the actions."""
+    """Steps of a batch: the state before each, its result, and the actions."""
 
     before: list[EnvState]
     steps: list
@@ -194,7 +197,7 @@ def test_auto_reset_gives_a_new_start(life):
             assert_uniform(np.stack([cell_before, cell], axis=1), 36)
 
 
-def test_only_finished_environments_start_anew(cramped, life):
+def test_only_finished_environments_restart(cramped, life):
     """Environments with unlike clocks in one batch."""
     clocks = np.arange(N) % MAX_STEPS
     state = life.steps[2].state._replace(clock=jnp.asarray(clocks, jnp.int32))
@@ -229,7 +232,7 @@ def test_an_environment_alone_lives_as_in_a_batch(cramped, keys, actions, life, 
     assert_equal_lives(alone.steps, life.steps, which)
 
 
-def test_the_place_in_the_batch_and_the_others_do_not_matter(cramped, keys, actions, life):
+def test_the_position_in_the_batch_and_the_others_do_not_matter(cramped, keys, actions, life):
     others = some_keys(2)
     mixed = jnp.concatenate([others[: N // 2], keys[: N // 2][::-1]])
     theirs = np.concatenate([actions[:, N // 2 :], actions[:, : N // 2][:, ::-1]], axis=1)
@@ -259,7 +262,7 @@ def transitions(compiled: Compiled, seed: int, deliveries: int) -> np.ndarray:
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs])
 
 
-def test_after_a_correct_delivery_the_recipe_is_drawn_anew_and_may_repeat(cramped):
+def test_a_correct_delivery_draws_a_recipe_that_may_repeat(cramped):
     pairs = transitions(cramped, seed=3, deliveries=4)
     assert set(np.unique(pairs)) == {3 * ZERO, 3 * ONE}
     assert_uniform(pairs, 4)  # also the pairs of equal ones
@@ -297,14 +300,14 @@ def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
 
 
 def test_shaped_rewards_are_each_agents_own_and_apart_from_the_teams(cramped, keys):
-    """Environments of three scenes in one batch: a placement, a dish, and a wrong delivery beside a plate."""
-    places = state_record(CRAMPED, (2, 1, "up"), (2, 2, "up"), hands=[ZERO, 0])
+    """Environments of three scenes in one batch: a placement, a dish, and a wrong delivery next to a placement."""
+    placements = state_record(CRAMPED, (2, 1, "up"), (2, 2, "up"), hands=[ZERO, 0])
     dishes = state_record(CRAMPED, (2, 2, "up"), (2, 1, "up"), hands=[0, PLATE], pot_items=[COOKED + 3 * ZERO])
     serves = state_record(
         CRAMPED, (1, 2, "down"), (3, 2, "down"), hands=[0, PLATE + COOKED + 3 * ONE], pot_items=[ZERO]
     )
     kinds = np.arange(N) % 3
-    state = cramped.init(keys)._replace(record=jnp.asarray(np.concatenate([places, dishes, serves])[kinds]))
+    state = cramped.init(keys)._replace(record=jnp.asarray(np.concatenate([placements, dishes, serves])[kinds]))
     step = cramped.step(state, jnp.asarray(np.full((N, 2), INTERACT, np.int32)))
     np.testing.assert_array_equal(step.shaped, np.array([[3, 0], [0, 5], [3, 0]], np.float32)[kinds])
     np.testing.assert_array_equal(step.reward, np.array([0, 0, -20], np.float32)[kinds])
@@ -338,10 +341,16 @@ def test_the_environments_observations_are_those_of_its_records(cramped, life):
         np.testing.assert_array_equal(each[agent], both[:, agent])
 
 
-# The rules and observations in JAX beside NumPy
+# The rules and observations in JAX compared with NumPy
 
 
-@pytest.fixture(scope="module", params=LAYOUTS.values(), ids=list(LAYOUTS))
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(layout, marks=() if name in DEFAULT_LAYOUTS else pytest.mark.slow, id=name)
+        for name, layout in LAYOUTS.items()
+    ],
+)
 def in_jax(request: pytest.FixtureRequest):
     """A layout, and one jitted step with the observations of the state before it."""
     layout = request.param

@@ -96,7 +96,7 @@ def test_paper_profile_has_the_papers_numbers():
 
 
 def test_paper_profile_keeps_146_episodes():
-    """T = 146 x 100 = 14,600 (paper, App. D.1), though 228 whole updates are 58,368 steps: the 146th
+    """T = 146 x 100 = 14,600 (paper, App. D.1), though 228 complete updates are 58,368 steps: the 146th
     episode has its first 100, and the state after them."""
     assert load_profile("paper").ego.updates == 228
     assert load_profile("paper").ego.episodes == 146
@@ -303,7 +303,7 @@ def _without(line: str, field: str) -> str:
             r"teammate: expected kind 'heuristic' or 'rl' and a family, found",
         ),
         (lambda first, line: _with(line, seed="1"), r"seed: expected int, found '1'"),
-        (lambda first, line: _with(line, track=["teammate"]), r"unknown track \['teammate'\]"),
+        (lambda first, line: _with(line, track=["teammate"]), r"track: expected str, found \['teammate'\]"),
         (lambda first, line: _with(line, layout_name="asymm_advantages_recipes_right"), r"unknown layout of the train"),
         (lambda first, line: line[:-1], r"not JSON: "),
         (lambda first, line: "", r"not JSON: "),

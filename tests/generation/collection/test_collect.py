@@ -128,7 +128,7 @@ def test_killed_before_it_got_its_name(built, task, tmp_path):
     assert not compare_rebuilds(folder, artefact(built / "a")).differences
 
 
-def test_a_partial_of_other_settings_is_begun_anew(built, task, tmp_path, monkeypatch):
+def test_a_partial_of_other_settings_is_started_again(built, task, tmp_path, monkeypatch):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
         run_task(task, folder, stop_after(3), save_seconds=0)

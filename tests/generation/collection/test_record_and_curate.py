@@ -1,4 +1,4 @@
-"""What a run keeps of its roll-outs, which streams a release takes, and how they are labelled."""
+"""Recording of roll-outs, selection of the streams of a release, and their labels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked.state import record_size
 from tests.helpers.states import random_records
 
 LAYOUT = LAYOUTS["cramped_up"]
-TABLES = 3
+ENVS = 3
 UNTOUCHED = 99  # no action, no reward and no record byte below
 
 
@@ -29,7 +29,7 @@ UNTOUCHED = 99  # no action, no reward and no record byte below
 
 
 def make_config(length: int, updates: int) -> PPOConfig:
-    return PPOConfig(total_steps=TABLES * length * updates, environments=TABLES, rollout=length, minibatches=1)
+    return PPOConfig(total_steps=ENVS * length * updates, environments=ENVS, rollout=length, minibatches=1)
 
 
 def empty_histories(config: PPOConfig) -> record.HistoryArrays:
@@ -39,7 +39,7 @@ def empty_histories(config: PPOConfig) -> record.HistoryArrays:
 
 def random_rollouts(length: int, updates: int) -> list[Rollout]:
     rng = np.random.default_rng(length)
-    shape = (length, TABLES)
+    shape = (length, ENVS)
 
     def one() -> Rollout:
         fields: dict[str, Any] = {
@@ -54,12 +54,12 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
 
 
 def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> record.HistoryArrays:
-    """One step of one table at a time: the first 100 of each 400, and the state after them."""
+    """Keep one step of one environment at a time: the first 100 of each 400, and the state after them."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
         for t in range(config.rollout):
             episode, clock = divmod(update * config.rollout + t, 400)
-            for n in range(TABLES):
+            for n in range(ENVS):
                 if episode >= config.episodes:
                     continue
                 if clock < 100:
@@ -84,7 +84,7 @@ def test_keep_equals_a_loop_over_steps(length, updates):
     for number, rollout in enumerate(rollouts):
         record.record_rollout(found, number, rollout)
     for name, array in expected._asdict().items():
-        assert array.size and not (array == UNTOUCHED).any(), name  # every place is filled
+        assert array.size and not (array == UNTOUCHED).any(), name  # every entry is filled
         np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
         assert getattr(found, name).dtype == array.dtype
 
@@ -122,9 +122,9 @@ def rewards_of(returns: list[list[int]]) -> np.ndarray:
     rewards = np.zeros((len(returns), len(returns[0]), 100), np.int8)
     for n, curve in enumerate(returns):
         for e, total in enumerate(curve):
-            places = rng.permutation(100)
+            steps = rng.permutation(100)
             pieces = [5 * int(np.sign(total))] * (abs(total) // 5)
-            rewards[n, e, places[: len(pieces)]] = pieces
+            rewards[n, e, steps[: len(pieces)]] = pieces
     assert rewards.sum(axis=-1).tolist() == returns
     return rewards.reshape(len(returns), -1)
 

@@ -42,7 +42,7 @@ def failures(out: Path) -> list[dict]:
 
 
 def collect(tasks, out: Path, **options) -> str:
-    """What the collection printed."""
+    """Collect the tasks and return the printed output."""
     output = StringIO()
     collect_tasks(tasks[0], tasks[1], out, Console(file=output, width=200), CollectOptions(**options))
     return output.getvalue()

@@ -1,4 +1,4 @@
-"""One update of a whole population: what it learns from negative weights, what it changes, what it carries on."""
+"""One update of a population: learning from negative weights, the changes of the state, the metrics."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from generation.learners.population import population as population_module
 from generation.learners.population.comedi import CoMeDi
 from generation.learners.population.lbrdiv import LBRDiv, Multipliers
 from generation.learners.population.population import Algorithm, Population, PopulationState
@@ -36,7 +37,7 @@ REWARDED = 2
 
 @pytest.fixture(scope="module")
 def parts(lbrdiv) -> Parts:
-    """Made-up sequences in which one action brings a reward at once; the second policy's weights are -1."""
+    """Made-up sequences in which one action is rewarded at once; the second policy's weights are -1."""
     before, rng = lbrdiv.before, np.random.default_rng(2)
     steps, slots = EPISODE, 16
     action = rng.integers(0, 6, (2, steps, slots))
@@ -93,7 +94,7 @@ def test_the_surrogate_of_weight_minus_1_is_that_of_negated_advantages(surrogate
     assert not same_bytes(down, up)
 
 
-def test_weights_scale_the_surrogate_place_by_place(surrogate, parts):
+def test_weights_scale_the_surrogate_slot_by_slot(surrogate, parts):
     """At unchanged parameters the surrogate is linear in the weights."""
     params, played = part(parts.params, 0), part(parts.played, 0)
     rng = np.random.default_rng(5)
@@ -120,6 +121,7 @@ def learned(lbrdiv, parts) -> tuple[Any, Any, dict[str, Any]]:
     return compiled(jax.vmap(lbrdiv.population.ppo.learn))(*parts, jax.random.split(jax.random.key(8), 2))
 
 
+@pytest.mark.slow
 def test_policies_that_learn_at_once_learn_as_each_alone(learn, parts, learned):
     keys = jax.random.split(jax.random.key(8), 2)
     for number in range(2):
@@ -144,33 +146,55 @@ def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
     assert change[1] < -0.005
 
 
-# A whole update.
+# Complete updates.
 
 
 class Updated(NamedTuple):
+    """An update of a population.
+
+    Attributes:
+        population: the population.
+        update: compiled; maps a state to the next state, the metrics, and both results of the roll-out.
+        before: the state before the update.
+        after: the state after it.
+        metrics: its metrics.
+        carry: environments and memories after its roll-out.
+        rollout: its roll-out.
+    """
+
     population: Population
     update: Any
     before: PopulationState
     after: PopulationState
     metrics: dict[str, float]
-    carry: RolloutCarry  # of the roll-out made anew
+    carry: RolloutCarry
     rollout: Rollout
 
 
-def updated(algorithm: Algorithm) -> Updated:
-    """The second update, in which the warm-up of the learning rate is over; its roll-out once more by itself."""
-    whole = population(algorithm)
-    update = compiled(whole.update)
-    before, _ = update(compiled(whole.init)(jax.random.key(5)))
-    after, metrics = update(before)
+def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
+    """The second update, in which the warm-up of the learning rate is over.
 
-    def again(state):
-        rolling = jax.random.split(jax.random.fold_in(state.key, state.update), 3)[0]
-        players, restart = whole._players(state.params), whole._restart(state.visited)
-        return roll_out(whole.env, players, state.carry, EPISODE, rolling, restart)
+    Without `learning` the policies stay as they are, which compiles in a third of the time.
+    """
+    trained = population(algorithm)
 
-    carry, rollout = compiled(again)(before)
-    return Updated(whole, update, before, after, {n: float(v) for n, v in metrics.items()}, carry, rollout)
+    @compiled
+    def update(state: PopulationState):
+        rollouts = []
+
+        def recorded(*arguments):
+            rollouts.append(roll_out(*arguments))
+            return rollouts[-1]
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(population_module, "roll_out", recorded)
+            if not learning:
+                patch.setattr(Population, "_learn", lambda self, state, *rest: (state.params, state.optimizer, {}))
+            return *trained.update(state), *rollouts[0]
+
+    before = update(compiled(trained.init)(jax.random.key(5)))[0]
+    after, metrics, carry, rollout = update(before)
+    return Updated(trained, update, before, after, {n: float(v) for n, v in metrics.items()}, carry, rollout)
 
 
 @pytest.fixture(scope="module")
@@ -179,11 +203,17 @@ def comedi() -> Updated:
 
 
 @pytest.fixture(scope="module")
+def comedi_play() -> Updated:
+    """An update of CoMeDi without learning."""
+    return updated(CoMeDi(), learning=False)
+
+
+@pytest.fixture(scope="module")
 def lbrdiv() -> Updated:
     return updated(LBRDiv(2))
 
 
-@pytest.fixture(params=["comedi", "lbrdiv"])
+@pytest.fixture(params=[pytest.param("comedi", marks=pytest.mark.slow), "lbrdiv"])
 def either(request) -> Updated:
     return request.getfixturevalue(request.param)
 
@@ -215,7 +245,7 @@ def test_untrained_policies_differ(either):
     assert np.abs(flat[0] - flat[1]).max() > 0.1
 
 
-def test_metrics_tell_self_play_from_cross_play(either):
+def test_metrics_separate_self_play_from_cross_play(either):
     assignment, done = either.population.assignment, np.asarray(either.rollout.done)
     returns = np.asarray(either.rollout.returns)
     fresh, group = assignment.starts_from < 0, assignment.policy[0] % 2 == assignment.policy[1] % 2
@@ -226,17 +256,18 @@ def test_metrics_tell_self_play_from_cross_play(either):
     np.testing.assert_allclose(either.metrics["shaping"], 1 - 96 / CONFIG.shaping_horizon, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(lbrdiv, learn):
     """Policy by policy, each from its own slots of the roll-out."""
-    whole, before = lbrdiv.population, lbrdiv.before
-    assignment = whole.assignment
+    trained, before = lbrdiv.population, lbrdiv.before
+    assignment = trained.assignment
     key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]
     keys = jax.random.split(jax.random.fold_in(key, 0), 4)
-    weight = np.asarray(whole._slot_weights(before.memory))
-    (group,) = whole.groups
+    weight = np.asarray(trained._slot_weights(before.memory))
+    (group,) = trained.groups
 
     def sequences_of_all(state, carry, rollout):
-        last = whole._players(state.params)[0].act(carry.memories[0], carry.env, key)[0].value
+        last = trained._players(state.params)[0].act(carry.memories[0], carry.env, key)[0].value
         shaping = shaping_weight(CONFIG, state.update)
         return sequences(rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
 
@@ -253,23 +284,24 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5)
 
 
+@pytest.mark.slow
 def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
-    whole, before = lbrdiv.population, lbrdiv.before
-    lowered = np.asarray(whole._slot_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
+    trained, before = lbrdiv.population, lbrdiv.before
+    lowered = np.asarray(trained._slot_weights(before.memory)).reshape(2, -1).T < 0  # (N, 2)
     assert 0 < lowered.sum() < lowered.size
     shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
 
     @compiled
     def learned(shaped):
         rollout = lbrdiv.rollout._replace(shaped=shaped)
-        return whole._learn(before, whole._players(before.params), lbrdiv.carry, rollout, jax.random.key(1))[0]
+        return trained._learn(before, trained._players(before.params), lbrdiv.carry, rollout, jax.random.key(1))[0]
 
     params = learned(shaped)
     assert same_bytes(params, learned(np.where(lowered, 0.0, shaped)))
     assert not same_bytes(params, learned(np.where(lowered, shaped, 0.0)))
 
 
-def test_the_multipliers_follow_the_returns_of_the_tables(lbrdiv):
+def test_the_multipliers_follow_the_returns_of_the_envs(lbrdiv):
     assignment, returns = lbrdiv.population.assignment, np.asarray(lbrdiv.rollout.returns)[-1]
     env = np.full((4, 4), np.nan)
     seen = np.zeros((4, 4), bool)
@@ -281,22 +313,22 @@ def test_the_multipliers_follow_the_returns_of_the_tables(lbrdiv):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi):
+def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi_play):
     """A quarter of the envs starts from states that the third quarter went through in the roll-out before."""
-    source = comedi.population.assignment.starts_from
-    started = np.asarray(comedi.after.carry.env.record)
-    visited = np.asarray(comedi.before.visited)
+    source = comedi_play.population.assignment.starts_from
+    started = np.asarray(comedi_play.after.carry.env.record)
+    visited = np.asarray(comedi_play.before.visited)
     moved = source >= 0
     assert moved.sum() == 4
     np.testing.assert_array_equal(started[moved], visited[source[moved]])
-    env = comedi.after.carry.env
-    fresh = np.asarray(compiled(comedi.population.env.first_record)(env.key, env.episode))
+    env = comedi_play.after.carry.env
+    fresh = np.asarray(compiled(comedi_play.population.env.first_record)(env.key, env.episode))
     np.testing.assert_array_equal(started[~moved], fresh[~moved])
     assert (started[moved] != fresh[moved]).any(axis=1).all()
 
 
-def test_a_visited_state_is_one_of_the_tables_own_last_roll_out(comedi):
-    record, visited = np.asarray(comedi.rollout.record), np.asarray(comedi.after.visited)
+def test_a_visited_state_is_one_of_its_environments_last_roll_out(comedi_play):
+    record, visited = np.asarray(comedi_play.rollout.record), np.asarray(comedi_play.after.visited)
     steps = [(record[:, env] == visited[env]).all(axis=1).nonzero()[0].tolist() for env in range(len(visited))]
     assert all(steps)
     assert len({own[0] for own in steps if len(own) == 1}) > 2, "the step is drawn"

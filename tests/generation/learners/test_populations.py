@@ -1,6 +1,6 @@
-"""Who sits where in each algorithm, what each place counts, and the multipliers.
+"""Assignments of policies to agent slots in each algorithm, weights of the slots, and LBRDiv's multipliers.
 
-Formulas are from the paper's App. B.1, written out here by hand.
+The expected values follow the formulas of the paper's App. B.1, written out by hand.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from tests.helpers.jit import same_bytes
 from tests.helpers.populations import plain_adapt, population
 
-# Who sits where.
+# Assignments.
 
 
-def test_fcp_members_play_themselves_in_both_seats():
+def test_fcp_members_play_themselves_as_either_agent():
     assignment = FCP(3).assignment(4)
     np.testing.assert_array_equal(assignment.policy, [[0] * 4 + [1] * 4 + [2] * 4] * 2)
     np.testing.assert_array_equal(assignment.term, assignment.policy)
@@ -39,7 +39,7 @@ def test_fcp_members_play_themselves_in_both_seats():
 
 @pytest.mark.parametrize("algorithm", [BRDiv, LBRDiv])
 @pytest.mark.parametrize(("members", "environments"), [(1, 4), (2, 8), (3, 8), (10, 256)])
-def test_confederates_sit_in_seat_1_and_best_responses_in_seat_0(algorithm, members, environments):
+def test_confederates_are_teammates_and_best_responses_egos(algorithm, members, environments):
     assignment = algorithm(members).assignment(environments)
     responses, confederates = assignment.policy
     assert set(responses) == set(range(members, 2 * members))
@@ -57,7 +57,7 @@ def test_confederates_sit_in_seat_1_and_best_responses_in_seat_0(algorithm, memb
 
 
 @pytest.mark.parametrize(("members", "environments"), [(2, 8), (3, 8), (4, 24), (10, 256)])
-def test_every_pair_plays_three_quarters_of_all_tables_self_play(members, environments):
+def test_three_quarters_of_the_envs_are_self_play_and_every_pair_plays(members, environments):
     responses, confederates = BRDiv(members).assignment(environments).policy
     pairs = np.zeros((members, members), int)
     np.add.at(pairs, (confederates, responses - members), 1)
@@ -70,9 +70,9 @@ def test_every_pair_plays_three_quarters_of_all_tables_self_play(members, enviro
 
 def test_each_pair_of_brdiv_is_a_term_for_either_side():
     assignment = BRDiv(3).assignment(8)
-    for table, (response, confederate) in enumerate(assignment.policy.T):
+    for env, (response, confederate) in enumerate(assignment.policy.T):
         pair = 3 * confederate + response - 3
-        assert assignment.term[:, table].tolist() == [9 + pair, pair]
+        assert assignment.term[:, env].tolist() == [9 + pair, pair]
 
 
 @pytest.mark.parametrize("environments", [8, 16, 256])
@@ -101,66 +101,68 @@ def test_comedi_has_a_quarter_each_of_self_play_cross_play_mixed_play_and_its_st
     assert assignment.agent_slots(0)[1].size + assignment.agent_slots(1)[1].size == 2 * quarter + quarter + quarter // 2
 
 
-def test_comedi_mixes_the_frozen_member_into_both_seats():
+def test_comedi_mixes_the_frozen_member_into_both_agents():
     mixed = np.split(CoMeDi().assignment(16).policy, 4, axis=1)[2]
     assert (mixed == 1).any(axis=1).all()
 
 
-def test_comedi_needs_tables_that_divide_by_eight():
+def test_comedi_needs_a_multiple_of_eight_environments():
     with pytest.raises(ValueError, match="environments = 12: CoMeDi needs a multiple of 8"):
         CoMeDi().assignment(12)
 
 
 @pytest.mark.parametrize("algorithm", [FCP(3), BRDiv(3), LBRDiv(4), CoMeDi()])
-def test_groups_hold_every_place_once_those_that_count_first(algorithm):
-    whole = population(algorithm)
-    assignment = whole.assignment
-    everyone = np.concatenate([group.agent_slots.ravel() for group in whole.groups])
+def test_groups_hold_every_slot_once_and_counting_slots_first(algorithm):
+    trained = population(algorithm)
+    assignment = trained.assignment
+    everyone = np.concatenate([group.agent_slots.ravel() for group in trained.groups])
     np.testing.assert_array_equal(np.sort(everyone), np.arange(2 * assignment.envs))
-    policies = [group.first + k for group in whole.groups for k in range(len(group.agent_slots))]
+    policies = [group.first + k for group in trained.groups for k in range(len(group.agent_slots))]
     assert policies == list(range(assignment.policies))
-    for group in whole.groups:
+    for group in trained.groups:
         for k, slots in enumerate(group.agent_slots):
             counting, others = assignment.agent_slots(group.first + k)
             np.testing.assert_array_equal(slots, np.concatenate([counting, others]))
             assert group.counting == counting.size
 
 
-def test_critics_are_told_the_partner_where_partners_vary():
+def test_critics_see_the_partner_where_partners_vary():
     partners = {type(a): population(a).network.partners for a in (FCP(3), BRDiv(1), BRDiv(3), LBRDiv(2), CoMeDi())}
     assert partners == {FCP: 0, BRDiv: 6, LBRDiv: 4, CoMeDi: 2}
     assert population(BRDiv(1)).network.partners == 0
     assert population(FCP(1), partners=2).network.partners == 2
 
 
-# What counts how much.
+# Weights of the slots.
 
 
 def by_hand(algorithm: Any, memory: Any) -> np.ndarray:
-    """The weight of each place's return in its policy's objective, from the paper's equations, (2, N); each expected
-    return is a mean over its slots."""
+    """Return the weight of each slot's return in its policy's objective, from the paper's equations, float64 (2, N).
+
+    An expected return is the mean over its slots.
+    """
     assignment = algorithm.assignment(16)
     k = getattr(algorithm, "members", 0)
     expected = np.zeros(assignment.policy.shape)
-    for table, (left, right) in enumerate(assignment.policy.T):
+    for env, (left, right) in enumerate(assignment.policy.T):
         if isinstance(algorithm, FCP):
-            expected[:, table] = 1 / 32
+            expected[:, env] = 1 / 32
         elif isinstance(algorithm, CoMeDi):
-            quarter = table // 4
+            quarter = env // 4
             alpha, beta = algorithm.cross_play_weight, algorithm.mixed_play_weight
             mixed = beta / 2 / 4 if left == right else beta / 2 / 2  # half of J_MP over 4 slots, half over 2
             both = {0: 1 / 8, 1: -alpha / 4, 2: 0, 3: mixed}[quarter]
-            expected[:, table] = [both * (left == 0), both * (right == 0)]
+            expected[:, env] = [both * (left == 0), both * (right == 0)]
         else:
             i, j = int(right), int(left) - k
             n = np.sum((assignment.policy[0] == left) & (assignment.policy[1] == right))
             if isinstance(algorithm, BRDiv):
                 conf = 1 + 2 * algorithm.cross_play_weight if i == j else -algorithm.cross_play_weight
-                expected[:, table] = [float(i == j) / n, conf / n]
+                expected[:, env] = [float(i == j) / n, conf / n]
             elif i == j:
-                expected[:, table] = sum(memory.vertical[i, m] + memory.horizontal[i, m] for m in range(k)) / n
+                expected[:, env] = sum(memory.vertical[i, m] + memory.horizontal[i, m] for m in range(k)) / n
             else:
-                expected[:, table] = -(memory.horizontal[i, j] + memory.vertical[j, i]) / n
+                expected[:, env] = -(memory.horizontal[i, j] + memory.vertical[j, i]) / n
     return expected
 
 
@@ -186,15 +188,15 @@ def some_multipliers(members: int) -> Multipliers:
 )
 def test_slot_weights_are_the_papers(algorithm, memory):
     """Up to a positive factor for each policy, which makes the mean size of a policy's weights 1."""
-    whole = population(algorithm)
-    found = np.asarray(whole._slot_weights(memory))
+    trained = population(algorithm)
+    found = np.asarray(trained._slot_weights(memory))
     expected, policy, counts = (
         by_hand(algorithm, memory).ravel(),
-        whole.assignment.policy.ravel(),
-        whole.assignment.term >= 0,
+        trained.assignment.policy.ravel(),
+        trained.assignment.term >= 0,
     )
     np.testing.assert_array_equal(found[~counts.ravel()], 0)
-    for number in range(whole.assignment.learning):
+    for number in range(trained.assignment.learning):
         mine = (policy == number) & counts.ravel()
         np.testing.assert_allclose(np.abs(found[mine]).mean(), 1, rtol=1e-5)
         np.testing.assert_allclose(found[mine], expected[mine] / np.abs(expected[mine]).mean(), rtol=1e-5)
@@ -219,7 +221,10 @@ def test_brdiv_weighs_self_play_by_one_more_than_twice_cross_play():
 
 
 def random_returns(k: int, rng: np.random.Generator, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2k, 2k) returns that are not a number where none was seen; only responses in agent 0 are."""
+    """Return the mean returns of pairs, float32 (2k, 2k), NaN where `seen`, bool (2k, 2k), is False.
+
+    Only pairs of a best response as the ego and a confederate as the teammate are seen.
+    """
     seen = np.zeros((2 * k, 2 * k), bool)
     seen[k:, :k] = rng.random((k, k)) < share
     return np.where(seen, rng.normal(size=seen.shape) * 30, np.nan).astype(np.float32), seen

@@ -1,6 +1,6 @@
-"""The one PPO: advantages, replay of the recurrent state, purity, schedules, and that it learns.
+"""PPO: advantages, replay of the recurrent state, purity, schedules, and that it learns.
 
-One tiny learner for all tests. Its ego stands in a closet between two buttons, a pile and a pot, so pressing (-5) and
+One tiny learner for all tests. Its ego is in a closet between two buttons, a pile and a pot, so pressing (-5) and
 placing (+3 shaped) happen often; of every three roll-outs of 8 steps, an episode of 12 ends inside the second and one
 with the third.
 """
@@ -51,11 +51,11 @@ UpdateFunction = Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str,
 
 
 PARAMS = {"turn": np.uint32(0)}
-"""Parameters of the scripted teammate: how far it turns from the direction that it would take."""
+"""Parameters of the scripted teammate: the number of directions by which its steps are rotated."""
 
 
 class Diary(NamedTuple):
-    """What the stand-in teammate remembers."""
+    """Memory of the scripted teammate."""
 
     offset: jax.Array  # from the episode's key
     steps: jax.Array  # it has acted in the episode
@@ -66,7 +66,7 @@ def begin(params, key) -> Diary:
 
 
 def acts(params, memory: Diary, view, key):
-    """A step in a direction that tells its memory and what it sees."""
+    """Take a step in a direction that depends on the memory and the observation."""
     action = (memory.offset + memory.steps + view.sum(dtype=jnp.uint32) + params["turn"]) % 4
     return action.astype(jnp.int32), memory._replace(steps=memory.steps + 1)
 
@@ -142,12 +142,12 @@ def joined(rollouts: list[Rollout]) -> Rollout:
 
 
 def egos(rollout: Rollout) -> Choice:
-    """What the ego chose."""
+    """Return the ego's actions, log-probabilities and values."""
     return rollout.choices[EGO]
 
 
 def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
-    """What the roll-out from this state is to the ego's learning."""
+    """Return the sequences that the ego learns from in the roll-out from this state."""
     slots, hidden = np.arange(CONFIG.environments), state.carry.memories[EGO]
     return sequences(rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(0))
 
@@ -289,7 +289,7 @@ def test_learning_is_a_pure_function_too(update, learning, trained):
     assert same_bytes(update(trained.before[60])[0], trained.before[61])
 
 
-def test_each_update_draws_anew(update, frozen):
+def test_each_update_draws_other_actions(update, frozen):
     actions = [update(frozen._replace(update=jnp.int32(n)))[1].actions[..., EGO] for n in (0, 1)]
     assert not np.array_equal(actions[0], actions[1])
 
@@ -304,6 +304,7 @@ def test_minibatches_are_shuffled_by_the_key(update, learning):
     assert not same_bytes(one[0].params, other[0].params)
 
 
+@pytest.mark.slow
 def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
     """Four sequences for three minibatches: the key decides which one is left out."""
     ppo = PPO(CLOSET, learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
@@ -324,18 +325,18 @@ def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learn
 
 
 def test_resets_follow_ends(played):
-    whole = joined(played.rollouts)
-    step = np.arange(len(whole.done))[:, None]
-    np.testing.assert_array_equal(whole.done, np.broadcast_to(step % EPISODE == EPISODE - 1, whole.done.shape))
-    np.testing.assert_array_equal(whole.reset, np.broadcast_to(step % EPISODE == 0, whole.done.shape))
+    joint = joined(played.rollouts)
+    step = np.arange(len(joint.done))[:, None]
+    np.testing.assert_array_equal(joint.done, np.broadcast_to(step % EPISODE == EPISODE - 1, joint.done.shape))
+    np.testing.assert_array_equal(joint.reset, np.broadcast_to(step % EPISODE == 0, joint.done.shape))
 
 
 def test_metrics_hold_the_sum_of_rewards_of_ended_episodes(played):
-    whole = joined(played.rollouts)
-    episodes = len(whole.reward) // EPISODE
-    sums = whole.reward[: episodes * EPISODE].reshape(episodes, EPISODE, -1).sum(axis=1)
+    joint = joined(played.rollouts)
+    episodes = len(joint.reward) // EPISODE
+    sums = joint.reward[: episodes * EPISODE].reshape(episodes, EPISODE, -1).sum(axis=1)
     assert len(np.unique(sums)) > 2
-    np.testing.assert_array_equal(whole.returns[EPISODE - 1 :: EPISODE], sums)
+    np.testing.assert_array_equal(joint.returns[EPISODE - 1 :: EPISODE], sums)
     for number, metrics in enumerate(played.metrics):
         ended = [e for e in range(episodes) if number * 8 <= (e + 1) * EPISODE - 1 < number * 8 + 8]
         assert metrics["episodes"] == 4 * len(ended)
@@ -346,19 +347,19 @@ def test_metrics_hold_the_sum_of_rewards_of_ended_episodes(played):
 
 
 def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
-    """The stand-in teammate only walks, so every shaped reward is the ego's; all are placements."""
-    whole = joined(played.rollouts)
-    assert whole.shaped.shape == (*whole.done.shape, 2)
-    assert set(np.unique(whole.shaped[..., EGO])) == {0, 3}
-    acted = whole.actions[..., EGO] == INTERACT
-    assert acted[whole.shaped[..., EGO] > 0].all()
-    assert (whole.actions[..., TEAMMATE] != INTERACT).all()
-    assert not whole.shaped[..., TEAMMATE].any()
+    """The scripted teammate only walks, so every shaped reward is the ego's; all are placements."""
+    joint = joined(played.rollouts)
+    assert joint.shaped.shape == (*joint.done.shape, 2)
+    assert set(np.unique(joint.shaped[..., EGO])) == {0, 3}
+    acted = joint.actions[..., EGO] == INTERACT
+    assert acted[joint.shaped[..., EGO] > 0].all()
+    assert (joint.actions[..., TEAMMATE] != INTERACT).all()
+    assert not joint.shaped[..., TEAMMATE].any()
 
 
-def expected_teammate_actions(learner: Learner, state: LearnerState, whole: Rollout) -> np.ndarray:
-    step = np.arange(len(whole.done))
-    seen = np.asarray(observe(CLOSET, whole.record, TEAMMATE)).sum(axis=(2, 3, 4))
+def expected_teammate_actions(learner: Learner, state: LearnerState, joint: Rollout) -> np.ndarray:
+    step = np.arange(len(joint.done))
+    seen = np.asarray(observe(CLOSET, joint.record, TEAMMATE)).sum(axis=(2, 3, 4))
     out = np.zeros_like(seen)
     for episode in np.unique(step // EPISODE):
         keys = learner.env.episode_key(state.carry.env._replace(episode=jnp.full(4, episode)))
@@ -370,9 +371,9 @@ def expected_teammate_actions(learner: Learner, state: LearnerState, whole: Roll
 
 
 def test_the_teammates_memory_restarts_with_each_episode(learner, frozen, played):
-    whole = joined(played.rollouts[:9])  # 72 steps, six episodes
-    expected = expected_teammate_actions(learner, frozen, whole)
-    np.testing.assert_array_equal(whole.actions[..., TEAMMATE], expected)
+    joint = joined(played.rollouts[:9])  # 72 steps, six episodes
+    expected = expected_teammate_actions(learner, frozen, joint)
+    np.testing.assert_array_equal(joint.actions[..., TEAMMATE], expected)
 
 
 def test_a_teammate_that_sees_the_state_is_given_the_record(learner, played):
@@ -468,7 +469,7 @@ def test_minibatches_must_divide_the_environments():
         PPOConfig(environments=10, minibatches=4)
 
 
-def test_defaults_are_the_papers_ego_table():
+def test_defaults_are_the_papers_hyper_parameters_of_the_ego():
     config = PPOConfig()
     assert (config.total_steps, config.environments, config.rollout) == (60_000_000, 1024, 256)
     assert (config.epochs, config.minibatches, config.learning_rate, config.warmup) == (4, 64, 2.5e-4, 0.1)

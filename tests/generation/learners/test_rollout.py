@@ -1,7 +1,7 @@
-"""The roll-out: slots, carry, what each actor sees, memories that restart with the episodes, the restart hook.
+"""Roll-outs: agent slots, observations of each actor, memories that restart with the episodes, the restart hook.
 
-Four envs of five-step episodes; two scripted players share the eight slots in no order, and each remembers the
-record that its episode began with and the steps since.
+Four environments have episodes of five steps. Two scripted players share the eight slots in no order; each remembers
+the record at the start of the episode and the steps since.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ NETWORK = ActorCritic(Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=
 
 
 class Notes(NamedTuple):
-    """What a scripted player remembers at each of its slots."""
+    """Memory of a scripted player with M slots."""
 
     begun: jax.Array  # (M, S), the record that it began with
     steps: jax.Array  # (M,)
 
 
 def scripted(slots: np.ndarray) -> Player:
-    """Acts by its slot, the steps of the episode and the record that it began with."""
+    """Return a player that acts by its slot, the steps of the episode and the record at its start."""
 
     def begin(state: EnvState) -> Notes:
         return Notes(state.record[slots % ENVS], jnp.zeros(slots.size, jnp.int32))
@@ -66,7 +66,7 @@ def scripted(slots: np.ndarray) -> Player:
 
 
 def expected_actions(record: np.ndarray) -> np.ndarray:
-    """What scripted players do, int (T, N, 2), from the records of a roll-out that starts with the episodes."""
+    """Return the actions of the scripted players, int (T, N, 2), in a roll-out that starts with the episodes."""
     slot = np.arange(2 * ENVS).reshape(2, ENVS).T
     step = np.arange(len(record))
     begun = record[step - step % EPISODE].sum(axis=-1, dtype=np.int64)
@@ -74,7 +74,7 @@ def expected_actions(record: np.ndarray) -> np.ndarray:
 
 
 def marked(state: EnvState, done: jax.Array) -> EnvState:
-    """A restart hook: where an episode starts, the agents change slots."""
+    """Swap the agents' positions where an episode starts: a restart hook."""
     first = state.record.at[:, :2].set(state.record[:, 1::-1])
     return state._replace(record=jnp.where(done[:, None], first, state.record))
 
@@ -88,15 +88,11 @@ class Played(NamedTuple):
 def play(players: list[Player], restart: Any = None) -> Played:
     """Two roll-outs, one after the other, as one; NumPy."""
     more = () if restart is None else (restart,)
-
-    def run(start):
-        middle, one = roll_out(ENV, players, start, STEPS, jax.random.key(1), *more)
-        carry, other = roll_out(ENV, players, middle, STEPS, jax.random.key(2), *more)
-        return carry, jax.tree.map(lambda *parts: jnp.concatenate(parts), one, other)
-
+    run = compiled(lambda carry, key: roll_out(ENV, players, carry, STEPS, key, *more))
     start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
-    carry, rollout = compiled(run)(start)
-    return Played(start, carry, jax.tree.map(np.asarray, rollout))
+    middle, one = run(start, jax.random.key(1))
+    carry, other = run(middle, jax.random.key(2))
+    return Played(start, carry, jax.tree.map(lambda *parts: np.concatenate(parts), one, other))
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +128,7 @@ def apply():
 
 
 def in_state(record: np.ndarray) -> EnvState:
-    """Tables in the middle of their first episode."""
+    """Return environments in the middle of their first episode."""
     clock = jnp.ones(len(record), jnp.int32)
     return EnvState(jax.random.split(jax.random.key(0), len(record)), 0 * clock, clock, jnp.asarray(record))
 
@@ -141,10 +137,10 @@ def one(params: Any, policy: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[policy], params)
 
 
-# Places.
+# Agent slots.
 
 
-def test_actions_reach_the_seats_of_their_places(played):
+def test_actions_reach_their_agents(played):
     np.testing.assert_array_equal(played.rollout.actions, expected_actions(played.rollout.record))
     for choice, slots in zip(played.rollout.choices, SLOTS, strict=True):
         agent, env = np.divmod(slots, ENVS)
@@ -166,7 +162,7 @@ def test_the_game_is_played_with_these_actions(played):
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
-def test_seat_1_sees_what_the_teammate_observes(batch):
+def test_slots_of_agent_1_see_what_the_teammate_observes(batch):
     slots = np.array([7, 0, 3, 4, 5, 4])
     rng = np.random.default_rng(8)
     record = random_records(LAYOUT, 12, rng).reshape(3, ENVS, -1)[(0,) if batch == () else slice(None)]
@@ -174,14 +170,14 @@ def test_seat_1_sees_what_the_teammate_observes(batch):
     assert own.shape[:-3] == (*batch, 6)
     differ = 0
     for m, slot in enumerate(slots):
-        at_table = record[..., slot % ENVS, :]
+        in_env = record[..., slot % ENVS, :]
         agent = TEAMMATE if slot >= ENVS else EGO
-        np.testing.assert_array_equal(own[..., m, :, :, :], observe(LAYOUT, at_table, agent))
-        differ += np.any(own[..., m, :, :, :] != observe(LAYOUT, at_table, 1 - agent))
+        np.testing.assert_array_equal(own[..., m, :, :, :], observe(LAYOUT, in_env, agent))
+        differ += np.any(own[..., m, :, :, :] != observe(LAYOUT, in_env, 1 - agent))
     assert differ == len(slots)
 
 
-def test_places_of_seat_0_in_order_are_the_records_themselves():
+def test_ordered_slots_of_agent_0_share_the_records():
     record = jnp.asarray(random_records(LAYOUT, ENVS, np.random.default_rng(1)))
     assert slot_records(record, np.arange(ENVS)) is record
     np.testing.assert_array_equal(slot_records(record, np.array([2, 0])), record[jnp.array([2, 0])])
@@ -200,8 +196,8 @@ def test_memories_restart_with_each_episode(played):
         np.testing.assert_array_equal(notes.steps, 1)
 
 
-def test_only_the_players_at_a_table_that_ended_begin_anew():
-    """A env whose episode is two steps older than the others'."""
+def test_only_players_of_an_ended_episode_restart():
+    """The third environment is two steps ahead of the others."""
     players = [scripted(slots) for slots in SLOTS]
     start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
     start = start._replace(env=start.env._replace(clock=jnp.array([0, 0, 2, 0])))
@@ -319,7 +315,7 @@ def test_several_policies_in_one_player_act_as_each_alone(params):
 # Policies that do not learn.
 
 
-def test_each_table_may_have_an_instance_of_its_own():
+def test_each_environment_may_have_its_own_parameters():
     """One that acts by its parameters, and one that acts by its episode's key, which no other env shares."""
 
     def draws(params, key):
@@ -338,7 +334,7 @@ def test_each_table_may_have_an_instance_of_its_own():
         np.testing.assert_array_equal(choice.action, (action + memory) % 6)
 
 
-def test_a_policy_sees_its_own_seats_observation():
+def test_a_policy_sees_its_own_agents_observation():
     policy = Policy(
         {}, lambda params, key: (), lambda params, memory, view, key: (view.sum(dtype=int), ()), "observation"
     )
@@ -347,7 +343,7 @@ def test_a_policy_sees_its_own_seats_observation():
     sums = []
     for agent in (EGO, TEAMMATE):
         player = policy_player(ENV, policy, {}, agent, ENVS)
-        sums.append(np.asarray(player.act((), state, jax.random.key(0))[0].action))
+        sums.append(np.asarray(compiled(player.act)((), state, jax.random.key(0))[0].action))
         np.testing.assert_array_equal(sums[-1], observe(LAYOUT, record, agent).sum(axis=(1, 2, 3)))
     assert (sums[0] != sums[1]).any()
 
@@ -357,6 +353,7 @@ def test_the_random_player_draws_every_action_equally_often():
     player = random_player(TEAMMATE, envs)
     np.testing.assert_array_equal(player.agent_slots, np.arange(envs, 2 * envs))
     state = in_state(random_records(LAYOUT, envs, np.random.default_rng(3)))
-    shares = np.bincount(player.act((), state, jax.random.key(2))[0].action, minlength=6) / envs
+    choice, _ = compiled(player.act)((), state, jax.random.key(2))
+    shares = np.bincount(choice.action, minlength=6) / envs
     assert len(shares) == 6
     np.testing.assert_allclose(shares, 1 / 6, rtol=0, atol=5 * (1 / 6 * 5 / 6 / envs) ** 0.5)

@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Callable
+from functools import cache
+from typing import Any, cast
 
+import jax
 import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
 from generation.planning import plan
 from generation.profiles import load_profile
+from icrl4aht_data.format.schema import Kind
 from tests.helpers.tiny import LEARNED, artefact
 
 
+@pytest.fixture(scope="module")
+def measure_size() -> Callable[[Kind], float]:
+    """`plan.bytes_per_transition`, which writes a release of each kind once."""
+    return cache(plan.bytes_per_transition)
+
+
 @pytest.fixture
-def measured(monkeypatch) -> None:
-    """A machine that makes 100,000 steps/s of egos, 50,000 of populations, and compiles in 36 s."""
+def measured(monkeypatch, measure_size) -> None:
+    """A machine that trains egos at 100,000 steps/s, populations at 50,000, and compiles in 36 s."""
     speeds = {1024: 100_000.0, 64: 100_000.0, 256: 50_000.0}
     monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.LearnerSpeed(speeds[config.environments], 36.0))
+    monkeypatch.setattr(plan, "bytes_per_transition", measure_size)
 
 
 def test_the_papers_numbers(measured):
-    """8 layouts x 80 teammates; FCP has 10 members of 256 tables, BRDiv and LBRDiv too, CoMeDi ten in turn."""
+    """8 layouts x 80 teammates; populations of 10 members, each with 256 environments."""
     profile = load_profile("paper")
     found = plan.estimate_cost(profile, devices=16)
     steps = 228 * 262_144
@@ -52,14 +63,14 @@ def test_the_command(measured):
     assert (found["profile"], found["tasks"], found["devices"]) == ("smoke", 2, 8)
 
 
-def test_learned_teammates_are_in_the_bill(measured):
+def test_the_command_counts_learned_teammates(measured):
     result = CliRunner().invoke(cli, ["plan", "--profile", "paper"])
     assert result.exit_code == 0, result.output
     for expected in ("populations of teammates     32", "50,000 steps/s", "hours, teammates"):
         assert expected in result.output
 
 
-def test_calibration_measures_a_share_then_the_whole(built, monkeypatch):
+def test_calibration_measures_one_minibatch_then_the_complete_update(built, monkeypatch):
     ego = load_profile(str(built / "tiny.toml")).ego
     widths = []
 
@@ -79,8 +90,29 @@ def test_calibration_measures_a_share_then_the_whole(built, monkeypatch):
     assert widths == [4]
 
 
+class Doubling:
+    """A learner whose update takes no time to compile."""
+
+    steps_per_update = 640
+
+    def init(self, key: jax.Array) -> jax.Array:
+        return jax.random.uniform(key, (4,))
+
+    def update(self, state: jax.Array) -> tuple[jax.Array, dict[str, float]]:
+        return 2 * state, {}
+
+
+def test_measuring():
+    speed, steps = plan._measure(cast("Any", Doubling()))
+    assert steps == 640
+    assert speed.steps_per_second > 0
+    assert speed.compile_seconds > 0
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize("make", [plan.task_learner, plan.calibration_population])
-def test_measuring(tmp_path, make):
+def test_measuring_the_learners_of_a_profile(tmp_path, make):
     path = tmp_path / "learned.toml"
     path.write_text(LEARNED)
     profile = load_profile(str(path))

@@ -49,7 +49,7 @@ POLICIES = [policy(0), policy(1, by_state), policy(0), policy(1), policy(0, turn
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_fast() -> Iterator[None]:
-    """Small programs, made anew by every call: compiling is their cost."""
+    """Every call compiles small programs, so compiling is their cost."""
     least = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
     jax.config.update("jax_disable_most_optimizations", True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -67,10 +67,10 @@ def actions(compiled_fast) -> np.ndarray:
 def records(compiled_fast) -> jax.Array:
     """(T, episodes, S) of random agents."""
     env = diversity.Environment(LAYOUT, STEPS)
-    players = [diversity.random_player(seat, 3) for seat in (0, 1)]
-    seats = diversity.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
-    play = jax.jit(lambda seats: diversity.roll_out(env, players, seats, STEPS, jax.random.key(1))[1].record)
-    return play(seats)
+    players = [diversity.random_player(agent, 3) for agent in (0, 1)]
+    carry = diversity.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
+    play = jax.jit(lambda carry: diversity.roll_out(env, players, carry, STEPS, jax.random.key(1))[1].record)
+    return play(carry)
 
 
 # By hand.
@@ -125,15 +125,15 @@ def test_the_result_is_a_pure_function_of_the_seed(actions):
     assert (other != actions).any()
 
 
-def test_policies_watch_from_seat_1_with_a_memory(records, monkeypatch):
+def test_policies_observe_as_the_teammate_with_a_memory(records, monkeypatch):
     """Against a loop over the same states: counted from each episode's start, seen as the teammate sees it."""
     monkeypatch.setattr(diversity, "_play", lambda env, numbers, family, key: records)
     found = actions_on_common_states(LAYOUT, [policy(2), policy(1, by_state)], steps=STEPS)
-    whole = np.concatenate([records, records], axis=1)  # once for either family
-    seen = observe(LAYOUT, whole, TEAMMATE).sum(axis=(2, 3, 4))
+    repeated = np.concatenate([records, records], axis=1)  # once for either family
+    seen = observe(LAYOUT, repeated, TEAMMATE).sum(axis=(2, 3, 4))
     expected = (2 + np.arange(STEPS)[:, None] + seen) % 6
     np.testing.assert_array_equal(found[0].reshape(seen.shape), expected)
-    np.testing.assert_array_equal(found[1].reshape(seen.shape), (whole[..., 1] + 1) % 6)
+    np.testing.assert_array_equal(found[1].reshape(seen.shape), (repeated[..., 1] + 1) % 6)
 
 
 @pytest.mark.parametrize("order", [[4, 3, 2, 1, 0], [1, 3, 0, 4, 2]])

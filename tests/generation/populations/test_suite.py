@@ -1,6 +1,7 @@
-"""Populations on disk: checkpoints and their cards, runs that are killed and go on, the filter, the manifests.
+"""Populations on disk: checkpoints and cards, interrupted and resumed runs, the selection of teammates, manifests.
 
-All four algorithms are trained once, by the shipped profile `smoke`: two members, six updates of 2,048 steps each.
+Each algorithm is trained at most once, by the shipped profile `smoke`: two members, six updates of 2,048 steps each.
+Fast tests train LBRDiv alone.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +62,9 @@ LAYOUT = get_layout("cramped_up")
 SEED = 7
 """Seed of the moment at which a run is killed."""
 SMOKE = load_profile("smoke").teammates
+EACH_ALGORITHM = pytest.mark.parametrize(
+    "algorithm", ["lbrdiv", *(pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS if name != "lbrdiv")]
+)
 CONFIG, WIDTHS = SMOKE.ppo, SMOKE.ppo.widths
 
 CHILD = """
@@ -92,17 +98,22 @@ np.savez(sys.argv[1], **flatten_dict(jax.tree.map(np.asarray, state.params), sep
 """
 
 
+@cache
 def run_of(algorithm: str) -> PopulationRun:
     return PopulationRun(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, compiled_quickly) -> Path:
-    """A suite of all four algorithms on cramped_up. Read only."""
+def trained(tmp_path_factory, compiled_quickly) -> Callable[..., Path]:
+    """Return `trained(*algorithms)`: a suite with at least these populations on cramped_up. Read only."""
     root = tmp_path_factory.mktemp("trained")
-    for algorithm in ALGORITHMS:
-        train_population(run_of(algorithm), root / LAYOUT.name / algorithm)
-    return root
+
+    def train(*algorithms: str) -> Path:
+        for algorithm in algorithms:
+            train_population(run_of(algorithm), population(root, algorithm))
+        return root
+
+    return train
 
 
 def population(root: Path, algorithm: str) -> Path:
@@ -130,12 +141,12 @@ def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[st
 # What a population is on disk.
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@EACH_ALGORITHM
 def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
-    found = list(suite_checkpoints(trained, LAYOUT.name, algorithm))
+    found = list(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm))
     names = [f"{LAYOUT.name}/{algorithm}/m{m}/c{c}" for m in range(2) for c in range(5)]
     assert [point.path for point in found] == names
-    folder = population(trained, algorithm)
+    folder = population(trained(algorithm), algorithm)
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
     assert len(set(weights(folder).values())) == 10 + len(responses), "all differ"
@@ -143,9 +154,9 @@ def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
     assert not list(folder.glob("resume*"))
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@EACH_ALGORITHM
 def test_cards_say_what_a_checkpoint_is(trained, algorithm):
-    for number, point in enumerate(suite_checkpoints(trained, LAYOUT.name, algorithm)):
+    for number, point in enumerate(suite_checkpoints(trained(algorithm), LAYOUT.name, algorithm)):
         member, checkpoint = divmod(number, 5)
         card = point.card
         assert (card["algorithm"], card["layout"], card["seed"]) == (algorithm, "cramped_up", 0)
@@ -160,8 +171,19 @@ def test_cards_say_what_a_checkpoint_is(trained, algorithm):
 
 
 def test_a_cards_return_is_that_checkpoints_own(trained):
-    """With its best response or itself, evaluated anew."""
-    folder = population(trained, "fcp")
+    """Evaluate the final members with their best responses again."""
+    folder = population(trained("lbrdiv"), "lbrdiv")
+    loaded = [load_policy(folder / f"m{m}/c4") for m in range(2)]
+    members = stacked([params for _, params, _ in loaded])
+    responses = stacked([load_policy(folder / f"responses/m{m}")[1] for m in range(2)])
+    for name, greedy in (("return", False), ("teammate_return", True)):
+        returns = cross_play.paired_returns(LAYOUT, loaded[0][0], responses, members, greedy=greedy)
+        assert [card[name] for _, _, card in loaded] == returns.tolist()
+
+
+@pytest.mark.slow
+def test_a_members_return_is_with_itself_without_best_responses(trained):
+    folder = population(trained("fcp"), "fcp")
     for checkpoint in (0, 4):
         loaded = [load_policy(folder / f"m{m}" / f"c{checkpoint}") for m in range(2)]
         members = stacked([params for _, params, _ in loaded])
@@ -170,9 +192,10 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
             assert [card[name] for _, _, card in loaded] == returns.tolist()
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@EACH_ALGORITHM
 def test_the_log_has_a_line_for_each_update(trained, algorithm):
-    lines = [json.loads(line) for line in (population(trained, algorithm) / "metrics.jsonl").read_text().splitlines()]
+    folder = population(trained(algorithm), algorithm)
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     stages = 2 if algorithm == "comedi" else 1
     assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
     for line in lines:
@@ -182,28 +205,30 @@ def test_the_log_has_a_line_for_each_update(trained, algorithm):
         meets_others = algorithm in ("brdiv", "lbrdiv") or line["stage"] > 0
         assert ("cross_play" in line) == (ended and meets_others)
         np.testing.assert_allclose(line["shaping"], max(0, 1 - line["update"] * 2048 / 6144), atol=1e-6)
-    timing = [json.loads(line) for line in (population(trained, algorithm) / "timing.jsonl").read_text().splitlines()]
+    timing = [json.loads(line) for line in (folder / "timing.jsonl").read_text().splitlines()]
     assert [(line["stage"], line["update"]) for line in timing] == [(line["stage"], line["update"]) for line in lines]
     assert all(line["steps_per_second"] > 0 for line in timing)
-    assert (population(trained, algorithm) / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_as_a_teammate_seat_1_alone_is_greedy(trained, monkeypatch):
-    network, params, _ = load_policy(population(trained, "fcp") / "m0/c4")
+def test_only_the_teammate_is_greedy(monkeypatch):
+    network = ActorCritic(WIDTHS)
+    params = jax.eval_shape(lambda key: stacked([network.untrained(key, LAYOUT.channels)]), jax.random.key(0))
     made = []
 
-    def player(env, network, params, places, partner, greedy):
-        made.append((bool((places >= places.size).all()), greedy))
-        return network_player(env, network, params, places, partner, greedy)
+    def player(env, network, params, agent_slots, partner, greedy):
+        made.append((bool((agent_slots >= agent_slots.size).all()), greedy))
+        return network_player(env, network, params, agent_slots, partner, greedy)
 
     monkeypatch.setattr(cross_play, "network_player", player)
     for greedy in (False, True):
-        cross_play.paired_returns(LAYOUT, network, stacked([params]), stacked([params]), episodes=2, greedy=greedy)
+        play = cross_play._compiled.__wrapped__(LAYOUT, WIDTHS, 0, (0,), (0,), 2, greedy)
+        jax.eval_shape(play, params, params, jax.random.key(0))
     assert made == [(False, False), (True, False), (False, False), (True, True)]
 
 
-def test_the_play_matrix_seats_best_responses_opposite_members(trained):
-    folder = population(trained, "brdiv")
+def test_the_play_matrix_pairs_best_responses_with_members(trained):
+    folder = population(trained("lbrdiv"), "lbrdiv")
     network, _, _ = load_policy(folder / "m0/c4")
     members, responses = (
         stacked([load_policy(folder / where.format(m))[1] for m in range(2)]) for where in ("m{}/c4", "responses/m{}")
@@ -211,29 +236,33 @@ def test_the_play_matrix_seats_best_responses_opposite_members(trained):
     expected = cross_play.cross_play_returns(LAYOUT, network, responses, members)
     assert expected.shape == (2, 2)
     assert len(np.unique(expected)) > 1
-    np.testing.assert_array_equal(play_matrix(trained, LAYOUT, "brdiv"), expected)
+    np.testing.assert_array_equal(play_matrix(trained("lbrdiv"), LAYOUT, "lbrdiv"), expected)
 
 
-def test_every_result_plays_as_a_teammate_in_both_seats(trained):
-    env, tables = Environment(LAYOUT), 3
-    for seat in (EGO, TEAMMATE):
-        first = learned.build_learned(LAYOUT, population(trained, "fcp") / "m0/c0")
+@pytest.mark.parametrize(
+    ("agents", "algorithms"),
+    [([TEAMMATE], ["lbrdiv"]), pytest.param([EGO, TEAMMATE], ALGORITHMS, marks=pytest.mark.slow)],
+)
+def test_every_checkpoint_acts_as_either_agent(trained, agents, algorithms):
+    env, envs, root = Environment(LAYOUT), 3, trained(*algorithms)
+    for agent in agents:
+        first = learned.build_learned(LAYOUT, population(root, algorithms[0]) / "m0/c0")
 
-        def play(params, seat=seat, policy=first):
-            players = [policy_player(env, policy, params, seat, tables), random_player(1 - seat, tables)]
-            seats = init_rollout(env, players, jax.random.split(jax.random.key(0), tables))
-            return roll_out(env, players, seats, 30, jax.random.key(1))[1].actions[..., seat]
+        def play(params, agent=agent, policy=first):
+            players = [policy_player(env, policy, params, agent, envs), random_player(1 - agent, envs)]
+            carry = init_rollout(env, players, jax.random.split(jax.random.key(0), envs))
+            return roll_out(env, players, carry, 30, jax.random.key(1))[1].actions[..., agent]
 
         play, seen = jax.jit(play), set()
-        for algorithm in ALGORITHMS:
-            for point in suite_checkpoints(trained, LAYOUT.name, algorithm):
-                policy = learned.build_learned(LAYOUT, trained / point.path)
+        for algorithm in algorithms:
+            for point in suite_checkpoints(root, LAYOUT.name, algorithm):
+                policy = learned.build_learned(LAYOUT, root / point.path)
                 assert policy.act is first.act
                 seen.add(np.asarray(play(policy.params)).tobytes())
         assert len(seen) > 4, "policies act differently"
 
 
-# Runs that stop and go on.
+# Interrupted runs.
 
 
 @pytest.mark.slow
@@ -254,7 +283,7 @@ def test_a_killed_run_resumes_to_the_same_policies(trained, tmp_path):
     train_population(run_of("comedi"), folder, lambda update, updates, metrics: done.append(update))
     assert done[-1] == 12
     assert moment == 1 or len(done) < 12, f"killed after update {moment}, but began at {done[0]}"
-    assert weights(folder) == weights(population(trained, "comedi")), f"killed after update {moment}"
+    assert weights(folder) == weights(population(trained("comedi"), "comedi")), f"killed after update {moment}"
     assert is_population_finished(folder, run_of("comedi"))
 
 
@@ -275,7 +304,7 @@ def stopped(tmp_path, monkeypatch) -> Path:
     return tmp_path / "lbrdiv"
 
 
-def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(trained, stopped):
+def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(trained, stopped):
     before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
     with pytest.raises(
         OptionError,
@@ -287,20 +316,20 @@ def test_a_stopped_run_goes_on_with_its_multipliers_and_only_under_its_settings(
     done: list[int] = []
     train_population(run_of("lbrdiv"), stopped, lambda update, updates, metrics: done.append(update))
     assert done == [6]
-    whole = population(trained, "lbrdiv")
-    assert weights(stopped) == weights(whole)
-    assert not compare_rebuilds(stopped, whole).differences
+    uninterrupted = population(trained("lbrdiv"), "lbrdiv")
+    assert weights(stopped) == weights(uninterrupted)
+    assert not compare_rebuilds(stopped, uninterrupted).differences
 
 
-def test_a_run_beside_another_in_the_same_folder_is_refused(tmp_path):
+def test_a_folder_takes_one_run_at_a_time(tmp_path):
     with run_lock(tmp_path / "fcp"), pytest.raises(BusyError, match="another process works in"):
         train_population(run_of("fcp"), tmp_path / "fcp")
 
 
 @pytest.mark.parametrize("name", [f"m0/c0/{POLICY_WEIGHTS}", f"m1/c4/{POLICY_CARD}", f"responses/m1/{POLICY_WEIGHTS}"])
 def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained, tmp_path, name):
-    folder, run = tmp_path / "brdiv", run_of("brdiv")
-    shutil.copytree(population(trained, "brdiv"), folder)
+    folder, run = tmp_path / "lbrdiv", run_of("lbrdiv")
+    shutil.copytree(population(trained("lbrdiv"), "lbrdiv"), folder)
     assert is_population_finished(folder, run)
     content = bytearray((folder / name).read_bytes())
     content[len(content) // 2] ^= 1
@@ -311,7 +340,7 @@ def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained,
 
 
 def test_a_population_of_other_settings_is_not_finished(trained):
-    folder, run = population(trained, "fcp"), run_of("fcp")
+    folder, run = population(trained("lbrdiv"), "lbrdiv"), run_of("lbrdiv")
     others = [
         replace(run, seed=1),
         replace(run, members=3),
@@ -335,8 +364,8 @@ def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
 @pytest.mark.slow
 def test_a_population_learns_the_same_on_two_devices(tmp_path):
     """To rounding: half of the policies on each device, one update."""
-    (whole,) = run_of("fcp").stages
-    state, _ = jax.jit(whole.update)(jax.jit(whole.init)(jax.random.fold_in(jax.random.key(0), 0)))
+    (stage,) = run_of("fcp").stages
+    state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
     process = child(TWO_DEVICES, str(tmp_path / "weights.npz"), devices=2)
     process.communicate(timeout=300)
     assert process.returncode == 0
@@ -346,7 +375,7 @@ def test_a_population_learns_the_same_on_two_devices(tmp_path):
         np.testing.assert_allclose(found[name], leaf, rtol=0, atol=1e-4, err_msg=name)
 
 
-# The filter and the manifests.
+# Selection and manifests.
 
 
 def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
@@ -435,8 +464,8 @@ def test_manifests_read_back(candidates, tmp_path):
         tasks = read_tasks(path)
         assert tasks == make_tasks(root, selections, split)
         first = 20 if split == "heldout" else 0
-        place = layout_number(LAYOUT.name) + 1
-        numbers = [10_000 * place + 1_000 * a + first + n for a in range(4) for n in range(count)]
+        layout = layout_number(LAYOUT.name) + 1
+        numbers = [10_000 * layout + 1_000 * a + first + n for a in range(4) for n in range(count)]
         assert [task.seed for task in tasks] == numbers
         assert {task.split for task in tasks} == {split}
         assert [task.teammate_kind for task in tasks] == [a for a in ALGORITHMS for _ in range(count)]
@@ -455,17 +484,18 @@ def test_tracks_without_teammates_have_no_manifest(tmp_path):
 
 
 def test_a_tasks_teammate_is_built_and_another_hash_refused(trained, tmp_path):
-    points = list(suite_checkpoints(trained, LAYOUT.name, "comedi"))
-    tasks = make_tasks(trained, [TeammateSelection(LAYOUT.name, "comedi", 10, 10, points, [])], "train")
+    root = trained("lbrdiv")
+    points = list(suite_checkpoints(root, LAYOUT.name, "lbrdiv"))
+    tasks = make_tasks(root, [TeammateSelection(LAYOUT.name, "lbrdiv", 10, 10, points, [])], "train")
     write_tasks(tmp_path / "tasks.jsonl", tasks)
     for task, point in zip(read_tasks(tmp_path / "tasks.jsonl"), points, strict=True):
-        built: Any = learned.build_learned_entry(task.layout, task.teammate, trained)
-        expected = load_policy(trained / point.path)[1]["params"]["actor"]["kernel"]
+        built: Any = learned.build_learned_entry(task.layout, task.teammate, root)
+        expected = load_policy(root / point.path)[1]["params"]["actor"]["kernel"]
         np.testing.assert_array_equal(built.params["params"]["actor"]["kernel"], expected)
 
     wrong = tasks[0].teammate | {"theta": tasks[0].teammate["theta"] | {"sha256": "0" * 64}}
     with pytest.raises(TaskFormatError, match=f"expected {'0' * 64} as in the task"):
-        learned.build_learned_entry(LAYOUT, wrong, trained)
+        learned.build_learned_entry(LAYOUT, wrong, root)
     write_tasks(tmp_path / "wrong.jsonl", [replace(tasks[0], teammate=wrong)])
     with pytest.raises(TaskFormatError, match=r"line 1: task_id .* does not match the task's content"):
         read_tasks(tmp_path / "wrong.jsonl")

@@ -1,4 +1,4 @@
-"""The whole rebuild at its smallest: collect, resume, pack, verify, sample; the learner's speed."""
+"""The smallest complete rebuild: collect, resume, package, verify, sample; the learner's speed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from tests.helpers.tiny import LEARNED, TINY, artefact
 
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
-def test_releases_are_whole_and_replay(built, kind):
+def test_releases_verify_and_replay(built, kind):
     report = verify_release(built / "a" / kind, level="deep")
     assert report.ok, report.findings
     assert (report.histories, report.transitions) == (3, 3 * 500)
@@ -175,7 +175,7 @@ def test_the_teammate_can_be_rebuilt(built):
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory) -> Path:
-    """A rebuild beside learned teammates, of which none is too bad to be one. Read only."""
+    """A rebuild with learned teammates, all of which pass the selection. Read only."""
     out = tmp_path_factory.mktemp("learned")
     (out / "learned.toml").write_text(LEARNED)
     with pytest.MonkeyPatch.context() as patch:
@@ -186,7 +186,7 @@ def learned(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned):
-    """The whole recorded episode: what the rebuilt teammate does on its observations is what it did."""
+    """On the observations of a complete recorded episode, the rebuilt teammate takes the recorded actions."""
     dataset = load_icrl4aht(learned / "lite")
     assert [task.teammate_kind for task in dataset.entries[::3]] == ["fcp", "brdiv"]
     assert {entry.teammate_family for entry in dataset.entries} == {"rl"}
@@ -231,7 +231,7 @@ def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_rebuilds_whose_teammates_have_the_same_place_in_their_suites(learned, tmp_path, monkeypatch):
+def test_two_rebuilds_whose_teammates_have_the_same_path_in_their_suites(learned, tmp_path, monkeypatch):
     """Another seed, another suite folder; together the releases hold all four teammates."""
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     arguments = ["generate", "--profile", str(learned / "learned.toml"), "--out", str(tmp_path / "out")]
@@ -273,7 +273,7 @@ with filelock.FileLock(sys.argv[1]):
 
 
 class Heard(StringIO):
-    """Calls `then` once it has been told `message`."""
+    """Calls `then` at the first occurrence of `message`."""
 
     def __init__(self, message: str, then: Callable[[], object]) -> None:
         super().__init__()
@@ -360,8 +360,10 @@ def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
 
 
 def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr("generation.populations.build.build_suite", lambda *arguments: asked.append(dict(arguments[2])))
+    requests = []
+    monkeypatch.setattr(
+        "generation.populations.build.build_suite", lambda *arguments: requests.append(dict(arguments[2]))
+    )
     path = tmp_path / "own.toml"
     path.write_text((FOLDER / "mini.toml").read_text().replace(', "comedi"]', "]"))
 
@@ -376,14 +378,14 @@ def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, mo
     ):
         assert teammates(*options).exit_code == 0, options
     everywhere = load_profile(str(path)).algorithms
-    assert asked == [
+    assert requests == [
         {layout: list(names) for layout, names in everywhere.items()},
         {layout: ["fcp"] if "fcp" in names else [] for layout, names in everywhere.items()},
         {layout: list(ALGORITHMS) for layout in load_profile("smoke").layouts},
         {"cramped_up": ("comedi",)},
     ]
     assert isinstance(teammates("--profile", str(path), "--algorithm", "comedi").exception, OptionError)
-    assert len(asked) == 4
+    assert len(requests) == 4
 
 
 def test_unknown_profile_is_one_line(tmp_path):

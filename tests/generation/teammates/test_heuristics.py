@@ -1,5 +1,5 @@
-"""The heuristic teammates: the published play, digit by digit, the published means, every family on every layout from
-both slots, rules that no published play reaches, their noise, and the registry."""
+"""The heuristic teammates: the published play, digit by digit, the published means, every family on every layout as
+either agent, rules that no published play reaches, and their noise."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from generation.teammates.registry import (
     heuristic_teammate,
     sample_teammate,
 )
-from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, PLATE, Layout
@@ -54,7 +53,7 @@ test_simple (5,2) 000 assembly_line 3 034045414235045121503305143143441435051124
 test_simple (5,2) 000 assembly_line 4 344425134444124444444443142444443444124434444142444444444444
 test_simple (5,2) 000 utility_greedy 0 030512503051250305125325124444444444444450530512503051250305
 """
-"""layout, the teammate's start, recipe, family, instance, 60 actions in the published ids; the ego stands at (1, 1),
+"""layout, the teammate's start, recipe, family, instance, 60 actions in the published ids; the ego is at (1, 1),
 both face up, and the recipe stays. By an independent simulator of the published teammates."""
 PLAYS = [line.split() for line in PUBLISHED_PLAY.split("\n")[1:-1]]
 
@@ -62,7 +61,7 @@ PUBLISHED_MEANS = {
     "coord_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.2, 0.0], H4: [40.0] * 5},
     "test_simple": {H1: [0] * 5, H2: [0] * 5, H3: [20.0, 20.0, 0.0, 9.8, 0.0], H4: [40.0] * 5},
 }
-"""Mean returns of t0..t4 beside an ego that always stays, 500 episodes of 100 steps, by the same simulator."""
+"""Mean returns of t0..t4 with an ego that always stays, 500 episodes of 100 steps, by the same simulator."""
 
 NOISE = """
 0 1 0.403646 0.557784 0.155612 0.673338
@@ -89,8 +88,10 @@ def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 @lru_cache
 def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.ndarray]:
-    """100 steps of t0..t4 in agent 1 under the published noise beside an ego that stays: actions and returns
-    (100, 5, N), (5, N). The last episode starts from the published scene and its recipe stays."""
+    """Return actions (100, 5, N) and returns (5, N) of t0..t4 as agent 1 with an ego that stays, under published noise.
+
+    The last episode starts from the published scene and its recipe stays.
+    """
     layout = LAYOUTS[name]
     thetas = published_thetas(name, family)
     policy = build_teammate(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
@@ -122,7 +123,7 @@ def test_published_actions(line):
     assert "".join(str(PUBLISHED_ACTIONS.index(ACTIONS[action])) for action in actions) == digits
 
 
-@pytest.mark.parametrize("name", PUBLISHED_MEANS)
+@pytest.mark.parametrize("name", ["test_simple", pytest.param("coord_simple", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
 def test_published_means(name, family):
     returns = played(name, family)[1][:, :-1]
@@ -156,10 +157,13 @@ ALL_SLOTS = tuple((family, slot) for family in HEURISTIC_FAMILIES for slot in (0
 
 
 @lru_cache
-def table(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_SLOTS) -> tuple[dict, Callable]:
-    """Policies by seat, and one program for them all: params and memories (ROWS, ...) in order of the slots, records
-    (ROWS, S) -> actions and memories."""
-    policies = {seat: build_teammate(layout, heuristic_teammate(seat[0], "default", 0), seat[1]) for seat in slots}
+def compiled_teammates(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_SLOTS) -> tuple[dict, Callable]:
+    """Return the policies by (family, agent), and one program for all of them.
+
+    The program maps parameters and memories (ROWS, ...), in the order of the slots, and records (ROWS, S) to actions
+    and memories.
+    """
+    policies = {slot: build_teammate(layout, heuristic_teammate(slot[0], "default", 0), slot[1]) for slot in slots}
 
     def act(params, memories, record):
         key = jax.random.key(0)
@@ -169,15 +173,15 @@ def table(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_SLOTS) -> tup
 
 
 def act_all(layout: Layout, slots, params: dict, memories: dict, records: np.ndarray) -> dict:
-    _, act = table(layout, slots)
-    return dict(zip(slots, act(*([part[seat] for seat in slots] for part in (params, memories)), records), strict=True))
+    _, act = compiled_teammates(layout, slots)
+    return dict(zip(slots, act(*([part[slot] for slot in slots] for part in (params, memories)), records), strict=True))
 
 
 @lru_cache
 def first_memories(layout: Layout, slots=ALL_SLOTS) -> dict:
     keys = jax.random.split(jax.random.key(4), ROWS)
-    policies, _ = table(layout, slots)
-    return {seat: jax.vmap(p.init, (None, 0))(p.params, keys) for seat, p in policies.items()}
+    policies, _ = compiled_teammates(layout, slots)
+    return {slot: jax.vmap(p.init, (None, 0))(p.params, keys) for slot, p in policies.items()}
 
 
 @lru_cache
@@ -194,14 +198,14 @@ def many_params(name: str) -> dict:
     return params
 
 
-DEFAULT_LAYOUTS = ("coord_ring", "demo_wide", "cramped_up")
+DEFAULT_LAYOUTS = ("cramped_down", "asymm_right", "demo_wide")  # those whose teammates other tests compile too
 
 
 @pytest.mark.parametrize(
     "name", [name if name in DEFAULT_LAYOUTS else pytest.param(name, marks=pytest.mark.slow) for name in LAYOUTS]
 )
-def test_every_family_plays_every_layout_from_both_seats(name):
-    """Row i is a game of family i % 4 with itself, at which the others look."""
+def test_every_family_plays_every_layout_as_either_agent(name):
+    """In row i, family i % 4 plays with itself; the other families see the same states."""
     layout = LAYOUTS[name]
     rng = np.random.default_rng(2)
     params, memories = many_params(name), first_memories(layout)
@@ -209,8 +213,8 @@ def test_every_family_plays_every_layout_from_both_seats(name):
     records = random_records(layout, ROWS, rng)
     for _ in range(25):
         acted = act_all(layout, ALL_SLOTS, params, memories, records)
-        memories = {seat: memory for seat, (_, memory) in acted.items()}
-        actions = np.stack([acted[seat][0] for seat in ALL_SLOTS])
+        memories = {slot: memory for slot, (_, memory) in acted.items()}
+        actions = np.stack([acted[slot][0] for slot in ALL_SLOTS])
         assert actions.dtype == np.int32
         assert set(np.unique(actions)) <= set(range(len(ACTIONS)))
         played = actions.reshape(4, 2, ROWS)[np.arange(ROWS) % 4, :, np.arange(ROWS)]
@@ -221,7 +225,7 @@ def test_every_family_plays_every_layout_from_both_seats(name):
 
 # Rules that no published play reaches: what a teammate does in one scene, without noise.
 
-ZERO, ONE = 4, 16  # ingredients 0 and 1 in the kitchens below
+ZERO, ONE = 4, 16  # ingredients 0 and 1 in the layouts below
 SOUP_0 = 3 * ZERO | COOKED
 DISH_0 = SOUP_0 | PLATE
 MIXED = 2 * ZERO + ONE
@@ -230,15 +234,15 @@ MIXED = 2 * ZERO + ONE
 def one_step(
     layout: Layout, family: str, slot: int, theta: dict[str, float], mine, partner, memory=None, **fields
 ) -> tuple[str, Any]:
-    """What a teammate at `mine` (x, y, facing, item in hand) does beside `partner`: action name and memory."""
+    """Return the action name and memory of a teammate at `mine` (x, y, facing, item in hand), given `partner`."""
     slots = ALL_SLOTS if layout.name in LAYOUTS else ((family, slot),)
     agents = (mine, partner) if slot == 0 else (partner, mine)
-    fields["hands"] = [place[3] for place in agents]
+    fields["hands"] = [agent[3] for agent in agents]
     records = np.repeat(state_record(layout, agents[0][:3], agents[1][:3], **fields), ROWS, axis=0)
     memories = first_memories(layout, slots)
     mind = memories[family, slot]
     mind = mind._replace(**{name: np.full_like(getattr(mind, name), v) for name, v in (memory or {}).items()})
-    params = {seat: stacked(seat[0], [HEURISTIC_FAMILIES[seat[0]].defaults] * ROWS) for seat in slots}
+    params = {own: stacked(own[0], [HEURISTIC_FAMILIES[own[0]].defaults] * ROWS) for own in slots}
     params[family, slot] = stacked(family, [HEURISTIC_FAMILIES[family].defaults | theta] * ROWS)
     actions, after = act_all(layout, slots, params, memories | {(family, slot): mind}, records)[family, slot]
     assert len(set(actions.tolist())) == 1
@@ -256,7 +260,7 @@ CRAMPED_CASES = [
     # H1: round the partner, or push.
     (H1, {}, {}, "1 32- 12- left, 1 32- 22- up, 0 21d 31- down, 0 210 22- right, 0 120 22- right, 0 32- 22- up"),
     (H1, {}, DONE, "0 21p 22- right, 1 21p 32d down"),
-    # H1 agent 1 leaves the pot to a partner who brings an ingredient and is about as near.
+    # H1 agent 1 leaves the pot to a partner who carries an ingredient and is about as near.
     (H1, {}, {}, "1 220v 210 right, 1 220v 110 interact, 1 220v 21p interact, 0 220v 210 interact, 0 21d 32- right"),
     # H1 specialists: agent 1 fetches no plate while the partner has none; agent 0 puts its dish down.
     (H1, SPECIALIST, {}, "1 21- 32- down, 1 21- 32p left, 0 21d 32- interact"),
@@ -270,11 +274,11 @@ CRAMPED_CASES = [
     (H2, {"yield_bias": 0.05}, {}, "1 21- 12- left, 1 32- 22- up"),
     (H2, {"yield_bias": 0.3}, {}, "0 32- 22- up"),
     (H2, {"yield_bias": 0.2}, {}, "0 32- 22- left"),
-    # H2 picks up what lies on a counter; lays down a plate that nothing needs.
+    # H2 picks up items from counters and lays down a plate that no soup needs.
     (H2, {}, {"counters": {(2, 0): ONE}}, "1 21- 32- interact"),
     (H2, {}, {}, "1 21p 32- interact"),
     (H2, {}, FULL, "1 22pv 32- stay"),
-    # H2, strict, for want of a goal or pile of its own uses the other's.
+    # A strict H2 without a goal or pile in its territory uses the other's.
     (H2, {"strictness": 1.0}, {"recipe": 3 * ONE}, "0 21d 32- right, 0 11- 32- right"),
     # H3 agent 1, empty-handed, makes room for a partner who carries something; agent 0 does not.
     (H3, {}, {}, "1 21- 11p right, 1 31- 21p down, 1 21- 220 right, 1 32- 31d left, 0 21- 11p left"),
@@ -288,13 +292,13 @@ CRAMPED_CASES = [
     (H3, {"plate_urgency": 0.5}, FULL, "0 21- 32- down"),
     (H3, PLATER, {}, "0 210 32- interact"),
     (H3, RUNNER, DONE, "0 21p 32- interact, 0 210 32- interact"),
-    # H3 hands an ingredient off beside the pot, in the middle, or near the partner.
+    # H3 hands an ingredient off next to the pot, in the middle, or near the partner.
     (H3, RUNNER | {"handoff_style": 0}, FULL, "0 210 32- down"),
     (H3, RUNNER | {"handoff_style": 1}, FULL, "0 210 32- interact"),
     (H3, RUNNER | {"handoff_style": 2}, FULL, "0 210 32- right"),
 ]
 ASYMM_CASES = [
-    # H1 brings an ingredient to the pot that lacks it, or to any.
+    # H1 carries an ingredient to the pot that misses it, or to any.
     (H1, {}, {"recipe": MIXED, "pot_items": [0, 2 * ZERO]}, "1 530< 13- up, 1 531< 13- interact"),
     (H1, {}, {"pot_items": [0, ZERO]}, "1 531< 13- interact"),
     # An H2 that invades takes no plate of its own side, and wanders, unless soups pile up.
@@ -307,7 +311,7 @@ DEMO_CASES = [
     (H3, {}, {}, "1 13- 51- down"),
 ]
 SCENES = {"cramped_down": CRAMPED_CASES, "asymm_right": ASYMM_CASES, "demo_wide": DEMO_CASES}
-"""Family, parameters, state, and moves: seat; x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (up if not
+"""Family, parameters, state, and moves: agent; x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (up if not
 given) of itself; the same of the partner; the action. cramped_down has floor at (1..3, 1..2), plates at (1, 0), the
 goal at (3, 0), pile 0 at (0, 1), pile 1 at (4, 1) and the pot at (2, 3); asymm_right has pots at (4, 2) and (4, 3)."""
 
@@ -326,7 +330,7 @@ def test_scenes(case):
 @pytest.mark.parametrize(
     ("cell", "stuck", "expected", "stuck_after"), [(7, 3, "right", 4), (8, 3, "right", 0), (7, 2, "interact", 3)]
 )
-def test_h2_wanders_after_four_looks_at_one_cell(cell, stuck, expected, stuck_after):
+def test_h2_wanders_after_four_steps_at_one_cell(cell, stuck, expected, stuck_after):
     memory, counters = {"cell": cell, "stuck": stuck}, {(2, 0): ONE}
     mine, partner = (2, 1, "up", 0), (3, 2, "up", 0)
     action, after = one_step(LAYOUTS["cramped_down"], H2, 1, {}, mine, partner, memory, counters=counters)
@@ -350,14 +354,14 @@ def test_h2_territories_are_the_written_ones(name):
     for slot, split, m, mode in [(s, k, m, b) for s in (0, 1) for k in (0, 1, 2) for m in (0, 2) for b in (0, 5)]:
         params = {"split_mode": jnp.int32(split), "shared_margin": jnp.int32(m), "behavior_mode": jnp.int32(mode)}
         areas = territory.areas(Scene(Paths(layout), jnp.asarray(record), slot), params)
-        seat = 1 - slot if mode == territory.INVADER else slot
+        side = 1 - slot if mode == territory.INVADER else slot
         if split == territory.STATIONS and stations:
-            strict = (to_prep < to_service, to_service <= to_prep)[seat]
-            relaxed = (to_prep < to_service + 1.5 * m, to_service < to_prep + 1.5 * m)[seat]
+            strict = (to_prep < to_service, to_service <= to_prep)[side]
+            relaxed = (to_prep < to_service + 1.5 * m, to_service < to_prep + 1.5 * m)[side]
         else:
             along, middle = (y, layout.height // 2) if split == territory.HORIZONTAL else (x, layout.width // 2)
-            strict = (along < middle, along >= middle)[seat]
-            relaxed = (along < middle + m, along >= middle - m)[seat]
+            strict = (along < middle, along >= middle)[side]
+            relaxed = (along < middle + m, along >= middle - m)[side]
         np.testing.assert_array_equal(areas.strict, strict)
         np.testing.assert_array_equal(areas.relaxed, relaxed)
 
@@ -390,14 +394,14 @@ def test_links_of_the_key_chain(family, theta, hand, expected):
 @pytest.mark.parametrize("stubbornness", [0.0, 0.1])
 def test_h3_wrong_moves_are_the_keys_own(stubbornness):
     """The chain's next key is split once more, and the second half draws one of right, down, left, up."""
-    layout, seat = LAYOUTS["demo_wide"], (H3, 1)
+    layout, slot = LAYOUTS["demo_wide"], (H3, 1)
     records = np.repeat(state_record(layout, (5, 1, "up"), (4, 3, "up")), ROWS, axis=0)
     memories = first_memories(layout)
     params = many_params("demo_wide") | {
-        seat: stacked(H3, [ASSEMBLY_LINE.defaults | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)
+        slot: stacked(H3, [ASSEMBLY_LINE.defaults | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)
     }
-    actions, after = act_all(layout, ALL_SLOTS, params, memories, records)[seat]
-    for action, key, start in zip(actions, after.key, memories[seat].key, strict=True):
+    actions, after = act_all(layout, ALL_SLOTS, params, memories, records)[slot]
+    for action, key, start in zip(actions, after.key, memories[slot].key, strict=True):
         own = jax.random.split(jax.random.split(start)[0])[1]
         drawn = PUBLISHED_ACTIONS[int(jax.random.randint(own, (), 0, 4))]
         assert stubbornness or ACTIONS[action] == drawn
@@ -406,7 +410,7 @@ def test_h3_wrong_moves_are_the_keys_own(stubbornness):
 
 
 UNSIGNED = Layout("unsigned", "test_unsigned", ("WWLWPWW", "0A   AX", "1     B", "WWWWWWW"))
-"""Nothing shows the recipe but the button."""
+"""A layout where only the button shows the recipe."""
 SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
 
 
@@ -423,91 +427,9 @@ SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
         (SURE, {}, FULL | {"buttons": [5]}, "stay", 1),
     ],
 )
-def test_h1_asks_the_button(theta, memory, fields, expected, steps):
+def test_h1_presses_the_button_for_the_recipe(theta, memory, fields, expected, steps):
     action, after = one_step(UNSIGNED, H1, 1, theta, (4, 1, "up", 0), (5, 2, "up", 0), memory, **fields)
     assert action == expected
     start = first_memories(UNSIGNED, ((H1, 1),))[H1, 1].key[0]
     assert jax.random.key_data(after.key).tolist() == links(start, steps)
     assert int(after.recipe) == (3 * ZERO if fields.get("buttons") else memory.get("recipe", 0))
-
-
-# The registry.
-
-
-@pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
-def test_missing_and_unknown_parameters(family):
-    theta = dict(HEURISTIC_FAMILIES[family].defaults)
-    first = next(iter(theta))
-    theta[f"{first}_"] = theta.pop(first)
-    with pytest.raises(TaskFormatError, match=rf"{family}: missing parameters \['{first}'\].*\['{first}_'\]"):
-        build_teammate(LAYOUTS["demo_wide"], {"family": family, "theta": theta})
-
-
-@pytest.mark.parametrize(
-    ("family", "name", "value", "expected"),
-    [
-        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number in 0..1\)"),
-        (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected an integer from 0\)"),
-        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected an integer in 0..5\)"),
-        (H2, "shared_margin", True, r"shared_margin = True \(expected an integer from 0\)"),
-        (H3, "role_mode", -1, r"role_mode = -1 \(expected an integer in 0..2\)"),
-        (H4, "inertia", None, r"inertia = None \(expected a number in 0..1\)"),
-    ],
-)
-def test_impossible_parameters(family, name, value, expected):
-    with pytest.raises(TaskFormatError, match=f"teammate {family}: out of range: {expected}"):
-        build_teammate(
-            LAYOUTS["demo_wide"], {"family": family, "theta": HEURISTIC_FAMILIES[family].defaults | {name: value}}
-        )
-
-
-def test_unknown_presets_and_splits():
-    with pytest.raises(UnknownNameError, match=r"preset of assembly_line 'plater'.*Did you mean 'plater_deliverer'"):
-        heuristic_teammate(H3, "plater", 0)
-    with pytest.raises(UnknownNameError, match=r"split 'tests'.*Did you mean 'test'"):
-        sample_teammate(H1, 0, "tests")
-    with pytest.raises(UnknownNameError, match=r"teammate family 'territori'.*Did you mean 'territory'"):
-        sample_teammate("territori", 0, "test")
-
-
-RANGES = """
-recipe_aware_button train default,high_L_priority 0.6-1 50,80,100 0-0.4 0.7-1 *1 *1 *0.9 *1 . . . . .
-recipe_aware_button test lazy_learner,strict_adherent 0.2-0.6 100,150,200 0.4-0.9 0.2-0.6 *1 *1 *0.9 *1 . . . . .
-territory train default,flexible 0,1 0-0.3 1,2,3 0.2-0.4 *1 . .
-territory test flexible,object_stations 1,2 0-0.3 1,2,3 0.2-0.4 *1 . .
-assembly_line train default,ingredient_runner 0,2 . 0-0.6 0.2-0.6 *1 . . . . .
-assembly_line test plater_deliverer 1 . 0.6-1 0-0.3 *1 . . . . .
-utility_greedy train default,delivery_focused 8-18 6-14 *8 3-8 *8 *4.5 *12 *7 0.2-0.7 0.1-0.5 *1
-utility_greedy test prep_focused,high_inertia,distance_sensitive 5-12 3-8 *8 7-12 *8 *4.5 *12 *7 0.6-1.2 0.5-0.9 *1
-"""
-"""Family, split, presets, and of every parameter the range low-high, the list, *width of the full range around the
-preset's value, or . for that value: the published code's, for the splits of the paper's App. B.3."""
-
-
-@pytest.mark.parametrize("line", RANGES.split("\n")[1:-1])
-def test_samples_stay_in_their_ranges(line):
-    family, split, presets, *ranges = line.split()
-    heuristic = HEURISTIC_FAMILIES[family]
-    entries = [sample_teammate(family, number, split) for number in range(12)]
-    assert entries == [sample_teammate(family, number, split) for number in range(12)]
-    assert len({str(entry["theta"]) for entry in entries}) == 12
-    assert sample_teammate(family, 0, split, 1)["theta"] != entries[0]["theta"]
-    assert sample_teammate(family, 0, ("train", "test")[split == "train"])["theta"] != entries[0]["theta"]
-    for entry in entries:
-        assert list(entry) == ["kind", "family", "theta_id", "base_seed", "theta"]
-        assert list(entry["theta"]) == list(heuristic.defaults)
-        build_teammate(LAYOUTS["demo_wide"], entry)
-        for (name, value), text in zip(entry["theta"].items(), ranges, strict=True):
-            assert type(value) is type(heuristic.defaults[name])
-            bases = [(heuristic.defaults | heuristic.presets[preset])[name] for preset in presets.split(",")]
-            assert in_range(value, text, bases), (name, value)
-
-
-def in_range(value: float, text: str, bases: list[float]) -> bool:
-    if text == "." or text.startswith("*"):
-        away = 0.2 * float(text[1:] or 0)
-        return min(abs(value - base) for base in bases) <= away + 1e-6
-    if "-" in text:
-        low, high = map(float, text.split("-"))
-        return low - 1e-6 <= value <= high + 1e-6
-    return str(value) in text.split(",")

@@ -27,7 +27,7 @@ from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
 WIDTHS = Widths(pointwise=(4,), spatial=(4,), dense=8, gru=8, head=8)
-STEPS, TABLES = 5, 3
+STEPS, ENVS = 5, 3
 
 
 def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partners: int = 0, seed: int = 0) -> Any:
@@ -45,7 +45,7 @@ def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partner
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
-    """Three checkpoints: a's critic is told one of four partners, b's is not, c is of test_simple."""
+    """Three checkpoints: a's critic distinguishes four partners, b's none; c is for test_simple."""
     root = tmp_path_factory.mktemp("suite")
     save(root / "a", partners=4)
     save(root / "b", seed=1)
@@ -59,26 +59,26 @@ def entry(suite: Path, name: str) -> dict[str, Any]:
 
 
 def states(steps: int, seed: int) -> np.ndarray:
-    """uint8 (steps, TABLES, S)."""
-    return random_records(LAYOUT, steps * TABLES, np.random.default_rng(seed)).reshape(steps, TABLES, -1)
+    """uint8 (steps, ENVS, S)."""
+    return random_records(LAYOUT, steps * ENVS, np.random.default_rng(seed)).reshape(steps, ENVS, -1)
 
 
 def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.ndarray:
-    """What the whole network says of a sequence of states, (T, N, 6)."""
+    """Return the logits (T, N, 6) of the complete network for a sequence of states."""
     obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
-    reset = np.arange(len(record))[:, None] == np.zeros(TABLES)
+    reset = np.arange(len(record))[:, None] == np.zeros(ENVS)
     apply = compiled(network.apply)
-    outputs: Any = apply(params, network.initial_hidden(TABLES), obs, jnp.asarray(reset))
+    outputs: Any = apply(params, network.initial_hidden(ENVS), obs, jnp.asarray(reset))
     return np.asarray(outputs[1], np.float64)
 
 
 def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
     """Actions (T, N) of a policy in N environments with these states, step by step."""
-    player = policy_player(Environment(LAYOUT), policy, policy.params, slot, TABLES)
+    player = policy_player(Environment(LAYOUT), policy, policy.params, slot, ENVS)
     act = compiled(player.act)
-    zero = jnp.zeros(TABLES, jnp.int32)
-    state = EnvState(jax.random.split(jax.random.key(0), TABLES), zero, zero, jnp.asarray(record[0]))
+    zero = jnp.zeros(ENVS, jnp.int32)
+    state = EnvState(jax.random.split(jax.random.key(0), ENVS), zero, zero, jnp.asarray(record[0]))
     memory, actions = player.init(state), []
     for step, now in enumerate(record):
         choice, memory = act(memory, state._replace(record=jnp.asarray(now)), jax.random.key(step))
@@ -119,7 +119,7 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
     greedy, sampled = (learned.build_learned(LAYOUT, suite / "b", action) for action in ("greedy", "sampled"))
     record = states(1, 8)[:, :1]
     params = {"params": save(suite.parent / f"{suite.name}-b", seed=1)["params"]}
-    logits = logits_of(params, 0, np.repeat(record, TABLES, axis=1), TEAMMATE)[0, 0]
+    logits = logits_of(params, 0, np.repeat(record, ENVS, axis=1), TEAMMATE)[0, 0]
     probability = np.exp(logits) / np.exp(logits).sum()
     obs, keys = observe(LAYOUT, record[0, 0], TEAMMATE), jax.random.split(jax.random.key(1), 3000)
 
@@ -136,7 +136,7 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
 
 
 def test_checkpoints_of_one_shape_share_their_functions(suite):
-    """Whatever their critics are told; so that they share compilations."""
+    """Even with different critics, so that they share compilations."""
     one, other = (learned.build_learned(LAYOUT, suite / name) for name in "ab")
     elsewhere = learned.build_learned(get_layout("test_simple"), suite / "c")
     assert one.init is other.init is elsewhere.init

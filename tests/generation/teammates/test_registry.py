@@ -1,0 +1,132 @@
+"""The registry of heuristic teammates: parameters, presets, and sampled teammates of the splits."""
+
+from __future__ import annotations
+
+import pytest
+
+from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
+from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, heuristic_teammate, sample_teammate
+from icrl4aht_data.errors import TaskFormatError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import LAYOUTS
+from tests.generation.teammates.test_utility_greedy import NAMES
+
+H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
+
+
+@pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
+def test_missing_and_unknown_parameters(family):
+    theta = dict(HEURISTIC_FAMILIES[family].defaults)
+    first = next(iter(theta))
+    theta[f"{first}_"] = theta.pop(first)
+    with pytest.raises(TaskFormatError, match=rf"{family}: missing parameters \['{first}'\].*\['{first}_'\]"):
+        build_teammate(LAYOUTS["demo_wide"], {"family": family, "theta": theta})
+
+
+@pytest.mark.parametrize(
+    ("family", "name", "value", "expected"),
+    [
+        (H1, "idle_prob", "often", r"idle_prob = 'often' \(expected a number in 0..1\)"),
+        (H1, "refresh_interval", 99.5, r"refresh_interval = 99.5 \(expected an integer from 0\)"),
+        (H2, "behavior_mode", 6, r"behavior_mode = 6 \(expected an integer in 0..5\)"),
+        (H2, "shared_margin", True, r"shared_margin = True \(expected an integer from 0\)"),
+        (H3, "role_mode", -1, r"role_mode = -1 \(expected an integer in 0..2\)"),
+        (H4, "inertia", None, r"inertia = None \(expected a number in 0..1\)"),
+    ],
+)
+def test_impossible_parameters(family, name, value, expected):
+    with pytest.raises(TaskFormatError, match=f"teammate {family}: out of range: {expected}"):
+        build_teammate(
+            LAYOUTS["demo_wide"], {"family": family, "theta": HEURISTIC_FAMILIES[family].defaults | {name: value}}
+        )
+
+
+def test_unknown_presets_and_splits():
+    with pytest.raises(UnknownNameError, match=r"preset of assembly_line 'plater'.*Did you mean 'plater_deliverer'"):
+        heuristic_teammate(H3, "plater", 0)
+    with pytest.raises(UnknownNameError, match=r"split 'tests'.*Did you mean 'test'"):
+        sample_teammate(H1, 0, "tests")
+    with pytest.raises(UnknownNameError, match=r"teammate family 'territori'.*Did you mean 'territory'"):
+        sample_teammate("territori", 0, "test")
+
+
+RANGES = """
+recipe_aware_button train default,high_L_priority 0.6-1 50,80,100 0-0.4 0.7-1 *1 *1 *0.9 *1 . . . . .
+recipe_aware_button test lazy_learner,strict_adherent 0.2-0.6 100,150,200 0.4-0.9 0.2-0.6 *1 *1 *0.9 *1 . . . . .
+territory train default,flexible 0,1 0-0.3 1,2,3 0.2-0.4 *1 . .
+territory test flexible,object_stations 1,2 0-0.3 1,2,3 0.2-0.4 *1 . .
+assembly_line train default,ingredient_runner 0,2 . 0-0.6 0.2-0.6 *1 . . . . .
+assembly_line test plater_deliverer 1 . 0.6-1 0-0.3 *1 . . . . .
+utility_greedy train default,delivery_focused 8-18 6-14 *8 3-8 *8 *4.5 *12 *7 0.2-0.7 0.1-0.5 *1
+utility_greedy test prep_focused,high_inertia,distance_sensitive 5-12 3-8 *8 7-12 *8 *4.5 *12 *7 0.6-1.2 0.5-0.9 *1
+"""
+"""Family, split, presets, and of every parameter the range low-high, the list, *width of the full range around the
+preset's value, or . for that value: the published code's, for the splits of the paper's App. B.3."""
+
+
+@pytest.mark.parametrize("line", RANGES.split("\n")[1:-1])
+def test_samples_stay_in_their_ranges(line):
+    family, split, presets, *ranges = line.split()
+    heuristic = HEURISTIC_FAMILIES[family]
+    entries = [sample_teammate(family, number, split) for number in range(12)]
+    assert entries == [sample_teammate(family, number, split) for number in range(12)]
+    assert len({str(entry["theta"]) for entry in entries}) == 12
+    assert sample_teammate(family, 0, split, 1)["theta"] != entries[0]["theta"]
+    assert sample_teammate(family, 0, ("train", "test")[split == "train"])["theta"] != entries[0]["theta"]
+    for entry in entries:
+        assert list(entry) == ["kind", "family", "theta_id", "base_seed", "theta"]
+        assert list(entry["theta"]) == list(heuristic.defaults)
+        build_teammate(LAYOUTS["demo_wide"], entry)
+        for (name, value), text in zip(entry["theta"].items(), ranges, strict=True):
+            assert type(value) is type(heuristic.defaults[name])
+            bases = [(heuristic.defaults | heuristic.presets[preset])[name] for preset in presets.split(",")]
+            assert in_range(value, text, bases), (name, value)
+
+
+def in_range(value: float, text: str, bases: list[float]) -> bool:
+    if text == "." or text.startswith("*"):
+        away = 0.2 * float(text[1:] or 0)
+        return min(abs(value - base) for base in bases) <= away + 1e-6
+    if "-" in text:
+        low, high = map(float, text.split("-"))
+        return low - 1e-6 <= value <= high + 1e-6
+    return str(value) in text.split(",")
+
+
+def test_presets_of_h4_are_the_published_ones():
+    published = {
+        "default": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.3, 0.5),
+        "delivery_focused": (15, 12, 8, 3, 2, 1, 4, 2, 0.3, 0.4, 0.3),
+        "prep_focused": (8, 5, 3, 10, 8, 4, 12, 5, 0.4, 0.5, 0.7),
+        "high_inertia": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.7, 0.5),
+        "distance_sensitive": (10, 8, 5, 6, 4, 2, 7, 3, 1.0, 0.3, 0.5),
+    }
+    assert tuple(UTILITY_GREEDY.defaults) == NAMES
+    assert set(UTILITY_GREEDY.presets) == set(published)
+    for name, values in published.items():
+        entry = heuristic_teammate("utility_greedy", name, 3)
+        theta = dict(zip(NAMES, values, strict=True))
+        rest = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 3, "base_seed": 0}
+        assert list(entry.items()) == [*rest.items(), ("theta", theta)], name
+
+
+def test_unknown_family():
+    with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
+        heuristic_teammate("utility_gredy", "default", 0)
+    with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
+        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_gredy", "theta": UTILITY_GREEDY.defaults})
+
+
+def test_unknown_preset_of_h4():
+    with pytest.raises(
+        UnknownNameError, match=r"preset of utility_greedy 'prep_focussed'.*Did you mean 'prep_focused'"
+    ):
+        heuristic_teammate("utility_greedy", "prep_focussed", 0)
+
+
+def test_missing_and_unknown_parameters_of_h4():
+    theta = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "inertia"} | {"w_inertia": 0.3}
+    with pytest.raises(TaskFormatError, match=r"missing parameters \['inertia'\], unknown parameters \['w_inertia'\]"):
+        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": theta})
+    with pytest.raises(TaskFormatError, match=r"missing parameters \['w_deliver'\], unknown parameters \[\]"):
+        without = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "w_deliver"}
+        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": without})
