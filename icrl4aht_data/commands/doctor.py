@@ -81,8 +81,14 @@ def in_words(found: dict[str, Any]) -> Iterator[str]:
 
 def _text(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {_text(v)}" for name, v in value.items() if v is not None)
-    return value if isinstance(value, str) else f"{value:,}" if type(value) is int else json.dumps(value)
+        absent = ["not installed"] if value.get("found", "") is None else []
+        known = (f"{name.replace('_', ' ')} {_text(v)}" for name, v in value.items() if v is not None)
+        return ", ".join([*absent, *known])
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return (
+        {True: "yes", False: "no"}[value] if isinstance(value, bool) else f"{value:,}" if type(value) is int else value
+    )
 
 
 def _packages(problems: list[Problem]) -> dict[str, Any]:

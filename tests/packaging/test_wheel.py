@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -191,9 +192,9 @@ def test_the_reader_works_without_extras(installed, tmp_path):
     assert ": valid; checked" in run("icrl4aht-data", "verify")
     report = run("icrl4aht-data", "doctor")
     assert "no problems found" in report
-    assert "generation, baselines  not here: they run from a checkout of the project" in report
-    assert "JAX" not in report.partition("Devices")[2]
-    assert f"jax               not installed: pip install '{NAME}[generation]'" in report
+    assert "checkout no" in report
+    assert "jax" not in report.partition("Devices")[2]
+    assert re.search(rf"jax +not installed, expected >=0.8, extra generation, install pip install '{NAME}\[gen", report)
     assert f"pip install '{NAME}[plot]'" in run("icrl4aht-data", "show", "--plot", "curves.png", code=1)
     assert not list(tmp_path.glob("*.png"))
 
