@@ -86,9 +86,9 @@ def _text(value: Any) -> str:
         return ", ".join([*absent, *known])
     if isinstance(value, list):
         return ", ".join(map(str, value)) or "none"
-    return (
-        {True: "yes", False: "no"}[value] if isinstance(value, bool) else f"{value:,}" if type(value) is int else value
-    )
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "yes", False: "no"}[value]
+    return f"{value:,}" if isinstance(value, int) else value
 
 
 def _packages(problems: list[Problem]) -> dict[str, Any]:

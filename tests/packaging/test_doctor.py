@@ -59,12 +59,12 @@ def test_no_problems(elsewhere):
     assert facts["ok"], facts["problems"]
     info = read_info(MINI)
     for expected in (
-        f"found {importlib.metadata.version('icrl4aht-data')}, folder {MINI.parent}, checkout true",
+        f"found {importlib.metadata.version('icrl4aht-data')}, folder {MINI.parent}, checkout yes",
         f"found {h5py.version.hdf5_version}, expected >=1.10.5",
         "expected >=0.8, extra generation",
         "backend cpu",
         f"path {elsewhere / 'cache'}, set by ICRL4AHT_CACHE_DIR",
-        "exists false, writable true",
+        "exists no, writable yes",
         "no problems found",
     ):
         assert expected in text
@@ -155,7 +155,7 @@ def test_offline_is_no_problem(elsewhere, monkeypatch):
     monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
     facts, text = run_doctor()
     assert facts["ok"] and facts["network"]["offline"] == ["ICRL4AHT_OFFLINE"]
-    assert '["ICRL4AHT_OFFLINE"]' in text
+    assert "offline  ICRL4AHT_OFFLINE" in text
 
 
 def test_damaged_bundled_release(elsewhere, monkeypatch, damaged):
@@ -201,7 +201,7 @@ def test_installation_without_jax(elsewhere, monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
     facts, text = run_doctor()
     assert facts["ok"] and "jax" not in facts["devices"]
-    assert "checkout false" in text
+    assert "checkout no" in text
 
 
 def test_gpu_that_jax_does_not_use(elsewhere, monkeypatch):
