@@ -6,7 +6,6 @@ Exit codes: 0 success; 1 an error, or a release in which `verify` found a proble
 from __future__ import annotations
 
 import errno
-import math
 import os
 import sys
 import threading
@@ -165,20 +164,9 @@ class NewFile(click.Path):
         return path
 
 
-class _Rate(click.FloatRange):
-    """Positive, finite number; click's range alone accepts nan, which compares false with every bound."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = super().convert(value, param, ctx)
-        if math.isnan(number):
-            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
-        return number
-
-
 SEED = click.IntRange(0, 2**32 - 1)
 COUNT = click.IntRange(min=1)
 COUNT_OR_NONE = click.IntRange(min=0)
-RATE = _Rate(min=0, max=math.inf, min_open=True, max_open=True)
 
 
 def version_option(command: Any) -> Any:
