@@ -27,7 +27,7 @@ import numpy as np
 from generation.collection.record import HistoryArrays, array_shapes, record_rollout
 from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS
 from generation.learners.config import PPOConfig
-from generation.learners.resume import METRICS, TIMING, RunLog, software_versions
+from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
@@ -73,6 +73,7 @@ def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
         "ego": asdict(profile.ego),
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),
+        "xla_threads": xla_threads(),
         "files": {name: file_hash(partial / name) for name in sorted(_HASHED)},
     }
     with atomic_write(partial / METADATA) as unnamed:
