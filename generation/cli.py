@@ -198,6 +198,9 @@ def check(a: Path, b: Path, as_json: bool) -> None:
         for name, difference in compared.differences.items():
             click.echo(f"{name}: {difference}")
         verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+        for folder, threads in zip((a, b), compared.xla_threads, strict=True):
+            numbers = " and ".join(map(str, threads)) or "an unknown number of"
+            click.echo(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
         click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
     sys.exit(1 if compared.differences else 0)
 
