@@ -65,6 +65,8 @@ def _show_progress(job: CollectionJob, tasks: Iterable[Task], board: ProgressBoa
 
 def _work(job: CollectionJob, task: Task) -> str:
     request_determinism()
+    if job.profile.xla_threads:
+        limit_xla_threads(job.profile.xla_threads)
     return job(task)
 
 

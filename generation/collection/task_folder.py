@@ -28,7 +28,7 @@ from generation.collection.record import HistoryArrays, array_shapes, record_rol
 from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
 from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
-from generation.learners.resume import METRICS, TIMING, RunLog, software_versions
+from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
@@ -101,6 +101,7 @@ def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
         "ego": asdict(profile.ego),
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),
+        "xla_threads": xla_threads(),
         "files": {name: file_hash(partial / name) for name in _hashed_files(profile.ego)},
     }
     with atomic_write(partial / METADATA) as unnamed:

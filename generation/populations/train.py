@@ -69,7 +69,8 @@ class PopulationRun:
     Attributes:
         layout: the layout.
         algorithm: one of `ALGORITHMS`.
-        members: policies for the suite.
+        members: policies for the suite. CoMeDi trains one more, the first, by self-play alone: the others are compared
+            with it, and it is no teammate itself.
         config: hyper-parameters of each policy.
         seed: seed of everything.
 
@@ -116,11 +117,11 @@ class PopulationRun:
 
     @cached_property
     def stages(self) -> list[Population]:
-        """The stages of training, one after the other; CoMeDi adds one member in each."""
+        """The stages of training, one after the other; CoMeDi trains one policy in each, the first by self-play."""
         env = Environment(self.layout)
         if self.algorithm == "comedi":
             first = Population(env, FCP(1), self.config, partners=2)
-            return [first, *[Population(env, CoMeDi(), self.config)] * (self.members - 1)]
+            return [first, *[Population(env, CoMeDi(), self.config)] * self.members]
         kinds = {"fcp": FCP, "brdiv": BRDiv, "lbrdiv": LBRDiv}
         return [Population(env, kinds[self.algorithm](self.members), self.config)]
 
@@ -312,7 +313,12 @@ class _PopulationTraining:
             for name in (POLICY_WEIGHTS, POLICY_CARD)
             for path in sorted(self.folder.rglob(name))
         }
-        content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
+        content = {
+            "settings_hash": self.run.settings_hash,
+            "settings": self.run.settings,
+            "software": software_versions(),
+            "files": files,
+        }
         with atomic_write(self.folder / _POPULATION) as partial:
             write_json(partial, content)
         (self.folder / _RESUME).unlink(missing_ok=True)
@@ -330,6 +336,11 @@ class SuiteCheckpoint:
     path: str
     card: dict[str, Any]
 
+    @property
+    def is_member(self) -> bool:
+        """Whether the population's objective shaped the policy: all but CoMeDi's first one, plain self-play."""
+        return self.card["algorithm"] != "comedi" or self.card["member"] > 0
+
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
     """Returns whether a suite has this population and it is finished."""
@@ -337,7 +348,9 @@ def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
-    """Yields a population's checkpoints, by member and checkpoint.
+    """Yields the checkpoints of a population's members, by member and checkpoint.
+
+    Without those of CoMeDi's first policy, which is trained as FCP's are (see `SuiteCheckpoint.is_member`).
 
     Raises:
         OptionError: if the population is not finished.
@@ -347,7 +360,9 @@ def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Suit
         raise OptionError(f"{folder}: no finished population; run `python -m generation teammates --layout {layout}`")
     found = [path.parent for path in folder.glob(f"m*/c*/{POLICY_WEIGHTS}")]
     for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
-        yield SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
+        point = SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
+        if point.is_member:
+            yield point
 
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:

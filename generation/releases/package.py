@@ -80,6 +80,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         code_version=metadata["code_version"],
         jax_version=metadata["jax_version"],
         platform=metadata["platform"],
+        xla_threads=metadata["xla_threads"],
         seed=task.seed,
         teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
         streams_recorded=metadata["ego"]["environments"],
