@@ -104,6 +104,15 @@ def cli() -> None:
     "--suite", type=Folder(), metavar="FOLDER", help="Folder of the learned teammates.", show_default="OUT/suite"
 )
 @click.option("--seed", type=SEED, default=0, help="Seed of the learned teammates.")
+@click.option(
+    "--tasks",
+    "task_file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Collect the tasks of this JSONL file, such as meta/tasks.jsonl of a release, and train no teammates: --suite is "
+    "a suite that has them, or the folder teammates of the release.",
+    show_default="the profile's tasks",
+)
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
 @_threads_option
 @dataclass_options(CollectOptions, "collect")
@@ -114,6 +123,7 @@ def generate(
     kind: tuple[Kind, ...],
     suite: Path | None,
     seed: int,
+    task_file: Path | None,
     bundle: bool,
     xla_threads: int | None,
     collect: dict[str, Any],
@@ -138,7 +148,9 @@ def generate(
     if options.executor == "ray":
         allocate_gpu_memory_on_demand()
     profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
-    releases = dict(zip(kind, build_releases(profile, out, kind, console, options, suite, seed), strict=True))
+    tasks = read_tasks(task_file) if task_file else None
+    built = build_releases(profile, out, kind, console, options, suite, seed, tasks)
+    releases = dict(zip(kind, built, strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
