@@ -109,8 +109,8 @@ def cli() -> None:
     "task_file",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Collect the tasks of this JSONL file, such as meta/tasks.jsonl of a release, and train no teammates: --suite is "
-    "a suite that has them, or the folder teammates of the release.",
+    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, and train no teammates: --suite is a "
+    "suite that has them, or the release's folder teammates.",
     show_default="the profile's tasks",
 )
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
