@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import platformdirs
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.locks import process_lock
 
 _DEFAULT_LIMIT = 100 * 10**9
 _TICK_NS = 10**8  # a file changed this recently may change again within one tick of its clock
@@ -105,7 +106,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
             f'ICRL4AHT_CACHE_BYTES, select fewer histories, or take cache="stream"'
         )
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder.with_name(f".{key}.lock")):
+    with process_lock(folder.with_name(f".{key}.lock")):
         arrays = _open(folder)
         if arrays is None:
             _make_room(folder.parent, size)
@@ -151,9 +152,9 @@ def _cached_sets(folder: Path) -> list[tuple[Path, int]]:
 
 def _make_room(folder: Path, size: int) -> None:
     """Remove leftovers of killed processes, then the least recently used sets until `size` more bytes fit."""
-    with FileLock(folder / ".room.lock"):
+    with process_lock(folder / ".room.lock"):
         for left in folder.glob(".*.partial"):
-            with suppress(Timeout), FileLock(left.with_suffix(".lock"), timeout=0):  # held while a set is built
+            with suppress(Timeout), process_lock(left.with_suffix(".lock"), wait=False):  # held while a set is built
                 shutil.rmtree(left, ignore_errors=True)
         for left in folder.glob(".*.removed-*"):
             shutil.rmtree(left, ignore_errors=True)
