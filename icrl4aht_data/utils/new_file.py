@@ -9,7 +9,7 @@ from pathlib import Path
 from icrl4aht_data.errors import OptionError
 
 _FORMS: dict[str, tuple[bytes, bytes]] = {
-    ".png": (b"\x89PNG\r\n\x1a\n", b""),
+    ".png": (b"\x89PNG\r\n\x1a\n", b"Matplotlib"),
     ".gif": (b"GIF8", b""),
     ".pdf": (b"%PDF-", b"Matplotlib"),
     ".svg": (b"<?xml ", b"Matplotlib"),
