@@ -12,7 +12,7 @@ from filelock import FileLock
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import parse_manifest
-from icrl4aht_data.utils.cache import cached_arrays
+from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import atomic_write
 from tests.robustness.faults.series import FAMILIES, run
 from tests.robustness.faults.workspace import Workspace
@@ -67,9 +67,10 @@ def test_leftovers_of_killed_builds_are_removed(tmp_path, monkeypatch):
     for name in (".one.partial", ".two.removed-1", ".building.partial"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.npy").write_bytes(bytes(100))
+    key = f"three-{0:032x}"
     with FileLock(tmp_path / ".building.lock"):
-        cached_arrays("three", 8, lambda folder: np.save(folder / "b.npy", np.zeros(1)))
-    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {".building.partial", "three"}
+        cached_arrays(key, 8, lambda folder: np.save(folder / "b.npy", np.zeros(1)))
+    assert {path.name for path in tmp_path.iterdir()} == {".building.lock", ".building.partial", key}
 
 
 def test_an_error_of_the_disk_names_the_file(tmp_path):

@@ -155,9 +155,9 @@ _BUILD = """
 import itertools, os, sys
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.format import columns
-from icrl4aht_data.utils import cache
+from icrl4aht_data.utils import remembered
 
-columns._UNCACHED = cache._SMALL = 0
+columns._UNCACHED = remembered._SMALL = 0
 for number in itertools.count():
     os.environ["ICRL4AHT_CACHE_DIR"] = f"{sys.argv[2]}/{number}"
     print(number, flush=True)
