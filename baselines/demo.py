@@ -29,6 +29,7 @@ from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import plot_learning_curves
+from icrl4aht_data.utils.new_file import check_new_file
 
 DEMO_LAYOUT = "demo_wide"
 DEMO_MODEL = ModelOptions(layers=2, width=64)
@@ -63,6 +64,9 @@ def run_demo(
         ReleaseError: if the bundled release is damaged.
     """
     started = time.perf_counter()
+    curves, episode, page = (out / name for name in ("learning_curves.png", "episode.gif", "report.html"))
+    for path in (curves, episode, page):
+        check_new_file(path, overwrite=(out / "ad").is_dir())  # of a stopped run
     out.mkdir(parents=True, exist_ok=True)
 
     def say(number: int, text: str) -> None:
@@ -71,7 +75,6 @@ def run_demo(
     say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}")')
     dataset = load_icrl4aht(split="train", layout=DEMO_LAYOUT)
     console.print(repr(dataset), highlight=False)
-    curves, episode = out / "learning_curves.png", out / "episode.gif"
     plot_learning_curves(load_icrl4aht(), curves)
     _draw_best_episode(dataset, episode)
     console.print(f"learning curves: {curves}\nbest episode: {episode}", highlight=False)
@@ -98,7 +101,7 @@ def run_demo(
     console.print("(a model this small, trained this briefly, shows the workflow, not the method's ability)")
 
     say(6, "drawing the report")
-    page = write_page_with_episodes(runs, out / "report.html")
+    write_page_with_episodes(runs, page)
     console.print(f"[bold]done[/bold] in {time.perf_counter() - started:.0f} s; the report is {page}", highlight=False)
     return page
 

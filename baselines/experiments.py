@@ -24,7 +24,7 @@ from baselines.methods.options import SIZES, ModelOptions
 from baselines.methods.registry import get_method
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
-from baselines.report.summary import write_report
+from baselines.report.summary import REPORT_BEGINS, write_report
 from baselines.training.histories import TrainingTask, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.trainer import train
@@ -35,6 +35,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.new_file import check_new_files
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""
@@ -200,6 +201,7 @@ def run_experiment(
     models = list(product(plan.methods, entries, layouts))
     for model in models:
         _prepare_entry(*model, plan)  # impossible trainings fail before any work
+    check_new_files(out / "report", overwrite=True, begins={**REPORT_BEGINS, "report.html": None})  # of a stopped run
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout

@@ -28,12 +28,14 @@ from icrl4aht_data.commands.options import (
     Sections,
     examples,
     json_option,
+    overwrite_option,
     run,
     version_option,
 )
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.files import atomic_write
 
 if TYPE_CHECKING:
     from generation.profiles import Profile  # loads JAX
@@ -238,17 +240,28 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 
 @cli.command()
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 if the files differ.")
-def manifests(check: bool) -> None:
+@click.option(
+    "--out", type=Folder(), metavar="FOLDER", help="Write the manifests here.", show_default="the package's folder"
+)
+@overwrite_option
+def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
     """Write the manifests of the published test tasks.
 
-    Makes icrl4aht_data/manifests/*.jsonl from the published parameter sets.
+    Makes teammate_test.jsonl and layout_test.jsonl from the published parameter sets. Files that have these tasks are
+    kept.
     """
     for track in TRACKS:
         path, tasks = manifest_path(track, "test"), published_tasks(track)
+        path = out / path.name if out else path
+        if check or path.is_file():
+            different = read_tasks(path) != tasks
+            if different and (check or not overwrite):
+                remedy = "run `python -m generation manifests --overwrite`" if check else "replace it by --overwrite"
+                raise TaskFormatError(f"{path}: differs from the parameter sets; {remedy}")
         if not check:
-            write_tasks(path, tasks)
-        elif read_tasks(path) != tasks:
-            raise TaskFormatError(f"{path}: differs from the parameter sets; run `python -m generation manifests`")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(path) as partial:
+                write_tasks(partial, tasks)
         console.print(f"{path}: {len(tasks)} tasks")
 
 
@@ -315,15 +328,19 @@ def teammates(
     help="Folder that `teammates` wrote.",
 )
 @click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
-def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
+@click.option("--out", type=Folder(), metavar="FOLDER", help="Draw the pictures here.", show_default="SUITE")
+@overwrite_option
+def diversity(
+    layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool, out: Path | None, overwrite: bool
+) -> None:
     """Report how much the teammates of a suite differ.
 
     Prints self-play and cross-play returns of each population and the Hamming distances of all teammates, and draws
-    them into SUITE/LAYOUT.
+    them into OUT/LAYOUT.
     """
     from generation.populations.build import report_diversity
 
-    report_diversity(suite, layouts, algorithms, greedy, console)
+    report_diversity(suite, layouts, algorithms, greedy, console, out, overwrite)
 
 
 def main() -> None:

@@ -50,11 +50,14 @@ from icrl4aht_data.commands.options import (
     bars,
     counted,
     examples,
+    overwrite_option,
     run,
     version_option,
 )
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.new_file import check_new_file, check_new_files
+from icrl4aht_data.utils.templates import card_file
 
 _console = Console(soft_wrap=True)
 
@@ -169,21 +172,27 @@ def evaluate_command(
 @click.option(
     "--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Also write one HTML page."
 )
+@overwrite_option
 @gifs_option
 @suite_option
-def report_command(runs: tuple[Path, ...], out: Path | None, html: Path | None, gifs: bool, suite: Path | None) -> None:
+def report_command(
+    runs: tuple[Path, ...], out: Path | None, html: Path | None, overwrite: bool, gifs: bool, suite: Path | None
+) -> None:
     """Compare results with the paper's.
 
     RESULTS are folders that `evaluate` made. Prints the paper's tables with its numbers and ours, and writes them as
     Markdown, CSV and curves, with a card for each trained model. Results of one agent on different layouts are merged.
     """
-    from baselines.report.model_card import write_model_cards
+    from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
     from baselines.report.page import write_page_with_episodes
     from baselines.report.results import merge, read_run
-    from baselines.report.summary import markdown, write_report
+    from baselines.report.summary import REPORT_BEGINS, markdown, write_report
 
-    loaded = merge([read_run(run) for run in runs])
-    paths = write_report(loaded, out or runs[0] / "report")
+    loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
+    check_new_files(folder, overwrite, REPORT_BEGINS | {card_name(run): CARD_BEGINS for run in loaded})
+    if html:
+        check_new_file(html, overwrite)
+    paths = write_report(loaded, folder)
     if html:
         paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite))
     paths += write_model_cards(loaded, paths[0].parent)
@@ -204,11 +213,13 @@ def report_command(runs: tuple[Path, ...], out: Path | None, html: Path | None, 
 @protocol_option
 @click.option("--seed", type=SEED, default=0, help="Seed of the episode.")
 @click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
-def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path) -> None:
+@overwrite_option
+def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path, overwrite: bool) -> None:
     """Play an episode and draw it as a GIF."""
     from baselines.evaluate.protocols import get_protocol
     from baselines.report.episode_gifs import episode_gif
 
+    check_new_file(out, overwrite)
     task = published_task(layout, teammate)
     earned = episode_gif(out, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
     _console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
@@ -224,16 +235,20 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     show_default="all",
     help="published or seeded; repeat for several.",
 )
-def headroom_command(out: Path, protocol: tuple[str, ...]) -> None:
+@click.option("--bundle", is_flag=True, help="Also replace headroom.json and headroom.md of the package's cards.")
+def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
     """Measure the reference egos on every test task.
 
-    Writes their results, and cards/headroom.json and cards/headroom.md from them.
+    Writes their results into OUT, and OUT/headroom.json and OUT/headroom.md from them.
     """
-    from baselines.report.headroom import measure_headroom, write_headroom_cards
+    from baselines.report.headroom import HEADROOM_BEGINS, measure_headroom, write_headroom_cards
 
+    folders = [out, card_file("headroom.json").parent] if bundle else [out]
+    for folder in folders:
+        check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
     with bars() as show:
         runs = measure_headroom(out, protocol, show)
-    for path in write_headroom_cards(runs):
+    for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
         _console.print(f"wrote {path}")
 
 

@@ -15,7 +15,9 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
-from icrl4aht_data.utils.templates import card_file
+
+HEADROOM_BEGINS = {"headroom.json": b'{\n "', "headroom.md": b"# Headroom: what an ego can change\n"}
+"""Files with the headroom -> their first bytes, by which they are recognised before they are replaced."""
 
 
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
@@ -42,12 +44,11 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
     return runs
 
 
-def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path | None = None) -> list[Path]:
-    """Write headroom.json and headroom.md into a folder, `cards` by default. Returns their paths.
+def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Path]:
+    """Write headroom.json and headroom.md into a folder. Returns their paths.
 
     headroom.json holds protocol -> layout -> family -> reference ego -> mean return.
     """
-    folder = folder or card_file("headroom.json").parent
     content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for run in runs:
         for layout, family in run.cells:

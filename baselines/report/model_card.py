@@ -11,6 +11,9 @@ from baselines.report.results import EvaluationRun
 from baselines.report.summary import track_tables
 from icrl4aht_data.utils.templates import fill_template
 
+CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
+"""First bytes of a model's card, by which it is recognised before it is replaced."""
+
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
 
@@ -51,9 +54,14 @@ def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]
     for run in runs:
         trained = next((source.trained for source in run.sources if source.trained), None)
         if trained:
-            paths.append(folder / f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md")
+            paths.append(folder / card_name(run))
             paths[-1].write_text(model_card(run, trained), encoding="utf-8")
     return paths
+
+
+def card_name(run: EvaluationRun) -> str:
+    """Returns the file name of a model's card."""
+    return f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md"
 
 
 def _bullets(settings: Mapping[str, Any]) -> str:

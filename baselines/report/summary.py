@@ -22,6 +22,9 @@ from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, headroom_table, read_headroom
 from icrl4aht_data.utils.templates import markdown_table
 
+REPORT_BEGINS = {"report.md": b"# Returns per layout", "report.csv": b"agent,protocol,layout,", "curves.png": None}
+"""Files of a report -> their first bytes, by which they are recognised before they are replaced; None: any picture."""
+
 _RESAMPLES = 10_000
 _PAPER_AGENTS = ("random", "AD", "DPT")
 

@@ -24,6 +24,7 @@ from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.new_file import check_new_file
 
 
 def build_suite(
@@ -124,7 +125,13 @@ def _describe(selection: TeammateSelection, wanted: int) -> str:
 
 
 def report_diversity(
-    suite: Path, layouts: Sequence[str], algorithms: Sequence[str], greedy: bool, console: Console
+    suite: Path,
+    layouts: Sequence[str],
+    algorithms: Sequence[str],
+    greedy: bool,
+    console: Console,
+    out: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
 
@@ -134,10 +141,14 @@ def report_diversity(
         algorithms: the populations.
         greedy: whether teammates take their most probable actions.
         console: where to print.
+        out: folder of the pictures; by default the suite's.
+        overwrite: replace pictures.
 
     Raises:
-        OptionError: if a population is not finished, or no layout has all of them.
+        OptionError: if a population is not finished, or no layout has all of them; if a picture may not be written, see
+            `new_file.check_new_file`.
     """
+    out = out or suite
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
         name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
     ]
@@ -147,13 +158,16 @@ def report_diversity(
             f"trains them, or name a --layout"
         )
     for name in names:
+        for picture in (_distances_picture(out, name), *(_cross_play_picture(out, name, each) for each in algorithms)):
+            check_new_file(picture, overwrite)
+    for name in names:
         layout = get_layout(name)
         for algorithm in algorithms:
-            _report_population(suite, layout, algorithm, greedy, console)
-        _report_distances(suite, layout, algorithms, console)
+            _report_population(suite, layout, algorithm, greedy, out, console)
+        _report_distances(suite, layout, algorithms, out, console)
 
 
-def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
+def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, out: Path, console: Console) -> None:
     returns = play_matrix(suite, layout, algorithm, greedy)
     members = [f"m{k}" for k in range(len(returns))]
     diagonal = np.eye(len(returns), dtype=bool)
@@ -162,12 +176,13 @@ def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool
     self_play = returns[diagonal].mean()
     cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
     console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
-    path = suite / layout.name / algorithm / "cross_play.png"
+    path = _cross_play_picture(out, layout.name, algorithm)
+    path.parent.mkdir(parents=True, exist_ok=True)
     plot_matrix(returns, members, path, f"{algorithm}, {layout.name}: return", ("ego", "teammate"))
     console.print(f"wrote {path}")
 
 
-def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], console: Console) -> None:
+def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], out: Path, console: Console) -> None:
     policies, families = [], {}
     for algorithm in algorithms:
         points = list(suite_checkpoints(suite, layout.name, algorithm))
@@ -180,9 +195,17 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     labels = list(families)
     console.print(_matrix_table(f"{layout.name}: mean Hamming distance of families", "", labels, distances, ".2f"))
-    path = suite / layout.name / "distances.png"
+    path = _distances_picture(out, layout.name)
     plot_matrix(distances, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
     console.print(f"wrote {path} ({track_of(layout.name)} track)")
+
+
+def _cross_play_picture(out: Path, layout: str, algorithm: str) -> Path:
+    return out / layout / algorithm / "cross_play.png"
+
+
+def _distances_picture(out: Path, layout: str) -> Path:
+    return out / layout / "distances.png"
 
 
 def _matrix_table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:

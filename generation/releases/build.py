@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.utils.locks import process_lock
-from icrl4aht_data.writing.release_folder import check_replaceable
+from icrl4aht_data.writing.release_folder import check_target
 from icrl4aht_data.writing.statistics import print_statistics
 
 SUITE = "suite"
@@ -57,7 +57,7 @@ def build_releases(
         CollectionError: if a task could not be collected; nothing is packed then.
     """
     for kind in kinds:
-        check_replaceable(out / kind)  # before the long work, not after it
+        check_target(out / kind, overwrite=True)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
     tasks = train_teammates(profile, suite, seed, console) if tasks is None else list(tasks)
     collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)

@@ -41,7 +41,7 @@ def package_release(
 
     Args:
         artefacts: folder of the tasks' finished artefacts.
-        target: the release folder, replaced atomically.
+        target: the release folder; a release there is replaced atomically.
         tasks: the tasks, in the release's order.
         profile: their profile.
         suite: folder of the learned teammates.
@@ -49,12 +49,12 @@ def package_release(
         done: called after each task.
     """
     new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
-    return write_release(target, kind, new, data_version=profile.data_version, done=done)
+    return write_release(target, kind, new, data_version=profile.data_version, overwrite=True, done=done)
 
 
 def bundle_release(release: Path) -> Path:
     """Replace the release that the package bundles by a copy of this one."""
-    with atomic_folder(MINI) as copy:
+    with atomic_folder(MINI, overwrite=True, sources=[release]) as copy:
         shutil.copytree(release, copy, dirs_exist_ok=True)
     return MINI
 

@@ -30,6 +30,7 @@ from icrl4aht_data.commands.options import (
     examples,
     filter_options,
     json_option,
+    overwrite_option,
     quiet_option,
     run,
     version_option,
@@ -44,10 +45,12 @@ from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.download import repair as repair_files
+from icrl4aht_data.utils.new_file import check_new_file
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.parquet import to_parquet
-from icrl4aht_data.writing.published import HISTORIES_H5, from_published, to_published
+from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.release_folder import HISTORIES_H5
 from icrl4aht_data.writing.statistics import print_statistics
 
 _root = click.argument("root", required=False, type=Root())
@@ -138,14 +141,24 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
 @filter_options
 @click.option("--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history.")
 @click.option("--plot", type=NewFile(*PICTURES), metavar="FILE", help="Also draw learning curves: .png, .svg or .pdf.")
+@overwrite_option
 @json_option
 def show(
-    root: str | Path | None, as_json: bool, history_id: int | None, plot: Path | None, **filters: tuple[str, ...]
+    root: str | Path | None,
+    as_json: bool,
+    history_id: int | None,
+    plot: Path | None,
+    overwrite: bool,
+    **filters: tuple[str, ...],
 ) -> None:
     """Show a release, a part of it or one history.
 
     Prints kind, versions, counts and layouts; for one history everything in its index entry. Only --plot writes a file.
     """
+    if overwrite and plot is None:
+        raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
+    if plot is not None:
+        check_new_file(plot, overwrite)
     dataset = _load(root, filters)
     if history_id is None:
         info = dataset.info
@@ -300,12 +313,20 @@ def _verdict(report: Report) -> str:
 
 @cli.command(
     epilog=examples(
-        "icrl4aht-data convert path/to/release full --to full --layout coord_simple",
-        "icrl4aht-data convert path/to/published lite",
+        "icrl4aht-data convert path/to/release --to full --layout coord_simple --out full",
+        "icrl4aht-data convert path/to/published --out lite",
     )
 )
 @click.argument("source", type=Root())
-@click.argument("target", type=click.Path(path_type=Path), metavar="OUT")
+@click.option(
+    "--out",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="PATH",
+    required=True,
+    help="Write the release, the folder of published files or the Parquet file here.",
+)
+@overwrite_option
 @click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]), help="The form to convert to.")
 @click.option(
     "--tasks",
@@ -320,18 +341,18 @@ def _verdict(report: Report) -> str:
 def convert(
     source: str | Path,
     target: Path,
+    overwrite: bool,
     form: str | None,
     tasks: Path | None,
     kept_steps: int,
     quiet: bool,
     **filters: tuple[str, ...],
 ) -> None:
-    """Convert a release, or published files, into OUT.
+    """Convert a release, or published files.
 
-    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. OUT becomes a
-    release folder (full, lite, observations), a folder with the published code's two files (published), or a Parquet
-    file with the index (parquet). Published files become lite by default, or observations where they have no state
-    records.
+    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. Writes a release
+    folder (full, lite, observations), a folder with the published code's two files (published), or a Parquet file with
+    the index (parquet). Published files become lite by default, or observations where they have no state records.
     """
     with bars(quiet) as show:
         advance = partial(show, "histories")
@@ -339,7 +360,9 @@ def convert(
         if isinstance(source, Path) and (source / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, without filters")
-            form = from_published(source, target, form, tasks=tasks, kept_steps=kept_steps, advance=advance)
+            form = from_published(
+                source, target, form, tasks=tasks, kept_steps=kept_steps, overwrite=overwrite, advance=advance
+            )
         else:
             dataset = _load(source, filters)
             if form is None:
@@ -347,19 +370,20 @@ def convert(
             if tasks or kept_steps != KEPT_STEPS:
                 raise click.UsageError(f"{source} is a release: --tasks and --kept-steps are for published files")
             if form in ALL_KINDS:
-                to_release(dataset, target, form, advance=advance)
+                to_release(dataset, target, form, overwrite=overwrite, advance=advance)
             elif form == "published":
-                to_published(dataset, target, advance=advance)
+                to_published(dataset, target, overwrite=overwrite, advance=advance)
             else:
-                to_parquet(dataset, target)
+                to_parquet(dataset, target, overwrite=overwrite)
     limit = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
     if not quiet:
         click.echo(f"{target}: {form}{limit}")
 
 
-@cli.command(epilog=examples("icrl4aht-data combine both path/to/release path/to/another --data-version 1.0.0"))
-@click.argument("out", type=Folder())
+@cli.command(epilog=examples("icrl4aht-data combine path/to/release path/to/another --data-version 1.0.0 --out both"))
 @click.argument("releases", nargs=-1, required=True, type=Root(), metavar="ROOT...")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the combination here.")
+@overwrite_option
 @click.option(
     "--data-version",
     metavar="SEMVER",
@@ -367,13 +391,15 @@ def convert(
     show_default="the version of the releases, if they agree",
 )
 @quiet_option
-def combine(out: Path, releases: tuple[str | Path, ...], data_version: str | None, quiet: bool) -> None:
-    """Combine releases into one, in the folder OUT.
+def combine(
+    releases: tuple[str | Path, ...], out: Path, overwrite: bool, data_version: str | None, quiet: bool
+) -> None:
+    """Combine releases into one.
 
-    They have to be of one kind and share no task. A release at OUT is replaced. The combination gets a new card; the
-    cards of the releases are kept in meta/source_card.md.
+    They have to be of one kind and share no task. The combination gets a new card; the cards of the releases are kept
+    in meta/source_card.md.
     """
-    combine_releases(out, releases, data_version)
+    combine_releases(out, releases, data_version, overwrite=overwrite)
     if not quiet:
         click.echo(f"release: {out}")
         print_statistics(read_info(out), Console())
@@ -384,24 +410,23 @@ def release() -> None:
     """Prepare a release for publication."""
 
 
-@release.command()
-@click.argument("source", nargs=-1, type=Folder(), metavar="[SOURCE]")
-@click.argument("out", type=Folder())
+@release.command(epilog=examples("icrl4aht-data release build path/to/release --out build/release"))
+@click.argument("source", required=False, type=Folder())
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
+@overwrite_option
 @click.option("--link", is_flag=True, help="Use hard links, not copies: saves space, but editing one changes both.")
 @quiet_option
 @json_option
-def build(source: tuple[Path, ...], out: Path, link: bool, quiet: bool, as_json: bool) -> None:
-    """Build a release for publication in the folder OUT.
+def build(source: Path | None, out: Path, overwrite: bool, link: bool, quiet: bool, as_json: bool) -> None:
+    """Build a release for publication.
 
-    OUT gets all data of SOURCE, a release folder (by default the bundled mini release), which is verified first, and
+    Copies all data of SOURCE, a release folder (by default the bundled mini release), which is verified first, and adds
     what people and tools look for in a dataset: README.md with a dataset card, figures, the index as Parquet for
     viewers, croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras
     plot and hf.
     """
-    if len(source) > 1:
-        raise click.UsageError("give one SOURCE at most, then OUT")
     with bars(quiet) as advance:
-        build_release(source[0] if source else None, out, link=link, advance=advance)
+        build_release(source, out, link=link, overwrite=overwrite, advance=advance)
     files = list(read_manifest(out))
     size = sum((out / name).stat().st_size for name in files)
     if as_json:

@@ -175,6 +175,9 @@ def version_option(command: Any) -> Any:
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace what exists, if it is what such a command wrote and nothing else."
+)
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
 
 

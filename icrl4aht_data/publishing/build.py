@@ -37,7 +37,7 @@ from icrl4aht_data.writing.dataset_card import (
     evaluated_on,
 )
 from icrl4aht_data.writing.parquet import to_parquet
-from icrl4aht_data.writing.release_folder import atomic_folder
+from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
 _POLICY = "policy.json"
@@ -50,6 +50,7 @@ def build_release(
     target: Path,
     *,
     link: bool = False,
+    overwrite: bool = False,
     published: datetime.date | None = None,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Path:
@@ -57,25 +58,26 @@ def build_release(
 
     Args:
         source: a release folder; the bundled mini release by default.
-        target: the folder to write; a release there is replaced when the new one is complete.
+        target: the folder to write, which appears when it is complete.
         link: hard-link the files of `source` instead of copying them, which saves space; changing a file then
             changes its copy too.
+        overwrite: replace a release at `target`.
         published: the date for Croissant; today by default.
         advance: progress of verifying and of copying.
 
     Raises:
-        OptionError: if `target` is `source` or exists and is not a release, or if a library is not installed.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, or if a library is not
+            installed.
         ReleaseError: if `source` is not valid; names the first problems.
     """
     source = (MINI if source is None else source).resolve()
-    if target.resolve() == source:
-        raise OptionError(f"{target}: the release itself; give another folder")
+    check_target(target, overwrite, [source])
     missing = [name for name in _LIBRARIES if find_spec(name) is None]
     if missing:
         raise OptionError(f"building a release needs {', '.join(missing)}: pip install 'icrl4aht-data[plot,hf]'")
     check_valid(source, advance)
     kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
-    with atomic_folder(target) as root:
+    with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             _copy(source / name, root / name, link)

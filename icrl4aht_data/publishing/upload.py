@@ -107,21 +107,24 @@ def upload_release(
     files = {name: _File((folder / name).stat().st_size, digest) for name, digest in manifest.items()}
     tag = f"v{read_info(folder).data_version}"
     api = HfApi()
-    with _wrap_hub_errors(repo, api.endpoint), _progress_bars(show):
+    uploader = _Uploader(api, folder, repo, tag, files)
+    with _wrap_hub_errors(uploader), _progress_bars(show):
         sizes = {name: files[name].size for name in sorted(files)}
         plan = Upload(repo, tag, f"{api.endpoint}/datasets/{repo}", sizes)
-        return _Uploader(api, folder, repo, tag, files).run(plan, private, dry_run)
+        return uploader.run(plan, private, dry_run)
 
 
 @dataclass
 class _Uploader:
-    """One upload; `files` has the size and hash of every file of the release."""
+    """One upload; `files` has the size and hash of every file of the release, `sending` is set by the first request
+    that changes the repository."""
 
     api: HfApi
     folder: Path
     repo: str
     tag: str
     files: Mapping[str, _File]
+    sending: bool = False
 
     def run(self, plan: Upload, private: bool, dry_run: bool) -> Upload:
         tags = self._tags()
@@ -139,6 +142,7 @@ class _Uploader:
         plan = replace(plan, creates=tags is None, private=private, deletes=foreign)
         if dry_run:
             return plan
+        self.sending = True
         if tags is None:
             self.api.create_repo(self.repo, repo_type=_KIND, private=private, exist_ok=True)
         self.api.upload_folder(
@@ -239,7 +243,7 @@ def _progress_bars(show: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _wrap_hub_errors(repo: str, endpoint: str) -> Iterator[None]:
+def _wrap_hub_errors(uploader: _Uploader) -> Iterator[None]:
     """Raise errors of the Hub's client as `UploadError`, which names the repository, the cause and a remedy."""
     from huggingface_hub.errors import HTTPError, LocalTokenNotFoundError  # pyright: ignore[reportPrivateImportUsage]
 
@@ -250,7 +254,9 @@ def _wrap_hub_errors(repo: str, endpoint: str) -> Iterator[None]:
     except (HTTPError, OSError, RuntimeError, ValueError) as error:
         cause = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error
         status = getattr(getattr(cause, "response", None), "status_code", None)
-        remedy = "files sent so far are kept: run the same command to resume"
+        repo, endpoint, remedy = uploader.repo, uploader.api.endpoint, "nothing was sent: run the same command again"
+        if uploader.sending:
+            remedy = "files sent so far are kept: run the same command to resume"
         if status in (401, 403) or isinstance(cause, (LocalTokenNotFoundError, PermissionError)):
             remedy = f"expected a token that may write to {repo.split('/')[0]}: `hf auth login`, or set HF_TOKEN"
         elif isinstance(cause, ValueError):

@@ -13,11 +13,11 @@ from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import MANIFEST, PROVENANCE
-from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.dataset_card import SOURCE_CARD
 from icrl4aht_data.writing.release import RELEASE_CARD, NewTask, write_release
+from icrl4aht_data.writing.release_folder import check_target
 from icrl4aht_data.writing.stored import release_tasks, stored_task
 
 
@@ -25,28 +25,29 @@ def combine_releases(
     target: Path,
     roots: Sequence[str | Path],
     data_version: str | None = None,
+    *,
+    overwrite: bool = False,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
     """Write a release with the histories of several, in order, under new history ids.
 
     Args:
-        target: the folder to write; a release there is replaced when the new one is complete.
+        target: the folder to write, which appears when it is complete.
         roots: releases of one kind, one format and one episode length, no two with a task in common.
         data_version: version of the combination; by default that of the releases, if they agree.
+        overwrite: replace a release at `target`.
         done: called after the histories of a task.
 
     Raises:
         OptionError: if the releases do not fit together; names both, and how they differ; if `data_version` is not
-            SemVer.
+            SemVer; if `target` may not be written, see `release_folder.check_target`.
         ReleaseError: if one of them cannot be read.
     """
     if data_version is not None:
         check_version(data_version)
     if not roots:
         raise OptionError("expected at least one release to combine")
-    for root in roots:
-        if not is_address(root) and Path(root).resolve() == target.resolve():
-            raise OptionError(f"{target}: is one of the releases to combine; give another folder")
+    check_target(target, overwrite, roots)
     datasets = [load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)
     first = datasets[0].info
@@ -57,6 +58,8 @@ def combine_releases(
         data_version=data_version or _common_version(datasets),
         source_card=_source_card(datasets),
         kept_steps=first.environment.kept_steps,
+        overwrite=overwrite,
+        sources=roots,
         done=done,
     )
 

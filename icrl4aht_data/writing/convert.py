@@ -12,31 +12,37 @@ from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, Kind
 from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.writing.dataset_card import SOURCE_CARD
 from icrl4aht_data.writing.release import write_release
+from icrl4aht_data.writing.release_folder import check_target
 from icrl4aht_data.writing.stored import HistoryProgress, release_tasks, stored_task
 
 
 def to_release(
-    dataset: Dataset, target: Path, kind: Kind, *, advance: HistoryProgress = lambda done, total: None
+    dataset: Dataset,
+    target: Path,
+    kind: Kind,
+    *,
+    overwrite: bool = False,
+    advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
     """Write a selection as a release of the current format version, its histories in order and numbered from 0.
 
     Args:
         dataset: a release, or a part of one.
-        target: the folder to write; a release there is replaced.
+        target: the folder to write, which appears when it is complete.
         kind: "full", "lite" or "observations"; only the last one if the dataset has no states.
+        overwrite: replace a release at `target`.
         advance: progress.
 
     Raises:
-        OptionError: if `target` is the dataset's own folder or not a release, or if a kind with states is wanted of a
-            dataset without.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, or if a kind with states is
+            wanted of a dataset without.
     """
     if kind in KINDS and not dataset.has_states:
         raise OptionError(
             f"{dataset.root}: has observations only, and a {kind} release is made of state records, which observations "
             f"do not determine; convert to {OBSERVATIONS}, published or parquet"
         )
-    if target.resolve() == dataset.root.resolve():
-        raise OptionError(f"{target}: the release itself; give another folder")
+    check_target(target, overwrite, [dataset.root])
     tasks = {task.task_id: task for task in release_tasks(dataset)}
     provenance = read_provenance(dataset.origin.file(PROVENANCE))
     by_task: dict[str, list[int]] = {}
@@ -58,4 +64,6 @@ def to_release(
         data_version=dataset.info.data_version,
         source_card=read_text(dataset.origin.file(SOURCE_CARD)) if SOURCE_CARD in listed else None,
         kept_steps=dataset.info.environment.kept_steps,
+        overwrite=overwrite,
+        sources=[dataset.root],
     )

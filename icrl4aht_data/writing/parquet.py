@@ -8,19 +8,26 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import ENTRY_HINTS
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.new_file import check_new_file
 
 
-def to_parquet(dataset: Dataset, path: Path) -> Path:
+def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path:
     """Write the selection's index as a Parquet file, one row per history. Needs pyarrow, of the extra `hf`.
 
+    Args:
+        dataset: a release, or a part of one.
+        path: the file to write.
+        overwrite: replace a Parquet file of histories at `path`.
+
     Raises:
-        OptionError: if pyarrow is not installed.
+        OptionError: if pyarrow is not installed, or `path` may not be written, see `new_file.check_new_file`.
     """
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
         raise OptionError("Parquet needs pyarrow: pip install 'icrl4aht-data[hf]'") from error
+    check_new_file(path, overwrite)
     types = {float: pa.float64(), int: pa.int64(), int | None: pa.int64(), str: pa.string(), bool: pa.bool_()}
     types |= {float | None: pa.float64(), tuple[int, int, int]: pa.list_(pa.int64())}
     schema = pa.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()])

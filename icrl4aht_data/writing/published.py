@@ -2,16 +2,15 @@
 
 The published code keeps all histories in `histories.h5`, one group each, with observations as float32 in gzip-6 chunks
 of 4096 steps and action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3).
-Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl` and `provenance.json`, which
-the published readers ignore; converted back they lose only the checkpoints of learned teammates. Files without states,
-which observations do not determine, become a release of observations; files without tasks one that knows its tasks by
-name.
+Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl`, `provenance.json` and a
+manifest, which the published readers ignore; converted back they lose only the checkpoints of learned teammates. Files
+without states, which observations do not determine, become a release of observations; files without tasks one that
+knows its tasks by name.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,7 +23,8 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_tasks
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError
+from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
+from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.safe_hdf5 import exists, member, read_dataset
 from icrl4aht_data.format.schema import (
@@ -46,10 +46,8 @@ from icrl4aht_data.utils.files import parse_json, read_lines, write_json
 from icrl4aht_data.utils.paths import resolve_inside
 from icrl4aht_data.utils.validation import check_int
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, atomic_folder, check_target
 from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays
-
-HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
-"""File names of the published code."""
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
@@ -69,28 +67,25 @@ def to_published(
     *,
     chunk: int = PUBLISHED_CHUNK,
     states: bool = True,
+    overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
     """Write a selection as the published code's two files, its histories numbered from 0.
 
     Args:
         dataset: a release, or a part of one.
-        target: the folder to write; nothing or an empty folder may be there.
+        target: the folder to write, which appears when it is complete.
         chunk: steps per chunk.
         states: also store the state records, if there are any: without them `from_published` makes a release of
             observations.
+        overwrite: replace a folder that was written by this function, or a release.
         advance: progress.
 
     Raises:
-        OptionError: if `target` exists and is not empty.
+        OptionError: if `target` may not be written, see `release_folder.check_target`.
     """
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise OptionError(f"{target}: exists; give a new folder")
-    folder = target.with_name(f".{target.name}.partial")
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
-    try:
+    with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         with h5py.File(folder / HISTORIES_H5, "w") as file, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = file.create_group(f"/{number}")
@@ -106,11 +101,7 @@ def to_published(
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
         kept = {task_id: of_task.to_json() for task_id, of_task in provenance.items() if task_id in wanted}
         write_json(folder / "provenance.json", kept)
-        if target.exists():
-            target.rmdir()
-        folder.rename(target)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        write_manifest(folder)
     return target
 
 
@@ -131,28 +122,32 @@ def from_published(
     tasks: Path | None = None,
     data_version: str = "0.1.0",
     kept_steps: int = KEPT_STEPS,
+    overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Kind:
     """Write a release from a folder with the published code's two files.
 
     Args:
         source: a folder with `histories.h5` and `histories_index.jsonl`.
-        target: the folder to write; a release there is replaced.
+        target: the folder to write, which appears when it is complete.
         kind: by default "lite" if the groups have state records, "observations" if none has.
         tasks: a JSONL file with the tasks that the index names; by default `tasks.jsonl` in `source`. A release of
             observations can be made without: it knows of its tasks what the index says.
         data_version: version of the data, SemVer.
         kept_steps: steps of every episode; an unfinished one may end a history.
+        overwrite: replace a release at `target`.
         advance: progress.
 
     Returns:
         The kind of the release.
 
     Raises:
+        OptionError: if `target` may not be written, see `release_folder.check_target`.
         PublishedFormatError: if a file is missing or malformed, or a group has no array that a release of that kind
             needs; names file and group.
     """
     kept_steps = check_int("kept_steps", kept_steps, 1)
+    check_target(target, overwrite, [source])
     lines = _read_index(resolve_inside(source, HISTORIES_INDEX))
     provenance_path = resolve_inside(source, "provenance.json")
     provenance = read_provenance(provenance_path) if provenance_path.is_file() else {}
@@ -177,7 +172,9 @@ def from_published(
             )
             for task, members in _tasks(histories, source, tasks, found)
         ]
-        write_release(target, found, new, data_version=data_version, kept_steps=kept_steps)
+        write_release(
+            target, found, new, data_version=data_version, kept_steps=kept_steps, overwrite=overwrite, sources=[source]
+        )
     return found
 
 

@@ -100,9 +100,11 @@ def write_release(
     kept_steps: int = KEPT_STEPS,
     shard_histories: int = 1024,
     shard_bytes: int = SHARD_BYTES,
+    overwrite: bool = False,
+    sources: Iterable[str | Path] = (),
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
-    """Write a release folder; an existing one at `target` is replaced when the new one is complete.
+    """Write a release folder, which appears when it is complete.
 
     Args:
         target: the folder to write.
@@ -115,11 +117,14 @@ def write_release(
         kept_steps: steps of every episode.
         shard_histories: maximum number of histories in a shard.
         shard_bytes: intended size of a shard, estimated from the first history of each layout.
+        overwrite: replace a release at `target`, if nothing else is in its folder.
+        sources: folders that the tasks are read from; `target` must be outside of them, and they outside of it.
         done: called after the histories of a task, for progress.
 
     Raises:
-        OptionError: if `target` exists and is not a release, if there is no task or one twice, if only some tasks are
-            known by name only, or if a history's arrays are missing, of unequal length or lossy.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, if there is no task or one
+            twice, if only some tasks are known by name only, or if a history's arrays are missing, of unequal length or
+            lossy.
     """
     new = list(tasks)
     ids = [task.task.task_id for task in new]
@@ -131,7 +136,7 @@ def write_release(
             f"{len(named)} of {len(ids)} tasks, such as {named[0]!r}, are known by name only: give all tasks or, in a "
             f"release of {OBSERVATIONS}, none"
         )
-    with atomic_folder(target) as root:
+    with atomic_folder(target, overwrite=overwrite, sources=sources) as root:
         writer = _ShardWriter(root, kind, kept_steps, shard_histories, shard_bytes, done)
         groups: dict[tuple[str, str, str], list[NewTask]] = defaultdict(list)
         for one in new:

@@ -1,42 +1,69 @@
-"""Atomic replacement of a release folder."""
+"""Atomic writing of a folder, which replaces another one only on demand, and only one that this package provably wrote.
+
+A folder is proved by its manifest: it lists every file of the folder, and each has the hash that the manifest says.
+"""
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import Timeout
 
-from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import INFO
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
+from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.locks import lock_beside, process_lock
+from icrl4aht_data.utils.paths import files_below
+
+HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
+"""File names of the published code."""
+
+_OWN = ((INFO, HISTORIES), (HISTORIES_H5, HISTORIES_INDEX))
+"""Files of a release, and of converted published files: a manifest of ours lists one of these pairs."""
+
+Snapshot = dict[str, tuple[int, int, int]]
+"""File of a folder -> its inode, size and time of change in nanoseconds."""
 
 
 @contextmanager
-def atomic_folder(target: Path) -> Iterator[Path]:
-    """Yield a new folder to fill, which replaces the release at `target` if the block ends without an error.
+def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[str | Path] = ()) -> Iterator[Path]:
+    """Yield a new folder to fill, which becomes `target` if the block ends without an error.
+
+    Args:
+        target: the folder to write.
+        overwrite: replace a release or converted published files at `target`.
+        sources: folders that are read meanwhile; addresses are ignored.
 
     Raises:
-        OptionError: if `target` exists and is not a release, or if another process is writing it.
+        OptionError: as `check_target`, before the block and again after it; if another process is writing the folder;
+            if a folder has the name of a temporary one.
     """
+    sources = tuple(sources)
+    before = check_target(target, overwrite, sources)
     target = target.resolve()
-    check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
+    lock = lock_beside(target)
+    foreign = [folder for folder in (new, old) if os.path.lexists(folder)]
+    if foreign and not lock.exists():  # a killed writer leaves its lock
+        raise OptionError(f"{foreign[0]}: was not left by this package; move it away, or give another folder")
     try:
-        with process_lock(lock_beside(target), wait=False):
-            if old.exists() and not target.exists():  # a writer was killed between the two renames below
-                old.rename(target)
-            for leftover in (new, old):
-                shutil.rmtree(leftover, ignore_errors=True)
-            new.mkdir()
+        with process_lock(lock, wait=False):
             try:
+                if old.exists() and not target.exists():  # a writer was killed between the two renames below
+                    old.rename(target)
+                    before = check_target(target, overwrite, sources)
+                for leftover in (new, old):
+                    shutil.rmtree(leftover, ignore_errors=True)
+                new.mkdir()
                 yield new
-                if target.exists():
-                    target.rename(old)
-                new.rename(target)
+                _replace(target, new, old, overwrite, before)
             finally:
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
@@ -44,11 +71,71 @@ def atomic_folder(target: Path) -> Iterator[Path]:
         raise OptionError(f"{target}: another process is writing it; wait for it, or give another folder") from error
 
 
-def check_replaceable(target: Path) -> None:
-    """Check that a release may be written at a path: nothing, an empty folder or a release may be there.
+def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = ()) -> Snapshot:
+    """Check that a folder may be written: it must not exist, except empty, or with `overwrite` as a folder of ours.
+
+    Args:
+        target: the folder to write.
+        overwrite: whether to replace a release or converted published files.
+        sources: folders that are read meanwhile, none equal to the target, inside or around it.
+
+    Returns:
+        The files to replace.
 
     Raises:
-        OptionError: if there is anything else.
+        OptionError: if the folder may not be written.
     """
-    if target.exists() and not (target.is_dir() and ((target / INFO).exists() or not any(target.iterdir()))):
-        raise OptionError(f"{target}: exists and is not a release; give another folder or remove it")
+    resolved = target.resolve()
+    for source in (Path(source) for source in sources if not is_address(source)):
+        read = source.resolve()
+        if read == resolved:
+            raise OptionError(f"{target}: is also read; give another folder")
+        if read.is_relative_to(resolved) or resolved.is_relative_to(read):
+            relation = "contains" if read.is_relative_to(resolved) else "is inside"
+            raise OptionError(f"{target}: {relation} {source}, which is read; give another folder")
+    if not os.path.lexists(target) or (resolved.is_dir() and not any(resolved.iterdir())):
+        return {}
+    if not overwrite:
+        raise OptionError(f"{target}: exists; give another folder, or replace it by --overwrite")
+    before = _snapshot(resolved)
+    fault = _foreign_content(resolved, before)
+    if fault:
+        raise OptionError(
+            f"{target}: {fault}; --overwrite replaces only what this package wrote, unchanged: remove the folder "
+            f"yourself, or give another one"
+        )
+    return before
+
+
+def _snapshot(folder: Path) -> Snapshot:
+    statuses = {name: (folder / name).lstat() for name in files_below(folder)} if folder.is_dir() else {}
+    return {name: (status.st_ino, status.st_size, status.st_mtime_ns) for name, status in statuses.items()}
+
+
+def _foreign_content(folder: Path, present: Iterable[str]) -> str | None:
+    """Return what of a folder this package did not write, in words; None if it wrote everything."""
+    if not folder.is_dir():
+        return "is not a folder"
+    try:
+        listed = read_manifest(folder)
+    except Icrl4ahtError as error:
+        return f"is not a release: {error}"
+    if not any(set(names) <= listed.keys() for names in _OWN):
+        return f"is not a release: its {MANIFEST} does not list {INFO}"
+    for name in sorted(present):
+        if name == MANIFEST:
+            continue
+        if name not in listed:
+            return f"has {name}, which its manifest does not list"
+        if (folder / name).is_symlink() or file_hash(folder / name) != listed[name]:
+            return f"{name} is not the file that was written, its hash differs from the manifest"
+    return None
+
+
+def _replace(target: Path, new: Path, old: Path, overwrite: bool, before: Snapshot) -> None:
+    """Rename the new folder to the target, and what was there to `old`."""
+    if target.is_dir() and any(target.iterdir()):
+        if not overwrite or _snapshot(target) != before:
+            raise OptionError(f"{target}: was changed while its replacement was written; nothing is replaced")
+        target.rename(old)
+    new.rename(target)

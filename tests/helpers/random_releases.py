@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -78,6 +79,7 @@ def random_release(
     labels: bool = True,
     seed: int = 0,
     shard_histories: int = 1024,
+    overwrite: bool = False,
 ) -> dict[int, dict[str, np.ndarray]]:
     """Write a release of random actions; returns the written arrays by history id."""
     rng = np.random.default_rng(seed)
@@ -92,9 +94,8 @@ def random_release(
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
         tasks.append(NewTask(task, Provenance(seed=seed), streams, lambda histories=histories: histories))
-    write_release(
-        root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
-    )
+    options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
+    write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)
     return written
 
 

@@ -61,12 +61,12 @@ reader: show --plot empty | 'empty' is a directory
 reader: download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 reader: download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 reader: download s3://a/b --to file | 'file' is a file
-reader: convert {MINI} out | give the form to convert to: --to full, lite, observations, published, parquet
-reader: convert {MINI} out --to parquet --kept-steps 50 | --kept-steps are for published files
-reader: convert {MINI} out --to lite --kept-steps 0 | 0 is not in the range x>=1
-reader: convert {MINI} out --to lite --tasks none | 'none' does not exist
-reader: combine file {MINI} | 'file' is a file
-reader: release build a b c | give one SOURCE at most, then OUT
+reader: convert {MINI} --out out | give the form to convert to: --to full, lite, observations, published, parquet
+reader: convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
+reader: convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
+reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist
+reader: combine {MINI} --out file | 'file' is a file
+reader: release build a b --out c | unexpected extra argument
 reader: upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
 generation: generate --out g --profile smke | unknown profile 'smke'; valid: mini, paper, smoke. Did you mean
 generation: generate --out file | 'file' is a file
@@ -107,12 +107,12 @@ reader: list --split test | no history has split=['test']. This release has trai
 reader: verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 reader: verify --split test | no history has split=['test']
 reader: list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
-reader: convert none out | none: no release here
-reader: convert {MINI} file/x --to lite | file: File exists; a file is where a folder is needed
-reader: convert {MINI} none/index --to parquet | none/index: No such file or directory; check the path;
-reader: combine out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
-reader: combine out {MINI} {MINI} | leave one of them out
-reader: release build empty out | empty: no release here
+reader: convert none --out out | none: no release here
+reader: convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
+reader: convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
+reader: combine --out out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
+reader: combine --out out {MINI} {MINI} | leave one of them out
+reader: release build empty --out out | empty: no release here
 reader: upload none hf://datasets/a/b --dry-run | none: no release here
 generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
@@ -141,7 +141,7 @@ def test_bad_input_has_a_message_and_an_exit_code(say, program, arguments, messa
 
 def test_empty_arguments_are_refused(say):
     assert say("reader", "list", "")[1].endswith("expected a release folder or an address, found an empty text")
-    assert say("reader", "release", "build", "")[1].endswith("expected a folder, found an empty text")
+    assert say("reader", "release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
 
 
 def test_verify_raises_for_unknown_names():

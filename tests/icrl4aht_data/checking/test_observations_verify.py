@@ -121,20 +121,24 @@ class TestCommand:
         return result.output if result.exception is None or code == 2 else f"{result.output}{result.exception}"
 
     def test_convert_says_what_is_missing(self, published_folder, tmp_path):
-        said = self.run("convert", published_folder[0], tmp_path / "out", "--kept-steps", KEPT)
+        said = self.run("convert", published_folder[0], "--out", tmp_path / "out", "--kept-steps", KEPT)
         assert said == f"{tmp_path / 'out'}: observations, no state records: nothing can be replayed or drawn\n"
-        self.run("convert", tmp_path / "out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide")
-        self.run("convert", tmp_path / "out", tmp_path / "files", "--to", "published")
+        self.run(
+            "convert", tmp_path / "out", "--out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide"
+        )
+        self.run("convert", tmp_path / "out", "--out", tmp_path / "files", "--to", "published")
         assert verify_release(tmp_path / "part").ok
         assert "is made of state records" in self.run(
-            "convert", tmp_path / "out", tmp_path / "full", "--to", "full", code=1
+            "convert", tmp_path / "out", "--out", tmp_path / "full", "--to", "full", code=1
         )
-        assert "give the form to convert to" in self.run("convert", tmp_path / "out", tmp_path / "x", code=2)
+        assert "give the form to convert to" in self.run("convert", tmp_path / "out", "--out", tmp_path / "x", code=2)
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_convert_to_what_needs_states(self, lite, tmp_path, kind):
         to_published(load_icrl4aht(lite[0]), tmp_path / "files", states=False)
-        said = self.run("convert", tmp_path / "files", tmp_path / "out", "--to", kind, "--kept-steps", KEPT, code=1)
+        said = self.run(
+            "convert", tmp_path / "files", "--out", tmp_path / "out", "--to", kind, "--kept-steps", KEPT, code=1
+        )
         assert "group /0: missing state, episode_end_state" in said
         assert f"a {kind} release is made of state records" in said
 

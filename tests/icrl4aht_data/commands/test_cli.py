@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 
 from click.testing import CliRunner
 
 from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.info import read_info
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
@@ -48,6 +51,37 @@ def test_show_plots(lite, tmp_path):
     picture = imread(tmp_path / "curves.png")
     assert picture.shape[0] > 300
     assert len({tuple(pixel) for pixel in picture[::7, ::7].reshape(-1, picture.shape[-1])}) > 5
+
+
+def test_commands_destroy_nothing(lite, full, tmp_path):
+    """Run commands with targets that exist: a release, a user's files, or the source itself."""
+    shutil.copytree(full[0], tmp_path / "cb")
+    shutil.copytree(lite[0], tmp_path / "ca")
+    (tmp_path / "mine").mkdir()
+    for name in ("thesis.txt", "index.parquet", "curves.png"):
+        (tmp_path / "mine" / name).write_text("years")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    ca, cb, mine = (str(tmp_path / name) for name in ("ca", "cb", "mine"))
+    commands = [
+        ("combine", ca, cb),  # this once replaced `ca`
+        ("release", "build", ca, cb),  # and this `cb`
+        ("convert", ca, cb, "--to", "full"),
+        *(("combine", ca, "--out", target, *more) for target in (ca, cb, mine) for more in ((), ("--overwrite",))),
+        *(("release", "build", ca, "--out", target) for target in (ca, cb, mine)),
+        *(("convert", ca, "--to", form, "--out", cb) for form in ("full", "published", "parquet")),
+        *(("convert", ca, "--to", form, "--out", mine, "--overwrite") for form in ("full", "published", "parquet")),
+        ("convert", ca, "--to", "parquet", "--out", f"{mine}/index.parquet", "--overwrite"),
+        ("show", ca, "--plot", f"{mine}/curves.png"),
+        ("show", ca, "--plot", f"{mine}/curves.png", "--overwrite"),
+    ]
+    commands.remove(("combine", ca, "--out", cb, "--overwrite"))  # `cb` is a release: replaced as demanded
+    for command in commands:
+        result = CliRunner().invoke(cli, command)
+        assert result.exit_code != 0, command
+        assert isinstance(result.exception, (SystemExit, OptionError)), (command, result.exception)
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before, command
+    result = CliRunner().invoke(cli, ["combine", ca, "--out", cb, "--overwrite", "-q"], catch_exceptions=False)
+    assert result.exit_code == 0 and read_info(tmp_path / "cb").kind == "lite"
 
 
 def test_errors_become_one_line_and_exit_code_1(tmp_path):

@@ -76,6 +76,21 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     assert "differs from the parameter sets" in str(result.exception)
 
 
+def test_manifests_are_replaced_on_demand(tmp_path):
+    arguments = ["manifests", "--out", str(tmp_path / "new")]
+    for _ in range(2):  # the second time, equal files are there
+        assert CliRunner().invoke(cli, arguments).exit_code == 0
+    path = tmp_path / "new" / "layout_test.jsonl"
+    assert read_tasks(path) == published_tasks("layout")
+    tasks.write_tasks(path, published_tasks("layout")[:-1])
+    assert "replace it by --overwrite" in str(CliRunner().invoke(cli, arguments).exception)
+    assert CliRunner().invoke(cli, [*arguments, "--overwrite"]).exit_code == 0
+    assert read_tasks(path) == published_tasks("layout")
+    path.write_text("mine")
+    assert CliRunner().invoke(cli, [*arguments, "--overwrite"]).exit_code == 1
+    assert path.read_text() == "mine"
+
+
 def test_unknown_manifest():
     with pytest.raises(UnknownNameError, match="unknown track 'tracks'"):
         manifest_path("tracks", "test")

@@ -188,6 +188,7 @@ def test_a_burst_of_server_errors_is_survived(hub, published):
     [
         ("*/refs", "GET", 403, r"token that may write to us: `hf auth login`, or set HF_TOKEN"),
         ("*/repos/create", "POST", 401, r"token that may write to us"),
+        ("*/refs", "GET", 500, r"nothing was sent: run the same command again"),
         ("*/commit/main", "POST", 500, r"files sent so far are kept: run the same command"),
         ("*/tag/*", "POST", 500, r"files sent so far are kept"),
     ],
@@ -204,8 +205,12 @@ def test_server_errors_are_wrapped_and_the_same_command_resumes(hub, published, 
 def test_an_unreachable_hub(published, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         hub.close()
-        with pytest.raises(UploadError, match=r"us/histories at http://127\.0\.0\.1:\d+: .*run the same command"):
-            upload_release(published, ADDRESS)
+        for dry_run in (True, False):
+            with pytest.raises(
+                UploadError, match=r"us/histories at http://.*; nothing was sent: run the same"
+            ) as error:
+                upload_release(published, ADDRESS, dry_run=dry_run)
+            assert "kept" not in str(error.value)
 
 
 def test_what_differs_after_the_upload_gets_no_tag(hub, published, tmp_path):

@@ -336,7 +336,7 @@ def test_download_command(lite, tmp_path, monkeypatch):
         result = run.invoke(cli, ["download", "--to", str(tmp_path / "mine")])
         assert result.exit_code == 0 and "bytes downloaded" in result.output
         assert contents(lite[0]).items() <= contents(tmp_path / "mine").items()
-        result = run.invoke(cli, ["convert", server.url, str(tmp_path / "full"), "--to", "full"])
+        result = run.invoke(cli, ["convert", server.url, "--out", str(tmp_path / "full"), "--to", "full"])
         assert result.exit_code == 0 and verify_release(tmp_path / "full", level="deep").ok
     monkeypatch.delenv("ICRL4AHT_REMOTE")
     assert run.invoke(cli, ["download"]).exit_code == 2

@@ -29,7 +29,8 @@ def parts(request, tmp_path_factory) -> list[Path]:
 
 
 def test_histories_are_those_of_the_parts(parts, tmp_path):
-    result = CliRunner().invoke(cli, ["combine", str(tmp_path / "out"), *map(str, parts)], catch_exceptions=False)
+    arguments = ["combine", *map(str, parts), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert "Filtered transitions" in result.output
     report = verify_release(tmp_path / "out", level="deep")
@@ -69,7 +70,7 @@ def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
         combine_releases(tmp_path / "out", [a, b])
     with pytest.raises(OptionError, match=r"c: environment .*'kept_steps': 10.*a has .*'kept_steps': 20"):
         combine_releases(tmp_path / "out", [a, c])
-    with pytest.raises(OptionError, match="is one of the releases to combine"):
+    with pytest.raises(OptionError, match="a: is also read; give another folder"):
         combine_releases(a, [a, d])
     info = json.loads((d / INFO).read_text())
     (d / INFO).write_text(json.dumps(info | {"data_version": "0.0.2"}))
@@ -79,4 +80,4 @@ def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
     assert json.loads((tmp_path / "out" / INFO).read_text())["data_version"] == "0.1.0"
     (d / INFO).write_text(json.dumps(info | {"format_version": 99}))
     with pytest.raises(FormatTooNewError, match="format version 99"):
-        combine_releases(tmp_path / "out", [a, d])
+        combine_releases(tmp_path / "new", [a, d])

@@ -101,12 +101,18 @@ def test_published_files_with_faults(published, tmp_path):
 def test_targets_that_are_taken(lite, tmp_path):
     dataset = load_icrl4aht(lite[0])
     (tmp_path / "file").touch()
-    with pytest.raises(OptionError, match="exists; give a new folder"):
-        to_published(dataset, tmp_path)
-    with pytest.raises(OptionError, match="is not a release"):
-        to_release(dataset, tmp_path, "full")
-    with pytest.raises(OptionError, match="the release itself"):
-        to_release(dataset, lite[0], "full")
+    for write in (to_published, lambda *arguments, **options: to_release(*arguments, "full", **options)):
+        with pytest.raises(OptionError, match="exists; give another folder, or replace it by --overwrite"):
+            write(dataset, tmp_path)
+        with pytest.raises(OptionError, match="is not a release"):
+            write(dataset, tmp_path, overwrite=True)
+        with pytest.raises(OptionError, match="lite: is also read"):
+            write(dataset, lite[0], overwrite=True)
+        with pytest.raises(OptionError, match=r"contains .*lite, which is read"):
+            write(dataset, lite[0].parent, overwrite=True)
+        with pytest.raises(OptionError, match=r"out: is inside .*lite, which is read"):
+            write(dataset, lite[0] / "out")
+    assert (tmp_path / "file").exists() and [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_parquet_index(lite, tmp_path):
@@ -120,13 +126,13 @@ def test_parquet_index(lite, tmp_path):
 @pytest.mark.parametrize("to", ["full", "published", "parquet"])
 def test_on_the_command_line(lite, tmp_path, to):
     target = tmp_path / ("index.parquet" if to == "parquet" else "out")
-    done = CliRunner().invoke(cli, ["convert", str(lite[0]), str(target), "--to", to, "--layout", "demo_wide"])
+    done = CliRunner().invoke(cli, ["convert", str(lite[0]), "--out", str(target), "--to", to, "--layout", "demo_wide"])
     assert done.exit_code == 0, done.output
     assert str(target) in done.output
     if to == "published":
-        back = CliRunner().invoke(
-            cli, ["convert", str(target), str(tmp_path / "r"), "--to", "lite", "--kept-steps", "20"]
-        )
+        arguments = ["convert", str(target), "--out", str(tmp_path / "r"), "--to", "lite", "--kept-steps", "20"]
+        back = CliRunner().invoke(cli, arguments)
         assert back.exit_code == 0, back.output
         assert verify_release(tmp_path / "r", level="deep").ok
-        assert CliRunner().invoke(cli, ["convert", str(target), str(tmp_path / "x"), "--to", "parquet"]).exit_code != 0
+        arguments = ["convert", str(target), "--out", str(tmp_path / "x"), "--to", "parquet"]
+        assert CliRunner().invoke(cli, arguments).exit_code != 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from hypothesis import strategies as st
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError, RootNotFoundError
 from icrl4aht_data.format.chunks import decode_chunk, encode_chunk
+from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, episode_returns
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
@@ -186,13 +188,15 @@ def test_a_failing_rewrite_leaves_the_old_release(tmp_path):
     root = tmp_path / "release"
     random_release(root, seed=1)
     before = (root / "MANIFEST.sha256").read_bytes()
-    with pytest.raises(RuntimeError, match="no data"):
+    with pytest.raises(OptionError, match="release: exists; give another folder, or replace it by --overwrite"):
         write_cramped(root, fail)
+    with pytest.raises(RuntimeError, match="no data"):
+        write_cramped(root, fail, overwrite=True)
     assert (root / "MANIFEST.sha256").read_bytes() == before
     assert verify_release(root).ok
-    random_release(root, seed=2)
+    random_release(root, seed=2, overwrite=True)
     assert (root / "MANIFEST.sha256").read_bytes() != before
-    assert visible(tmp_path) == ["release"]
+    assert [path.name for path in tmp_path.iterdir()] == ["release"], "no lock is left"
 
 
 def test_no_task_and_a_task_twice_are_refused(tmp_path):
@@ -217,7 +221,10 @@ def test_a_writer_killed_between_the_two_renames(tmp_path):
     random_release(tmp_path / "release", seed=1)
     before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
     (tmp_path / "release").rename(tmp_path / ".release.old")
-    with pytest.raises(RuntimeError):
+    with pytest.raises(OptionError, match=r"\.release\.old: was not left by this package"):
+        write_cramped(tmp_path / "release", fail)
+    (tmp_path / ".release.lock").touch()
+    with pytest.raises(OptionError, match="release: exists"):
         write_cramped(tmp_path / "release", fail)
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
 
@@ -225,7 +232,7 @@ def test_a_writer_killed_between_the_two_renames(tmp_path):
 def test_a_link_to_a_release_is_followed(tmp_path):
     random_release(tmp_path / "real", seed=1)
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    random_release(tmp_path / "link", seed=2, streams=1)
+    random_release(tmp_path / "link", seed=2, streams=1, overwrite=True)
     assert (tmp_path / "link").is_symlink()
     assert verify_release(tmp_path / "real").histories == 4
 
@@ -234,11 +241,61 @@ def test_only_releases_are_replaced(tmp_path):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
-    for name in ("file", "mine"):
-        with pytest.raises(OptionError, match="is not a release"):
+    (tmp_path / "listed").mkdir()
+    (tmp_path / "listed" / "thesis.txt").write_text("years")
+    write_manifest(tmp_path / "listed")
+    for name, fault in {"file": "is not a folder", "mine": "is not a release", "listed": "does not list"}.items():
+        with pytest.raises(OptionError, match="exists"):
             random_release(tmp_path / name)
+        with pytest.raises(OptionError, match=fault):
+            random_release(tmp_path / name, overwrite=True)
     assert (tmp_path / "file").read_text() == "mine"
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
+
+
+def add_note(root: Path) -> None:
+    (root / "note.txt").write_text("mine")
+
+
+def edit_card(root: Path) -> None:
+    (root / "README.md").write_text("mine")
+
+
+def edit_shard(root: Path) -> None:
+    shard = next(root.rglob("*.h5"))
+    shard.write_bytes(shard.read_bytes()[:-1] + b"?")
+
+
+def link_card(root: Path) -> None:
+    (root / "README.md").rename(root.parent / "card.md")
+    (root / "README.md").symlink_to(root.parent / "card.md")
+
+
+@pytest.mark.parametrize("spoil", [add_note, edit_card, edit_shard, link_card])
+def test_a_release_with_anything_of_the_users_is_not_replaced(lite, tmp_path, spoil):
+    root = tmp_path / "release"
+    shutil.copytree(lite[0], root)
+    spoil(root)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(OptionError, match=r"--overwrite replaces only what this package wrote, unchanged"):
+        write_cramped(root, lambda: [NewHistory(0, played())], overwrite=True)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+
+
+def test_what_appears_meanwhile_is_not_replaced(tmp_path):
+    root = tmp_path / "release"
+
+    def meanwhile() -> list[NewHistory]:
+        root.mkdir(exist_ok=True)
+        add_note(root)
+        return [NewHistory(0, played())]
+
+    for overwrite in (False, True):
+        with pytest.raises(OptionError, match="was changed while its replacement was written"):
+            write_cramped(root, meanwhile, overwrite=overwrite)
+        assert (root / "note.txt").read_text() == "mine"
+        shutil.rmtree(root)
+        random_release(root, seed=1)
 
 
 @pytest.mark.parametrize(
