@@ -16,6 +16,7 @@ from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
+from baselines.training.seen import SEEN, seen_in
 from baselines.training.trainer import TrainingData
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -78,6 +79,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "data_version": dataset.info.data_version,
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
+            SEEN: seen_in(split.train).to_json(),
         },
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
@@ -173,6 +175,7 @@ class TrainedModel(NamedTuple):
         obs_shape: shape of the observations that it takes.
         label: as reports show it.
         hash: of the run's settings.
+        seen: layouts and teammates in training, see `seen.SeenInTraining.to_json`; None if the run does not say.
     """
 
     method: Method
@@ -183,6 +186,7 @@ class TrainedModel(NamedTuple):
     obs_shape: tuple[int, ...]
     label: str
     hash: str
+    seen: dict[str, Any] | None = None
 
 
 def read_trained(folder: Path) -> TrainedModel:
@@ -210,4 +214,5 @@ def read_trained(folder: Path) -> TrainedModel:
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
-    return TrainedModel(method, params, step, context, names, layouts[0].obs_shape, label, json_hash(config))
+    shape, seen = layouts[0].obs_shape, histories.get(SEEN)
+    return TrainedModel(method, params, step, context, names, shape, label, json_hash(config), seen)
