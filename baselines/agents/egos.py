@@ -13,7 +13,6 @@ from baselines.agents.oracle import oracle
 from baselines.methods.method import Method
 from baselines.methods.tokens import percept_step
 from baselines.training.histories import TrainedModel, read_trained
-from baselines.training.seen import SEEN
 from generation.policy import Policy
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
@@ -114,8 +113,7 @@ def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
         check_fits(run, layout, folder)
         return policy
 
-    details = {"run": run.hash, "step": run.step, "context": run.context, "acting": acting}
-    return NamedEgo(run.label, make, details | ({SEEN: run.seen} if run.seen else {}))
+    return NamedEgo(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})
 
 
 def check_fits(run: TrainedModel, layout: Layout, folder: Path) -> None:

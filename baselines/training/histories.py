@@ -16,7 +16,6 @@ from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
-from baselines.training.seen import SEEN, seen_in
 from baselines.training.trainer import TrainingData
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -79,7 +78,6 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "data_version": dataset.info.data_version,
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
-            SEEN: seen_in(split.train).to_json(),
         },
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
@@ -175,7 +173,6 @@ class TrainedModel(NamedTuple):
         obs_shape: shape of the observations that it takes.
         label: as reports show it.
         hash: of the run's settings.
-        seen: layouts and teammates in training, see `seen.SeenInTraining.to_json`; None if the run does not say.
     """
 
     method: Method
@@ -186,7 +183,6 @@ class TrainedModel(NamedTuple):
     obs_shape: tuple[int, ...]
     label: str
     hash: str
-    seen: dict[str, Any] | None = None
 
 
 def read_trained(folder: Path) -> TrainedModel:
@@ -214,5 +210,4 @@ def read_trained(folder: Path) -> TrainedModel:
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
-    shape, seen = layouts[0].obs_shape, histories.get(SEEN)
-    return TrainedModel(method, params, step, context, names, shape, label, json_hash(config), seen)
+    return TrainedModel(method, params, step, context, names, layouts[0].obs_shape, label, json_hash(config))

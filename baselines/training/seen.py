@@ -1,4 +1,4 @@
-"""What a model was trained on: the layouts and teammates that it has seen, which reports compare with its tests."""
+"""Layouts and teammates that a model has seen in training, which reports compare with those it is tested on."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
 from icrl4aht_data.utils.files import json_hash
 
-SEEN = "seen_in_training"
-"""Key of the record in a run's config.json, under `histories`, and in the `details` of evaluation settings."""
+TRAINED_ON = "trained_on"
+"""Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
+
+_KINDS = {family: tuple(kind for kind, of in HEURISTIC_KINDS.items() if of == family) for family in FAMILIES}
+_KINDS["rl"] = ALGORITHMS
 
 
 class SeenInTraining(NamedTuple):
@@ -21,20 +25,15 @@ class SeenInTraining(NamedTuple):
     Attributes:
         layouts: short names.
         teammates: teammate kind, such as "utility_greedy" or "fcp" -> ids of its teammates, see `teammate_id`; None if
-            the release does not say which teammates of this kind it has.
+            they are not known.
     """
 
     layouts: tuple[str, ...] = ()
     teammates: Mapping[str, tuple[str, ...] | None] = {}
 
-    def to_json(self) -> dict[str, Any]:
-        """Returns the record as JSON values; `parse_seen` reads it."""
-        teammates = {kind: None if ids is None else list(ids) for kind, ids in self.teammates.items()}
-        return {"layouts": list(self.layouts), "teammates": teammates}
-
 
 def teammate_id(teammate: Mapping[str, Any]) -> str:
-    """Returns the id of a teammate's policy, 16 hexadecimal digits that are equal for equal policies of one kind.
+    """Returns 16 hexadecimal digits that are the same for teammates of one kind with one policy.
 
     Args:
         teammate: kind and theta, as in a task. The numbers of a heuristic are compared in single precision, since some
@@ -46,46 +45,50 @@ def teammate_id(teammate: Mapping[str, Any]) -> str:
     return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
 
 
-def seen_in(dataset: Dataset) -> SeenInTraining:
-    """Returns the record of training on all histories of a selection."""
-    _, first = np.unique(dataset.column("task_id"), return_index=True)
-    ids: dict[str, set[str | None]] = {}
-    for history_id in dataset.ids[first].tolist():
-        ids.setdefault(dataset.index.entry(history_id).teammate_kind, set()).add(_recovered_id(dataset, history_id))
-    known = {kind: None if None in found else tuple(sorted(map(str, found))) for kind, found in sorted(ids.items())}
-    return SeenInTraining(tuple(layout.name for layout in dataset.layouts), known)
-
-
-def _recovered_id(dataset: Dataset, history_id: int) -> str | None:
+def teammate_ids(dataset: Dataset, history_ids: np.ndarray) -> list[str] | None:
+    """Returns the sorted ids of the teammates of some histories, or None if the release does not describe them all."""
+    _, first = np.unique([dataset.index.entry(int(row)).task_id for row in history_ids], return_index=True)
     try:
-        return teammate_id(dataset.recover_teammate(history_id))
+        return sorted({teammate_id(dataset.recover_teammate(int(row))) for row in history_ids[first]})
     except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
         return None
 
 
-def parse_seen(content: Any, where: str) -> SeenInTraining:
-    """Returns the record in JSON values.
+def read_trained_on(entries: Any, where: str) -> SeenInTraining:
+    """Returns what a record of training data says.
 
     Args:
-        content: see `SeenInTraining.to_json`.
-        where: origin of the content, for the message.
+        entries: JSON list of entries with `layout` and `family`, usually also `algorithm` (the kind of a heuristic, or
+            the algorithm of a learned teammate) and `teammates` (ids, see `teammate_id`); empty for an agent that was
+            not trained.
+        where: origin of the record, for the message.
 
     Raises:
-        OptionError: if it is no such record.
+        OptionError: if it is no such list.
     """
-    layouts = content.get("layouts") if isinstance(content, dict) else None
-    teammates = content.get("teammates") if isinstance(content, dict) else None
-    if not _are_names(layouts) or not isinstance(teammates, dict):
+    if not isinstance(entries, list | tuple):
+        raise OptionError(f"{where}: {TRAINED_ON}: expected a list of entries, found {str(entries)[:200]!r}")
+    seen: dict[str, tuple[str, ...] | None] = {}
+    layouts = []
+    for entry in entries:
+        layout, kinds, ids = _read_entry(entry, where)
+        layouts.append(layout)
+        for kind in kinds:
+            known = seen.get(kind, ())
+            seen[kind] = None if ids is None or known is None else tuple(sorted({*known, *ids}))
+    return SeenInTraining(tuple(dict.fromkeys(layouts)), seen)
+
+
+def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str] | None]:
+    """Returns an entry's layout, teammate kinds and teammate ids."""
+    fields = entry if isinstance(entry, dict) else {}
+    layout, family, algorithm = (fields.get(name) for name in ("layout", "family", "algorithm"))
+    ids = fields.get("teammates")
+    kinds = _KINDS.get(family, ()) if isinstance(family, str) else ()
+    valid_ids = ids is None or (isinstance(ids, list | tuple) and all(isinstance(name, str) for name in ids))
+    if not isinstance(layout, str) or not kinds or algorithm not in (None, *kinds) or not valid_ids:
         raise OptionError(
-            f"{where}: {SEEN}: expected layouts, a list of names, and teammates, a list of ids by kind; found "
-            f"{content!r:.200}"
+            f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(FAMILIES)}), perhaps an algorithm of this "
+            f"family and a list of teammates' ids; found {str(entry)[:200]!r}"
         )
-    for kind, ids in teammates.items():
-        if ids is not None and not _are_names(ids):
-            raise OptionError(f"{where}: {SEEN}: ids of {kind}: expected a list of names or null, found {ids!r:.200}")
-    known = {kind: None if ids is None else tuple(ids) for kind, ids in teammates.items()}
-    return SeenInTraining(tuple(layouts), known)
-
-
-def _are_names(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
+    return layout, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)

@@ -2,40 +2,25 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from baselines.training.histories import hold_out
-from baselines.training.seen import SeenInTraining, parse_seen, seen_in, teammate_id
+from baselines.training.seen import SeenInTraining, read_trained_on, teammate_id, teammate_ids
 from generation.teammates.instances import published_task
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import NotStoredError, OptionError
 
 
-def test_the_record_names_the_layouts_and_teammates_of_a_selection():
-    tasks = [task for task in read_tasks(MINI / "meta" / "tasks.jsonl") if task.split == "train"]
-    dataset = load_icrl4aht(split="train", layout=["demo_simple", "demo_wide"])
-    seen = seen_in(dataset)
-    assert seen.layouts == ("demo_simple", "demo_wide")
-    expected: dict[str, set[str]] = {}
-    for task in tasks:
-        if task.layout.name in seen.layouts:
-            expected.setdefault(task.teammate_kind, set()).add(teammate_id(task.teammate))
-    assert {kind: set(ids or ()) for kind, ids in seen.teammates.items()} == expected
-    assert parse_seen(json.loads(json.dumps(seen.to_json())), "run.json") == seen
-
-
-def test_held_out_teammates_are_not_in_the_record():
+def test_held_out_teammates_are_not_among_those_in_training():
     dataset = load_icrl4aht(split="train", layout="demo_simple")
     split = hold_out(dataset, 0.1)
     assert split.teammates is not None
-    held = {teammate_id(dataset.recover_teammate(int(history_id))) for history_id in split.teammates.ids}
-    trained = {name for ids in seen_in(split.train).teammates.values() for name in ids or ()}
+    held = teammate_ids(dataset, split.teammates.ids)
+    trained = teammate_ids(dataset, split.train.ids)
     assert held
-    assert not held & trained
+    assert trained
+    assert not set(held) & set(trained)
+    assert len(trained) == len({entry.task_id for entry in split.train.entries})
 
 
 def test_teammates_of_one_policy_have_one_id():
@@ -48,20 +33,42 @@ def test_teammates_of_one_policy_have_one_id():
     assert teammate_id(policy) == "ab" * 8
 
 
-def test_releases_without_tasks_say_that_teammates_are_unknown(monkeypatch):
+def test_releases_without_tasks_do_not_know_their_teammates(monkeypatch):
     dataset = load_icrl4aht(split="train", layout="demo_simple")
 
     def recover(history_id):
         raise NotStoredError("no tasks")
 
     monkeypatch.setattr(dataset, "recover_teammate", recover)
-    kinds = {entry.teammate_kind for entry in dataset.entries}
-    assert seen_in(dataset) == SeenInTraining(("demo_simple",), dict.fromkeys(sorted(kinds)))
+    assert teammate_ids(dataset, dataset.ids) is None
+
+
+def test_records_join_the_entries_of_a_kind():
+    greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["b"]}
+    learned = {"layout": "demo_wide", "split": "train", "family": "rl", "algorithm": "fcp", "teammates": ["a", "c"]}
+    found = read_trained_on([greedy, greedy | {"layout": "demo_simple", "teammates": ["a"]}, learned], "run.json")
+    expected = {"utility_greedy": ("a", "b"), "fcp": ("a", "c")}
+    assert found == SeenInTraining(("demo_wide", "demo_simple"), expected)
+    unknown = read_trained_on([learned, learned | {"teammates": None}], "run.json")
+    assert unknown.teammates == {"fcp": None}
+    any_algorithm = read_trained_on([{"layout": "demo_wide", "family": "rl"}], "run.json")
+    assert any_algorithm.teammates == dict.fromkeys(("fcp", "brdiv", "lbrdiv", "comedi"))
+    assert read_trained_on([], "run.json") == SeenInTraining()
 
 
 @pytest.mark.parametrize(
-    "content", [None, [], {}, {"layouts": "demo_wide", "teammates": {}}, {"layouts": [], "teammates": {"fcp": [3]}}]
+    "entries",
+    [
+        None,
+        "demo_wide",
+        ["demo_wide"],
+        [{"layout": "demo_wide"}],
+        [{"layout": 3, "family": "H4"}],
+        [{"layout": "demo_wide", "family": "H5"}],
+        [{"layout": "demo_wide", "family": "H4", "algorithm": "fcp"}],
+        [{"layout": "demo_wide", "family": "H4", "teammates": [3]}],
+    ],
 )
-def test_records_of_another_form_are_refused(content):
-    with pytest.raises(OptionError, match=r"run\.json: seen_in_training: .*expected"):
-        parse_seen(content, "run.json")
+def test_records_of_another_form_are_refused(entries):
+    with pytest.raises(OptionError, match=r"run\.json: trained_on: expected "):
+        read_trained_on(entries, "run.json")
