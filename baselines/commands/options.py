@@ -114,7 +114,8 @@ def history_filters(command: Any) -> Any:
 
     @functools.wraps(command)
     def collect(*args: Any, **values: Any) -> Any:
-        return command(*args, filters={name: values.pop(name) for name in FILTERS}, **values)
+        filters = {name: chosen for name in FILTERS if (chosen := values.pop(name))}
+        return command(*args, filters=filters, **values)
 
     decorated: Any = collect
     for option in reversed(options):
