@@ -187,7 +187,7 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0) -> HistorySpli
     """
     if not 0 < share < 1:
         raise OptionError(f"share = {share}: expected a number between 0 and 1")
-    names, codes = dataset.index.values("task_id"), dataset.column("task_id")
+    names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
     tasks = sorted(np.unique(codes).tolist(), key=lambda code: _rank(seed, names[code]))
     held_tasks = tasks[: _count(share, len(tasks)) if len(tasks) > 1 else 0]
     env_idx, held = dataset.column("env_idx"), np.zeros(len(dataset), bool)
