@@ -11,7 +11,7 @@ from filelock import FileLock
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import parse_manifest
+from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import atomic_write
 from tests.robustness.faults.series import FAMILIES, run
@@ -51,6 +51,9 @@ def test_episodes_one_step_shorter_by_a_flipped_bit(workspace, tmp_path):
     shutil.copytree(workspace.small, root)
     info = root / "meta" / "info.json"
     info.write_text(info.read_text().replace('"kept_steps": 15', '"kept_steps": 14'))
+    with pytest.raises(IndexFormatError, match=r"info\.json: expected sha256"):
+        load_icrl4aht(root)
+    write_manifest(root)
     dataset = load_icrl4aht(root, layout="demo_wide")
     with pytest.raises(OptionError, match="some history's episodes have not 14 steps; run `icrl4aht-data verify`"):
         dataset.ad(batch_size=4, length=5, episodes=(1, 4))

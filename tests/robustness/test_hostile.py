@@ -21,7 +21,7 @@ from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_pol
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import parse_manifest
+from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.remote.download import ORIGIN, repair
 from icrl4aht_data.utils.files import atomic_write, parse_json
 from tests.helpers.paths import ROOT
@@ -130,6 +130,7 @@ def test_a_link_is_not_written_through(tmp_path):
 def test_names_are_not_read_as_markup(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
+    write_manifest(damaged)
     result = CliRunner().invoke(cli, ["list", str(damaged)], catch_exceptions=False)
     assert "[/b][link=file:///]" in result.output
 

@@ -41,6 +41,8 @@ FAMILIES: dict[str, tuple[remote.Family, int]] = {
     "cache build killed": (local.killed_builds, 10),
     "two downloads at once": (local.two_downloads, 5),
     "two readers at once": (local.two_readers, 5),
+    "mapped arrays' disk full": (local.full_mmap, 20),
+    "damaged caches": (local.damaged_caches, 100),
     "bit flips": (local.bit_flips, 1000),
     "mutated index or manifest": (local.mutations, 200),
     "hub: connection cut": (anywhere(remote.cut, on_hub), 12),
