@@ -170,6 +170,19 @@ for number in itertools.count():
 """
 
 
+_BUILD_ONCE = """
+import os, sys
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.format import columns
+
+columns._UNCACHED = 0
+os.environ["ICRL4AHT_CACHE_DIR"] = sys.argv[2]
+print(flush=True)
+sys.stdin.readline()
+load_icrl4aht(sys.argv[1], cache="mmap").storage
+"""
+
+
 def _start(code: str, *arguments: object, wait: bool = False) -> subprocess.Popen[str]:
     """Start a Python process that runs `code`, and with `wait` read its first line."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
@@ -284,10 +297,9 @@ def full_mmap(workspace: Workspace, n: int) -> Iterator[Attempt]:
     with workspace.fresh_folders() as to, patch.object(columns, "_UNCACHED", 0):
         workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
         sizes = [path.stat().st_size for path in to.parent.rglob("*.npy")]
+    most = 1.2 * (sum(sizes) + PAGE * len(sizes) if can_mount() else max(sizes))
     for number in range(n):
-        mounted = number % 2 == 0 and can_mount()
-        most = 1.2 * (sum(sizes) + PAGE * len(sizes) if mounted else max(sizes))
-        yield partial(attempt, PAGE + int(most * number / max(n - 1, 1)) // PAGE * PAGE, mounted)
+        yield partial(attempt, PAGE + int(most * number / max(n - 1, 1)) // PAGE * PAGE, can_mount())
 
 
 def damaged_caches(workspace: Workspace, n: int) -> Iterator[Attempt]:
@@ -315,6 +327,23 @@ def damaged_caches(workspace: Workspace, n: int) -> Iterator[Attempt]:
     right = contents(caches)
     for _ in range(n):
         yield partial(attempt, str(workspace.rng.choice(list(right))), str(workspace.rng.choice(list(DAMAGES))))
+
+
+def two_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Two processes build the caches of index and arrays at the same time."""
+
+    def attempt() -> None:
+        caches = workspace.new_path()
+        _check_success([_start(_BUILD_ONCE, workspace.release, caches, wait=True) for _ in range(2)], "\n")
+        names = {path.name.split("-")[0] for path in caches.iterdir()}
+        check(names <= {"index", "histories", ".hashes"}, f"left behind: {names}")
+        with environment({"ICRL4AHT_CACHE_DIR": str(caches)}), patch.object(columns, "_UNCACHED", 0):
+            made = contents(caches)
+            workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
+            check(contents(caches) == made, "built again")
+
+    for _ in range(n):
+        yield partial(attempt)
 
 
 class DamagedCopy:
