@@ -6,10 +6,9 @@ import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from filelock import FileLock
-
 from generation.collection.job import TaskOutcome
 from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.utils.locks import process_lock
 
 FAILED = "failed.jsonl"
 
@@ -19,7 +18,6 @@ class FailureLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock = FileLock(path.with_name(f".{path.name}.lock"))
 
     def add(self, outcome: TaskOutcome) -> None:
         """Add a task's line, or replace the one of an earlier attempt."""
@@ -37,8 +35,7 @@ class FailureLog:
         self._change(lambda lines: [line for line in lines if line["task_id"] not in finished])
 
     def _change(self, change: Callable[[list[dict]], list[dict]]) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self._lock:
+        with process_lock(self.path.with_name(f".{self.path.name}.lock")):
             before = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
             after = change(before)
             if not after:
