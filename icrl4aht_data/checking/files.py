@@ -14,7 +14,6 @@ from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.schema import MANIFEST, TEAMMATES
-from icrl4aht_data.remote.download import ORIGIN
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
@@ -40,7 +39,7 @@ def check_files(
     if not quick or origin.remote is None:  # files of a remote need not be downloaded for a quick check
         for name in sorted(expected - present):
             report.add(name, "listed in the manifest, but missing")
-    for name in sorted(present - listed.keys() - {MANIFEST, ORIGIN}):
+    for name in sorted(present - listed.keys() - {MANIFEST}):
         if not name.startswith(_HUB_FILES):
             report.add(name, "not listed in the manifest")
     both = sorted(expected & present)

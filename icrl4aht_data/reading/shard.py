@@ -117,11 +117,9 @@ class Shard:
     def _check_size(self) -> None:
         """Check that the file is long enough for every chunk."""
         try:
-            size = self.path.stat().st_size
+            size = self.path.stat().st_size if self._remote is None else self._remote.size(self.name)
         except FileNotFoundError as error:
-            if self._remote is None:
-                raise self._missing() from error
-            size = self._remote.size(self.name)
+            raise self._missing() from error
         except OSError as error:
             raise self._unreadable(error) from error
         offset, length = self.table["offset"], self.table["size"]
@@ -217,6 +215,8 @@ class Shard:
         try:
             check_chunk(data, self.table[row])
         except ValueError as error:
+            if self._remote is not None:
+                return self._remote.part(self.name).chunk(self.table[row])
             raise ShardCorruptError(
                 f"{self.path}: {self.describe(row)}: {error}; the file is damaged, fetch the shard again"
             ) from error
@@ -244,7 +244,7 @@ class Shard:
 
         Empty for a shard on this machine's disk.
         """
-        if self._remote is None or self.path.exists():
+        if self._remote is None or self._remote.is_here(self.name):
             return []
         wanted = set()
         for _, history_id, field, start, stop in ranges:
