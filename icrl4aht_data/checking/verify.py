@@ -94,6 +94,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if origin.remote is not None and report.level != "quick":
         _fetch(origin.remote, sorted(chosen), report, advance)
     check_files(origin, listed, chosen, report, advance)
+    check_names(origin.folder, listed, report)
     if unreadable is not None:
         report.add("meta", str(unreadable))
         return
@@ -101,14 +102,19 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
+    if index.info.format_version < STRONG_HASHES:
+        report.notes.append(
+            f"format version {index.info.format_version}: its chunk tables have no strong hashes, only CRC-32, which "
+            f"finds accidents but no forgery; `icrl4aht-data convert` brings it to version {FORMAT_VERSION}"
+        )
+    check_provenance(index, tasks, report)
     check_index(index, tasks, chosen, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
-    if report.level == "quick":
-        check_shard_sizes(origin, index, shards, report)
-    else:
+    check_shard_sizes(origin, index, shards, report)
+    if report.level != "quick":
         check_checkpoints(origin.folder, tasks, report)
         _check_shards(index, shards, report, advance)
 

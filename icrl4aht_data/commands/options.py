@@ -24,6 +24,7 @@ from icrl4aht_data.commands.requirements import PACKAGE, extra_with
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.disk import FULL, describe_disk
 
 SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
 
@@ -35,7 +36,8 @@ _REMEDIES = {
     errno.EACCES: "give a folder that you may write to, and files that you may read",
     errno.EPERM: "give a folder that you may write to, and files that you may read",
     errno.EROFS: "give a folder that can be written to",
-    errno.ENOSPC: "free some space, or give a folder on another disk",
+    errno.EFBIG: "a limit on the size of files is set, see `ulimit -f`",
+    **dict.fromkeys(FULL, "free some space, or give a folder on another disk"),
 }
 
 
@@ -270,4 +272,6 @@ def _in_words(error: OSError) -> str:
     if path.name.startswith(".") and path.suffix in (".partial", ".lock"):
         path = path.with_name(path.stem.removeprefix("."))
     remedy = _REMEDIES.get(error.errno)
+    if error.errno in FULL:
+        remedy = f"{describe_disk(path)}: {remedy}"
     return f"{path}: {os.strerror(error.errno)}" + (f"; {remedy}" if remedy else "")
