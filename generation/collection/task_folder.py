@@ -6,6 +6,7 @@
   metrics.jsonl       one line per update
   checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
   timing.jsonl        wall-clock figures, not hashed
+  filter.png labeller_returns.json   added by packing, not hashed
 <task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
 .<task_id>.lock       held by the collector that works on it
 """
@@ -36,7 +37,8 @@ from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
-FILTER_CURVES = "filter.png"
+FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
+"""Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
 
 EGO_CHECKPOINTS = 5
 """Checkpoints of each ego, evenly spaced over its training, as those of learned teammates are."""

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from generation.collection.failures import FAILED
-from generation.collection.task_folder import FILTER_CURVES
+from generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS
 from generation.learners.resume import TIMING
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.hashes import file_hash
 
-_IGNORED = {TIMING, FAILED, FILTER_CURVES}
-"""Files about the course of a rebuild, and pictures of its results."""
+_IGNORED = {TIMING, FAILED, FILTER_CURVES, LABELLER_RETURNS}
+"""Files about the course of a rebuild, and those that packing adds to artefacts."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
@@ -38,7 +38,9 @@ class Comparison:
 
 
 def compare_rebuilds(a: Path, b: Path) -> Comparison:
-    """Compare two folders by the hashes of their files, except wall-clock figures, failures, pictures and hidden files.
+    """Compare two folders by the hashes of their files.
+
+    Wall-clock figures, failures, hidden files and what packing adds to artefacts are left out.
 
     Raises:
         OptionError: if one is not a folder, or there is nothing to compare.
