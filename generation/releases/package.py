@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def package_release(
     profile: Profile,
     suite: Path,
     kind: Kind,
-    done: Callable[[Task], None] = lambda task: None,
+    advance: Callable[[Literal[0, 1]], None] = lambda step: None,
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
@@ -48,10 +49,13 @@ def package_release(
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
-        done: called after each task.
+        advance: called after each task with 0, when its labeller is chosen, and with 1, when it is written.
     """
-    new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
-    return write_release(target, kind, new, data_version=profile.data_version, done=done)
+    new = []
+    for task in tasks:
+        new.append(_new_task(artefacts / task.task_id, task, profile, suite))
+        advance(0)
+    return write_release(target, kind, new, data_version=profile.data_version, done=lambda task: advance(1))
 
 
 def bundle_release(release: Path) -> Path:
