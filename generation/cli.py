@@ -105,6 +105,15 @@ def cli() -> None:
     "--suite", type=Folder(), metavar="FOLDER", help="Folder of the learned teammates.", show_default="OUT/suite"
 )
 @click.option("--seed", type=SEED, default=0, help="Seed of the learned teammates.")
+@click.option(
+    "--tasks",
+    "task_file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, and train no teammates: --suite is a "
+    "suite that has them, or the release's folder teammates.",
+    show_default="the profile's tasks",
+)
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
 @_threads_option
 @dataclass_options(CollectOptions, "collect")
@@ -115,6 +124,7 @@ def generate(
     kind: tuple[Kind, ...],
     suite: Path | None,
     seed: int,
+    task_file: Path | None,
     bundle: bool,
     xla_threads: int | None,
     collect: dict[str, Any],
@@ -139,7 +149,9 @@ def generate(
     if options.executor == "ray":
         allocate_gpu_memory_on_demand()
     profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
-    releases = dict(zip(kind, build_releases(profile, out, kind, console, options, suite, seed), strict=True))
+    tasks = read_tasks(task_file) if task_file else None
+    built = build_releases(profile, out, kind, console, options, suite, seed, tasks)
+    releases = dict(zip(kind, built, strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
@@ -201,6 +213,9 @@ def check(a: Path, b: Path, as_json: bool) -> None:
         for name, difference in compared.differences.items():
             click.echo(f"{name}: {difference}")
         verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+        for folder, threads in zip((a, b), compared.xla_threads, strict=True):
+            numbers = " and ".join(map(str, threads)) or "an unknown number of"
+            click.echo(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
         click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
     sys.exit(1 if compared.differences else 0)
 

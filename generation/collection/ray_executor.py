@@ -16,6 +16,7 @@ from rich.text import Text
 from generation.collection.job import CollectionJob, TaskOutcome
 from generation.collection.options import CollectOptions, request_determinism
 from generation.collection.task_folder import last_timing
+from generation.learners.resume import limit_xla_threads
 from generation.progress import ProgressBoard
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError

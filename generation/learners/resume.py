@@ -180,9 +180,10 @@ class StateFile:
             raise self._unreadable(repr(error)) from error
         different = {} if self.settings is None else differing_settings(settings, self.settings)
         for name, (found, expected) in different.items():
+            resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
             raise OtherSettingsError(
                 f"{self.path}: saved by a training of other settings: {name} was {found!r}, now it is {expected!r}; "
-                f"remove the file to start again, or choose another folder"
+                f"{resume}remove the file to start again, or choose another folder"
             )
         return progress
 

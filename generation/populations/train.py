@@ -56,7 +56,10 @@ POPULATION_SAVE_SECONDS = 60.0
 """Interval of saves: the work that a kill can cost."""
 
 _SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
-_POPULATION, _RESUME = "population.json", "resume.safetensors"
+POPULATION = "population.json"
+"""The record of a finished population."""
+
+_RESUME = "resume.safetensors"
 
 PopulationCallback = Callable[[int, int, dict[str, float]], None]
 """Called after each update with its number, the number of all updates, and the metrics."""
@@ -144,7 +147,7 @@ class PopulationRun:
 def is_population_finished(folder: Path, run: PopulationRun) -> bool:
     """Returns whether a folder has this population under these settings, with all its files unchanged."""
     try:
-        content = json.loads((folder / _POPULATION).read_text(encoding="utf-8"))
+        content = json.loads((folder / POPULATION).read_text(encoding="utf-8"))
         same = content["settings_hash"] == run.settings_hash
         return same and hashes_hold(folder, content["files"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -192,7 +195,7 @@ class _PopulationTraining:
         self.interval = SaveInterval(run.updates, seconds=save_seconds)
 
     def train(self) -> None:
-        if (self.folder / _POPULATION).exists():
+        if (self.folder / POPULATION).exists():
             raise OptionError(
                 f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
             )
@@ -217,7 +220,7 @@ class _PopulationTraining:
     def _difference(self) -> str:
         """Returns a text that names the settings in which a finished population differs from this run."""
         try:
-            found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
+            found = json.loads((self.folder / POPULATION).read_text(encoding="utf-8"))["settings"]
             other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
         except (OSError, ValueError, KeyError, AttributeError):
             other = {}
@@ -319,7 +322,7 @@ class _PopulationTraining:
             "software": software_versions(),
             "files": files,
         }
-        with atomic_write(self.folder / _POPULATION) as partial:
+        with atomic_write(self.folder / POPULATION) as partial:
             write_json(partial, content)
         (self.folder / _RESUME).unlink(missing_ok=True)
 
@@ -344,7 +347,7 @@ class SuiteCheckpoint:
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
     """Returns whether a suite has this population and it is finished."""
-    return (suite / layout / algorithm / _POPULATION).is_file()
+    return (suite / layout / algorithm / POPULATION).is_file()
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:

@@ -31,6 +31,7 @@ from generation.populations import train as suite
 from generation.populations.build import build_suite
 from generation.profiles import FOLDER, load_profile
 from generation.releases import build, package
+from generation.releases.check import compare_rebuilds
 from generation.teammates.registry import build_teammate, recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
@@ -245,6 +246,21 @@ def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned
             action, memory = act(mate.params, memory, view, jax.random.key(0))
             played.append(int(action))
         assert played == history.teammate_actions[:100].tolist()
+
+
+@pytest.mark.slow
+def test_a_release_is_rebuilt_from_its_own_tasks_and_teammates(learned, tmp_path):
+    """Without its suite, to the same bits; the profile of the populations that trained the teammates is not needed."""
+    profile = tmp_path / "learned.toml"
+    profile.write_text(LEARNED)
+    given = ("--tasks", learned / "lite/meta/tasks.jsonl", "--suite", learned / "lite/teammates")
+    arguments = ["generate", "--profile", profile, "--out", tmp_path / "again", *given]
+    result = CliRunner().invoke(cli, [str(part) for part in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert not (tmp_path / "again/suite").exists()
+    compared = compare_rebuilds(learned / "lite", tmp_path / "again/lite")
+    assert not compared.differences
+    assert compared.files > 10
 
 
 @pytest.mark.slow
