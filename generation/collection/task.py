@@ -6,7 +6,6 @@ and since an update is a pure function of the state, the artefact has the bits o
 
 from __future__ import annotations
 
-import errno
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from typing import Any
 import jax
 
 from generation.collection.task_folder import (
+    FULL_DISK,
     LEARNER,
     ArtefactWriter,
     DiskFullError,
@@ -43,8 +43,6 @@ TEAMMATE_NOISE: Noise = "seeded"
 
 TASK_SAVE_SECONDS = 30.0
 """Interval of saves: the work that a kill can cost."""
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 UpdateCallback = Callable[[int, dict[str, float]], None]
 """Called after each update with its number and metrics."""
@@ -155,7 +153,7 @@ def _readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
     try:
         yield
     except (OSError, DiskFullError) as error:
-        if isinstance(error, OSError) and error.errno not in _FULL:
+        if isinstance(error, OSError) and error.errno not in FULL_DISK:
             raise
         shown = disk_full(partial, needed)
         if not (partial / LEARNER).exists():

@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initialising
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
@@ -29,6 +29,7 @@ from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.locks import lock_beside, process_lock
 
 METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
 
@@ -91,11 +92,6 @@ def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) ->
     return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
 
 
-def lock_file(folder: Path) -> Path:
-    """Path of a folder's lock: next to the folder, so that the folder can be renamed while the lock is held."""
-    return folder.with_name(f".{folder.name}.lock")
-
-
 @contextmanager
 def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder's lock.
@@ -107,16 +103,13 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
     Raises:
         BusyError: if another process holds the lock.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(lock_file(folder), timeout=-1 if wait else 0)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise BusyError(f"{folder}: another process works in this folder; wait for it, or choose another") from error
-    try:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(process_lock(lock_beside(folder), wait=wait))
+        except Timeout as error:
+            message = f"{folder}: another process works in this folder; wait for it, or choose another"
+            raise BusyError(message) from error
         yield
-    finally:
-        lock.release()
 
 
 class SaveInterval:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-from filelock import FileLock
 from rich.console import Console
 
 from generation.collection.job import CollectionError
@@ -20,6 +19,7 @@ from generation.releases.package import package_release
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.writing.release_folder import check_replaceable
 from icrl4aht_data.writing.statistics import print_statistics
 
@@ -62,7 +62,7 @@ def build_releases(
     tasks = train_teammates(profile, suite, seed, console) if tasks is None else list(tasks)
     collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)
     releases = []
-    with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same releases
+    with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
         for kind in kinds:
             with progress_bars(console) as bars:
                 steps = [f"choosing labellers for {kind}", f"packing {kind}"]

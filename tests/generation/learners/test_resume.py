@@ -226,6 +226,7 @@ def test_a_folder_has_one_owner(tmp_path):
         assert not (tmp_path / "run").exists()
     with run_lock(tmp_path / "run"):
         pass
+    assert not list(tmp_path.iterdir()), "the lock's file is removed"
 
 
 def test_settings_that_differ():
