@@ -10,9 +10,9 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, Entry
-from icrl4aht_data.format.index import Index
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.paths import resolve_inside
 

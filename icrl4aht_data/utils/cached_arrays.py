@@ -13,12 +13,12 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
 from icrl4aht_data.utils.cache import CACHE_VARIABLES, cache_folder, cache_limit
@@ -72,7 +72,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
         )
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with _temporary_lock(folder.with_name(f".{key}.lock")):
+        with process_lock(folder.with_name(f".{key}.lock")):
             arrays = _open(folder)
             if arrays is None:
                 _make_room(folder.parent, size)
@@ -166,17 +166,6 @@ def _remove(path: Path) -> None:
             path.unlink()
 
 
-@contextmanager
-def _temporary_lock(path: Path) -> Iterator[None]:
-    """A lock between processes; its file is removed with it."""
-    with FileLock(path):
-        try:
-            yield
-        finally:
-            with suppress(OSError):
-                path.unlink()
-
-
 def _cached_sets(folder: Path) -> list[tuple[Path, int]]:
     """Finished sets and their bytes, the least recently used first. Other processes may remove sets meanwhile."""
     found = []
@@ -194,11 +183,10 @@ def _make_room(folder: Path, size: int) -> None:
     Raises:
         OSError: if the disk has no room for them even without those sets.
     """
-    with _temporary_lock(folder / ".room.lock"):
+    with process_lock(folder / ".room.lock"):
         for left in folder.glob(".*.partial"):
-            with suppress(Timeout), FileLock(left.with_suffix(".lock"), timeout=0):  # held while a set is built
+            with suppress(Timeout), process_lock(left.with_suffix(".lock"), wait=False):  # held while a set is built
                 _remove(left)
-                left.with_suffix(".lock").unlink(missing_ok=True)
         for left in folder.glob(".*.removed-*"):
             _remove(left)
         found, free = _cached_sets(folder), shutil.disk_usage(folder).free

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.manifest import read_manifest
@@ -19,6 +19,7 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import explain_full_disk
 from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.locks import lock_beside, process_lock
 from icrl4aht_data.utils.paths import files_below
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
@@ -55,12 +56,13 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
 @contextmanager
 def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path], before: Snapshot) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
-    new, old, lock = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old", "lock"))
+    new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
+    lock = lock_beside(target)
     foreign = [folder for folder in (new, old) if os.path.lexists(folder)]
     if foreign and not lock.exists():  # a killed writer leaves its lock
         raise OptionError(f"{foreign[0]}: was not left by this package; move it away, or give another folder")
     try:
-        with FileLock(lock, timeout=0):
+        with process_lock(lock, wait=False):
             try:
                 if old.exists() and not target.exists():  # a writer was killed between the two renames below
                     old.rename(target)
@@ -74,7 +76,6 @@ def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path],
             finally:
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
-                lock.unlink(missing_ok=True)  # while it is held: who waits for it sees that it is gone
     except Timeout as error:
         raise OptionError(f"{target}: another process is writing it; wait for it, or give another folder") from error
 
