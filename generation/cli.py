@@ -26,6 +26,7 @@ from icrl4aht_data.commands.options import (
     Folder,
     Names,
     Sections,
+    bars,
     examples,
     json_option,
     overwrite_option,
@@ -185,7 +186,9 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
     from generation.planning.plan import estimate_cost
     from generation.profiles import load_profile
 
-    cost = estimate_cost(load_profile(profile_name).with_ego(ego), devices)
+    with bars(edges=True) as show:
+        profile = load_profile(profile_name).with_ego(ego)
+        cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, f": {what}"))
     if as_json:
         click.echo(json.dumps(cost.to_json(), indent=2))
     else:

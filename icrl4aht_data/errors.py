@@ -106,6 +106,10 @@ class CacheError(Icrl4ahtError):
     """The cache folder has no room, cannot be written, or is not a folder."""
 
 
+class DiskFullError(Icrl4ahtError, OSError):
+    """The disk that is written to is full; names the file or folder, the disk, and its free space."""
+
+
 class UploadError(Icrl4ahtError):
     """Uploading a release failed, or the repository's content differs from it; names the repository."""
 

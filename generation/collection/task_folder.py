@@ -6,13 +6,16 @@
   metrics.jsonl       one line per update
   checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
   timing.jsonl        wall-clock figures, not hashed
+  filter.png labeller_returns.json   added by packing, not hashed
 <task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
 .<task_id>.lock       held by the collector that works on it
 """
 
 from __future__ import annotations
 
+import errno
 import json
+import math
 import os
 import shutil
 import time
@@ -31,12 +34,19 @@ from generation.learners.network import ActorCritic
 from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
+from icrl4aht_data.utils.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
-FILTER_CURVES = "filter.png"
+FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
+"""Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
+
+_LINE_BYTES = 600  # of an update, in the metrics and in the timing
+
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the errors of a full disk, a full quota and a limited file."""
 
 EGO_CHECKPOINTS = 5
 """Checkpoints of each ego, evenly spaced over its training, as those of learned teammates are."""
@@ -94,6 +104,45 @@ def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
         return False
 
 
+class DiskFullError(Icrl4ahtError):
+    """The disk of an artefact has no room for it."""
+
+
+def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
+    """Disk space of an unfinished artefact: histories, checkpoints, log, and two copies of the learner's state.
+
+    Args:
+        task: the task.
+        config: the ego's hyper-parameters.
+        state: the learner's state.
+    """
+    histories = sum(
+        math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in array_shapes(task.layout, config).values()
+    )
+    saved, params = (sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) for tree in (state, state.params))
+    return histories + 2 * saved + len(checkpoint_updates(config)) * params + config.updates * _LINE_BYTES
+
+
+def check_room(partial: Path, needed: int) -> None:
+    """Check that a disk has room for an artefact.
+
+    Raises:
+        DiskFullError: if it has not.
+    """
+    if needed > shutil.disk_usage(partial).free:
+        raise disk_full(partial, needed)
+
+
+def disk_full(partial: Path, needed: int) -> DiskFullError:
+    """Returns the error for an unfinished artefact whose disk has not the space it needs."""
+    free = shutil.disk_usage(partial if partial.exists() else partial.parent).free
+    folder = partial.with_name(partial.name.removesuffix(".partial"))
+    return DiskFullError(
+        f"{folder}: the disk is full: this task needs {needed:,} bytes, {free:,} are free; free some space, or give "
+        f"another --out"
+    )
+
+
 def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
     """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it."""
     metadata = artefact_settings(task, profile) | {
@@ -118,23 +167,26 @@ def publish_artefact(partial: Path, folder: Path) -> None:
 class ArtefactWriter:
     """Fills an artefact's histories, metrics and timing, update by update.
 
-    The arrays are memory maps of files that have their full size from the start. `sync` writes them out and maps them
-    again, so that memory holds only what came since the last `sync`.
+    The arrays are memory maps of files whose space on the disk is allocated at the start. `sync` writes them out and
+    maps them again, so that memory holds only what came since the last `sync`.
 
     Args:
         partial: an existing folder.
         task: the task.
         config: the ego's hyper-parameters.
         first: the first update to write; 0 creates the files, otherwise the log is cut at that update.
+
+    Raises:
+        OSError: if the disk is full.
     """
 
     def __init__(self, partial: Path, task: Task, config: PPOConfig, first: int) -> None:
-        self._partial, self._config, self._first = partial, config, first
+        self._partial, self._task, self._config, self._first = partial, task, config, first
         self._started = time.perf_counter()
         self._recording = 0.0
         if not first:
             for name, (shape, dtype) in array_shapes(task.layout, config).items():
-                np.lib.format.open_memmap(self._array(name), "w+", dtype, shape)
+                new_mapped_array(self._array(name), shape, np.dtype(dtype))
         self._log = RunLog(partial, keep=lambda line: line["update"] < first)
         self._histories = self._mapped()
 
@@ -170,7 +222,7 @@ class ArtefactWriter:
         self._log.write(line, timing={"update": number} | timing)
         return line | timing
 
-    def write_checkpoint(self, updates: int, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
+    def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Keep the ego after so many updates, if it is one of `checkpoint_updates`; on the disk when this returns.
 
         Call before the state after these updates is saved, so that a resumed task never lacks a checkpoint.
@@ -178,10 +230,8 @@ class ArtefactWriter:
         moments = checkpoint_updates(self._config)
         if updates in moments:
             began = time.perf_counter()
-            steps = updates * self._config.steps_per_update
-            save_policy(
-                checkpoint_path(self._partial, moments.index(updates)), network, params, card | {"steps": steps}
-            )
+            card = {"task_id": self._task.task_id, "steps": updates * self._config.steps_per_update}
+            save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
             self._recording += time.perf_counter() - began
 
     def sync(self) -> None:

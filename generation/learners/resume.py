@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +25,7 @@ from filelock import Timeout
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initialising
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write
@@ -191,7 +191,7 @@ class StateFile:
             }
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.path) as partial:
-                save_file(arrays, partial, metadata=metadata)
+                partial.write_bytes(to_bytes(arrays, metadata))  # `save_file` has errors of its own for a full disk
         if jax.process_count() > 1:
             multihost_utils.sync_global_devices(f"saved {self.path.name}")
 
@@ -318,8 +318,10 @@ class RunLog:
             os.fsync(self._metrics.fileno())
 
     def close(self) -> None:
-        self._metrics.close()
-        self._timing.close()
+        """Close both files."""
+        for file in (self._metrics, self._timing):
+            with suppress(OSError):  # `write` leaves nothing to be written, unless it has raised the same error
+                file.close()
 
 
 def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:

@@ -65,10 +65,11 @@ def build_releases(
     with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
         for kind in kinds:
             with progress_bars(console) as bars:
-                bar = bars.add_task(f"packing {kind}", total=len(tasks), note="")
+                steps = [f"choosing labellers for {kind}", f"packing {kind}"]
+                rows = [bars.add_task(step, total=len(tasks), note="", unit="tasks") for step in steps]
 
-                def advance(task: Task, bars=bars, bar=bar) -> None:
-                    bars.advance(bar)
+                def advance(step: int, bars=bars, rows=rows) -> None:
+                    bars.advance(rows[step])
 
                 releases.append(package_release(out / "artefacts", out / kind, tasks, profile, suite, kind, advance))
         for release in releases:

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from generation.collection.failures import FAILED
-from generation.collection.task_folder import FILTER_CURVES, METADATA
+from generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS, METADATA
 from generation.learners.resume import TIMING
 from generation.populations.train import POPULATION
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.utils.hashes import file_hash
 
-_IGNORED = {TIMING, FAILED, FILTER_CURVES}
-"""Files about the course of a rebuild, and pictures of its results."""
+_IGNORED = {TIMING, FAILED, FILTER_CURVES, LABELLER_RETURNS}
+"""Files about the course of a rebuild, and those that packing adds to artefacts."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
@@ -45,7 +45,9 @@ class Comparison:
 
 
 def compare_rebuilds(a: Path, b: Path) -> Comparison:
-    """Compare two folders by the hashes of their files, except wall-clock figures, failures, pictures and hidden files.
+    """Compare two folders by the hashes of their files.
+
+    Wall-clock figures, failures, hidden files and what packing adds to artefacts are left out.
 
     Raises:
         OptionError: if one is not a folder, or there is nothing to compare.

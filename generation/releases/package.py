@@ -6,24 +6,25 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from generation.collection.curate import best_streams, filter_report, plot_filter, relabel
 from generation.collection.record import HistoryArrays
 from generation.collection.task import TEAMMATE_NOISE
-from generation.collection.task_folder import FILTER_CURVES, METADATA, checkpoint_path, checkpoint_updates
-from generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
+from generation.collection.task_folder import FILTER_CURVES, METADATA
+from generation.learners.checkpoint import load_policy
 from generation.populations.select import THRESHOLD
 from generation.profiles import Profile
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from generation.releases.labeller import choose_labeller
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder
 
@@ -35,9 +36,11 @@ def package_release(
     profile: Profile,
     suite: Path,
     kind: Kind,
-    done: Callable[[Task], None] = lambda task: None,
+    advance: Callable[[Literal[0, 1]], None] = lambda step: None,
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
+
+    The histories of a task are labelled by the checkpoint of its ego that `choose_labeller` returns.
 
     Args:
         artefacts: folder of the tasks' finished artefacts.
@@ -46,10 +49,15 @@ def package_release(
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
-        done: called after each task.
+        advance: called after each task with 0, when its labeller is chosen, and with 1, when it is written.
     """
-    new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
-    return write_release(target, kind, new, data_version=profile.data_version, overwrite=True, done=done)
+    new = []
+    for task in tasks:
+        new.append(_new_task(artefacts / task.task_id, task, profile, suite))
+        advance(0)
+    return write_release(
+        target, kind, new, data_version=profile.data_version, overwrite=True, done=lambda task: advance(1)
+    )
 
 
 def bundle_release(release: Path) -> Path:
@@ -64,7 +72,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")
     streams = best_streams(rewards, profile.keep)
     plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
-    labeller = checkpoint_path(folder, len(checkpoint_updates(profile.ego)) - 1)
+    labeller = choose_labeller(folder, task, suite)
     populations = TeammateSuite(
         algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
         members=profile.teammates.members,
@@ -86,11 +94,21 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         streams_recorded=metadata["ego"]["environments"],
         streams_kept=profile.keep,
         filter=filter_report(rewards, streams),
-        expert=ExpertLabels(file_hash(labeller / POLICY_WEIGHTS), "greedy, recurrent"),
+        expert=ExpertLabels(
+            policy_sha256=labeller.sha256,
+            action="greedy, recurrent",
+            step=labeller.step,
+            return_greedy=labeller.return_greedy,
+            return_sampled=labeller.return_sampled,
+            episodes=LABEL_EPISODES,
+            last_return_greedy=labeller.last_return_greedy,
+        ),
         suite=populations if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
-    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams, labeller), files)
+    if profile.policies:
+        files |= expert_files(labeller.folder, labeller.sha256)
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams, labeller.folder), files)
 
 
 def _histories(folder: Path, task: Task, streams: np.ndarray, labeller: Path) -> Iterator[NewHistory]:

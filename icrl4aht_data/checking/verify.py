@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.checking.files import check_checkpoints, check_files, check_shard_sizes
+from icrl4aht_data.checking.files import check_checkpoints, check_experts, check_files, check_shard_sizes
 from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
@@ -95,6 +95,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if origin.remote is not None and report.level != "quick":
         _fetch(origin.remote, sorted(chosen), report, advance)
     check_files(origin, listed, chosen, report, advance)
+    check_names(origin.folder, listed, report)
     if unreadable is not None:
         report.add("meta", str(unreadable))
         return
@@ -102,15 +103,21 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
+    if index.info.format_version < STRONG_HASHES:
+        report.notes.append(
+            f"format version {index.info.format_version}: its chunk tables have no strong hashes, only CRC-32, which "
+            f"finds accidents but no forgery; `icrl4aht-data convert` brings it to version {FORMAT_VERSION}"
+        )
+    check_provenance(index, tasks, report)
     check_index(index, tasks, chosen, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
-    if report.level == "quick":
-        check_shard_sizes(origin, index, shards, report)
-    else:
+    check_shard_sizes(origin, index, shards, report)
+    if report.level != "quick":
         check_checkpoints(origin.folder, tasks, report)
+        check_experts(index, report)
         _check_shards(index, shards, report, advance)
 
 

@@ -24,6 +24,8 @@ from icrl4aht_data.commands.requirements import PACKAGE, extra_with
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.disk import FULL, describe_disk
+from icrl4aht_data.utils.progress import LineProgress
 
 SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
 
@@ -35,7 +37,8 @@ _REMEDIES = {
     errno.EACCES: "give a folder that you may write to, and files that you may read",
     errno.EPERM: "give a folder that you may write to, and files that you may read",
     errno.EROFS: "give a folder that can be written to",
-    errno.ENOSPC: "free some space, or give a folder on another disk",
+    errno.EFBIG: "a limit on the size of files is set, see `ulimit -f`",
+    **dict.fromkeys(FULL, "free some space, or give a folder on another disk"),
 }
 
 
@@ -205,16 +208,19 @@ def examples(*lines: str) -> str:
 
 
 @contextmanager
-def bars(quiet: bool = False, of_bytes: bool = False) -> Iterator[Callable[..., None]]:
+def bars(quiet: bool = False, of_bytes: bool = False, edges: bool = False) -> Iterator[Callable[..., None]]:
     """Show progress bars on a terminal; yields a function `show(name, done, total, note="")`, one bar for each name.
+
+    Where stderr is not a terminal, a plain line a minute is printed instead, see `LineProgress`.
 
     Args:
         quiet: show nothing.
         of_bytes: the numbers are bytes: show sizes and speed.
+        edges: print plain lines also at the start and at the end.
     """
     console, running = Console(stderr=True), {}
     columns = (*Progress.get_default_columns(), *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()))
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as shown:
+    with LineProgress(*columns, console=console, quiet=quiet, of_bytes=of_bytes, edges=edges, transient=True) as shown:
 
         def show(name: str, done: int, total: int | None, note: str = "") -> None:
             if name not in running:
@@ -270,4 +276,6 @@ def _in_words(error: OSError) -> str:
     if path.name.startswith(".") and path.suffix in (".partial", ".lock"):
         path = path.with_name(path.stem.removeprefix("."))
     remedy = _REMEDIES.get(error.errno)
+    if error.errno in FULL:
+        remedy = f"{describe_disk(path)}: {remedy}"
     return f"{path}: {os.strerror(error.errno)}" + (f"; {remedy}" if remedy else "")

@@ -59,7 +59,7 @@ class ExpertLabels:
         last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
     """
 
-    policy_sha256: str
+    policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     action: str
     step: _Count | None = None
     return_greedy: _Return | None = None

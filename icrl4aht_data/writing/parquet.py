@@ -7,6 +7,7 @@ from pathlib import Path
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import ENTRY_HINTS
+from icrl4aht_data.utils.disk import explain_full_disk
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.new_file import check_new_file
 
@@ -32,6 +33,6 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
     types |= {float | None: pa.float64(), tuple[int, int, int]: pa.list_(pa.int64())}
     schema = pa.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()])
     rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
-    with atomic_write(path) as partial:
-        pq.write_table(rows, partial)
+    with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
+        pq.write_table(rows, stream)  # which would leave a file open where it fails
     return path

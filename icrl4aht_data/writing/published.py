@@ -45,6 +45,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_lines, write_json
 from icrl4aht_data.utils.paths import resolve_inside
 from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.writing.hdf5_sink import new_hdf5
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, atomic_folder, check_target
 from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays
@@ -86,11 +87,12 @@ def to_published(
     """
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
-        with h5py.File(folder / HISTORIES_H5, "w") as file, (folder / HISTORIES_INDEX).open("w") as index:
+        with new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
-                group = file.create_group(f"/{number}")
+                group = new.file.create_group(f"/{number}")
                 for field in history.entry.stored_fields(kind):
                     _write_published(group, field.name, history.read(field.name), chunk)
+                    new.check()
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))

@@ -17,6 +17,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.disk import explain_full_disk
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.locks import lock_beside, process_lock
 from icrl4aht_data.utils.paths import files_below
@@ -43,10 +44,17 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
     Raises:
         OptionError: as `check_target`, before the block and again after it; if another process is writing the folder;
             if a folder has the name of a temporary one.
+        DiskFullError: if the disk is full; nothing is left of the new folder then.
     """
     sources = tuple(sources)
     before = check_target(target, overwrite, sources)
     target = target.resolve()
+    with explain_full_disk(target), _locked_folder(target, overwrite, sources, before) as folder:
+        yield folder
+
+
+@contextmanager
+def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path], before: Snapshot) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
     lock = lock_beside(target)
@@ -62,7 +70,8 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
                 new.mkdir()
-                yield new
+                with explain_full_disk(target):  # before the space is freed
+                    yield new
                 _replace(target, new, old, overwrite, before)
             finally:
                 for leftover in (new, old):

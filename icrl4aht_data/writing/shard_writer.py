@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from icrl4aht_data.format.chunks import (
 )
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import add_filename
 
 _BLOCK = 2000  # steps: one chunk of scalars, two of records
 
@@ -56,7 +58,8 @@ def write_shard(
     table_path.parent.mkdir(parents=True, exist_ok=True)
     layout = get_layout(entries[0].layout)
     checksums: list[tuple[int, np.ndarray]] = []
-    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+    # In memory, since libhdf5 may crash when it closes a file on a full disk. A shard is small, see `SHARD_BYTES`.
+    with h5py.File(path, "w", libver=("v110", "v110"), driver="core", backing_store=False) as file:
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["layout"] = layout.name
         for group in dict.fromkeys(entry.h5_group for entry in entries):
@@ -72,21 +75,25 @@ def write_shard(
         table["hash"] = [digest for _, digest in checksums]
         locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(locations, np.uint64).T
-    np.save(table_path, np.concatenate([table, _metadata_lines(path, table)]), allow_pickle=False)
+        file.flush()
+        content: bytes = file.id.get_file_image()
+    saved = BytesIO()
+    np.save(saved, np.concatenate([table, _metadata_lines(content, table)]), allow_pickle=False)
+    for name, data in ((path, content), (table_path, saved.getbuffer())):
+        with add_filename(name):
+            name.write_bytes(data)
 
 
-def _metadata_lines(path: Path, chunks: np.ndarray) -> np.ndarray:
-    """Return chunk table lines for the bytes between the chunks: HDF5 writes them, so they are read from the file."""
+def _metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
+    """Return chunk table lines for the bytes of a file between the chunks, which HDF5 writes."""
     ordered = np.sort(chunks, order="offset")
-    starts = [*ordered["offset"].tolist(), path.stat().st_size]
+    starts = [*ordered["offset"].tolist(), len(content)]
     stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
     lines = []
-    with path.open("rb") as stream:
-        for stop, start in zip(stops, starts, strict=True):
-            for low in range(stop, start, BETWEEN):
-                stream.seek(low)
-                data = stream.read(min(BETWEEN, start - low))
-                lines.append((low, len(data), 0, *_checksums(data)))
+    for stop, start in zip(stops, starts, strict=True):
+        for low in range(stop, start, BETWEEN):
+            data = content[low : min(low + BETWEEN, start)]
+            lines.append((low, len(data), 0, *_checksums(data)))
     return np.array(lines, CHUNK_DTYPE)
 
 

@@ -43,21 +43,21 @@ def test_what_differs_is_said(built, tmp_path):
     np.save(theirs / "rewards.npy", np.zeros((2, 3), np.int8))
     lines = (theirs / "metrics.jsonl").read_text().splitlines()
     (theirs / "metrics.jsonl").write_text("\n".join([*lines[:2], "{}", *lines[3:]]) + "\n")
-    (theirs / "policy.json").unlink()
+    (theirs / "checkpoints/c2/policy.json").unlink()
     (theirs / "notes.txt").touch()
-    for name in ("timing.jsonl", "filter.png"):
+    for name in ("timing.jsonl", "filter.png", "labeller_returns.json"):
         (theirs / name).write_bytes(b"another clock")
     result = CliRunner().invoke(cli, ["check", "--json", str(ours), str(theirs)])
     assert result.exit_code == 1
     compared = json.loads(result.output)
     found = compared["differences"]
     assert not compared["equal"]
-    assert set(found) == {"actions.npy", "rewards.npy", "metrics.jsonl", "policy.json", "notes.txt"}
+    assert set(found) == {"actions.npy", "rewards.npy", "metrics.jsonl", "checkpoints/c2/policy.json", "notes.txt"}
     was = int(np.load(ours / "actions.npy")[2, 7])
     assert found["actions.npy"] == f"1 of 4000 values, the first at (2, 7): {was} and {was + 1}"
     assert found["rewards.npy"] == "int8 (8, 500) and int8 (2, 3)"
     assert found["metrics.jsonl"].endswith(", line 3")
-    assert found["policy.json"] == f"only in {ours}"
+    assert found["checkpoints/c2/policy.json"] == f"only in {ours}"
     assert found["notes.txt"] == f"only in {theirs}"
     text = CliRunner().invoke(cli, ["check", str(ours), str(theirs)])
     assert text.exit_code == 1

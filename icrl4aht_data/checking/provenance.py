@@ -1,0 +1,99 @@
+"""Checks of meta/provenance.json against the tasks and the index."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.checking.report import Report
+from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, Entry
+from icrl4aht_data.utils.files import json_hash
+from icrl4aht_data.utils.paths import resolve_inside
+
+_ROUNDING = 1e-3  # of the means that a stream filter records
+
+
+def check_provenance(index: Index, tasks: Sequence[Task], report: Report) -> None:
+    """Check what provenance says of each task: its learner, its streams, the filter, and the source of its labels.
+
+    Args:
+        index: the release's index.
+        tasks: its tasks; none in a release that knows them by name only.
+        report: receives the problems.
+    """
+    try:
+        provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
+    except Icrl4ahtError as error:
+        report.add(PROVENANCE, str(error))
+        return
+    members: dict[str, list[Entry]] = defaultdict(list)
+    for entry in index.entries:
+        members[entry.task_id].append(entry)
+    seeds = {task.task_id: task.seed for task in tasks}
+    for task_id in provenance.keys() - members.keys():
+        report.add(PROVENANCE, f"task {task_id!r}: has no history")
+    for task_id, entries in members.items():
+        if task_id not in provenance:
+            report.add(PROVENANCE, f"task {task_id!r}: missing")
+            continue
+        for fault in _faults(provenance[task_id], entries, seeds.get(task_id)):
+            report.add(PROVENANCE, f"task {task_id!r}: {fault}")
+
+
+def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
+    """Yield what contradicts the index and the task's seed, or itself."""
+    if None not in (seed, found.seed) and found.seed != seed:
+        yield f"seed: expected the task's {seed}, found {found.seed}"
+    if found.ego is not None and found.ego_hash not in (None, json_hash(found.ego)):
+        yield f"ego_hash: expected {json_hash(found.ego)} of `ego`, found {found.ego_hash}"
+    environments = None if found.ego is None else found.ego["environments"]
+    if None not in (environments, found.streams_recorded) and environments != found.streams_recorded:
+        yield f"streams_recorded: expected the learner's {environments} environments, found {found.streams_recorded}"
+    yield from _stream_faults(found, entries)
+    expert = found.expert
+    expected = {
+        "expert_return": expert and expert.return_greedy,
+        "expert_return_sampled": expert and expert.return_sampled,
+        "expert_step": expert and expert.step,
+    }
+    for name, value in expected.items():
+        wrong = [entry for entry in entries if getattr(entry, name) != value]
+        if wrong:
+            yield (
+                f"history {wrong[0].history_id}: {name}: the index says {getattr(wrong[0], name)}, provenance {value}"
+            )
+
+
+def _stream_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
+    recorded, kept = found.streams_recorded, found.streams_kept
+    limits = [("streams_recorded", recorded)] * (recorded is not None) + [("streams_kept", kept)] * (kept is not None)
+    for name, value in limits:
+        if value < len(entries):
+            yield f"{name}: expected at least the {len(entries)} histories of the index, found {value}"
+    if None not in (recorded, kept) and kept > recorded:
+        yield f"streams_kept: expected at most the {recorded} recorded ones, found {kept}"
+    last = max(entries, key=lambda entry: entry.env_idx)
+    if recorded is not None and last.env_idx >= recorded:
+        yield f"history {last.history_id}: env_idx {last.env_idx}, but {recorded} streams were recorded"
+    if found.filter is None:
+        return
+    for name, side, streams in (("before", found.filter.before, recorded), ("after", found.filter.after, kept)):
+        if streams is not None and side.streams != streams:
+            yield f"filter.{name}.streams: expected {streams}, found {side.streams}"
+    if found.filter.after.streams == len(entries):
+        yield from _filter_faults(found.filter.after, entries)
+
+
+def _filter_faults(after: StreamReturns, entries: Iterable[Entry]) -> Iterator[str]:
+    """Compare the mean returns of the kept streams with the index, which has all of them."""
+    members = list(entries)
+    for name in ("return_start", "return_end"):
+        mean, said = np.mean([getattr(entry, name) for entry in members]), getattr(after, name)
+        if not abs(mean - said) <= _ROUNDING:
+            yield f"filter.after.{name}: the index gives {mean:.3f}, found {said}"
