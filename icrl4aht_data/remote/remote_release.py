@@ -14,7 +14,6 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +37,7 @@ from icrl4aht_data.remote.store import RetryPolicy, Store, offline
 from icrl4aht_data.utils.cache import data_folder
 from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size
 from icrl4aht_data.utils.hashes import file_hash, git_hash
+from icrl4aht_data.utils.locks import cached_property
 from icrl4aht_data.utils.paths import LARGEST, resolve_inside
 
 _INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE)  # read when a release is opened

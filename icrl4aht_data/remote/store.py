@@ -6,7 +6,6 @@ import errno
 import logging
 import os
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +14,7 @@ from email.utils import parsedate_to_datetime
 from typing import Any, TypeVar
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
+from icrl4aht_data.utils.locks import ForkSafeLock
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ class Store:
         self._filesystem_url = self.url
         self._filesystem: tuple[int, Any] = 0, None
         self._traffic = Traffic()
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.url, self.retry)

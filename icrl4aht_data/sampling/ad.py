@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
+from icrl4aht_data.utils.locks import cached_property
 
 
 class ADBatch(NamedTuple):

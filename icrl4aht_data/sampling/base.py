@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from functools import cached_property
 from typing import Any, Generic, TypedDict, TypeVar
 
 import numpy as np
@@ -14,6 +13,7 @@ from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, Episodes, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
+from icrl4aht_data.utils.locks import cached_property
 from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B", bound=tuple)
