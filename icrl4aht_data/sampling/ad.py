@@ -114,8 +114,8 @@ class ADSampler(Sampler[ADBatch]):
         return position, starts, np.minimum(high - starts, self.length)
 
     def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
+        batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         position, starts, valid = self._draw(i)
-        batch = self._buffer(out)
 
         records = self._observer.records(batch.obs)
         reads = [

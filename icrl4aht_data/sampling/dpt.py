@@ -83,7 +83,8 @@ class DPTSampler(Sampler[DPTBatch]):
             longer than some history, or than the part of it that `episodes` or `curriculum` selects.
     """
 
-    batch_type = DPTBatch
+    batch_type, length_option = DPTBatch, "context"
+    drawn_bytes = 48  # six numbers of each transition: draws, steps, rows, episodes
 
     def __init__(
         self,
@@ -129,8 +130,8 @@ class DPTSampler(Sampler[DPTBatch]):
         }
 
     def batch(self, i: int, out: DPTBatch | None = None) -> DPTBatch:
+        batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         query, query_step, context, steps = self._draw(i)
-        batch = self._buffer(out)
 
         observer, kept_steps = self._observer, self._draws.kept_steps
         query_records = observer.records(batch.query_obs)
