@@ -91,10 +91,8 @@ class _TorchBatches:
 
 def _for_losses(batch: Any) -> Any:
     """A batch with int64 for int32, and targets that losses ignore on padding."""
-    arrays = {
-        name: array.astype(np.int64) if array is not None and array.dtype == np.int32 else array
-        for name, array in batch._asdict().items()
-    }
+    present = {name: array for name, array in batch._asdict().items() if array is not None}
+    arrays = {name: array.astype(np.int64) if array.dtype == np.int32 else array for name, array in present.items()}
     if isinstance(batch, ADBatch):
         arrays["target_actions"][~batch.attention_mask] = IGNORED
     return batch._replace(**arrays)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from functools import cached_property
 from string import digits
 
 import numpy as np
 
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.utils.fork import cached_property
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
 """Kinds of cells. A wall is a counter that holds one item; PLATES and PILE are endless supplies."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from collections import OrderedDict
 
 import numpy as np
+
+from icrl4aht_data.utils.fork import ForkSafeLock
 
 _CACHE_BYTES = 256 * 2**20
 
@@ -25,7 +26,7 @@ class ChunkCache:
         """Drop all chunks."""
         self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes = 0
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
 
     def __getstate__(self) -> int:
         return self._size  # a pickled cache is empty: the receiver reads what it needs

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import operator
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
 
@@ -30,6 +28,7 @@ from icrl4aht_data.reading.sources import (
 )
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.remote.store import Traffic
+from icrl4aht_data.utils.fork import ForkSafeLock, cached_property
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 
@@ -99,7 +98,7 @@ class Selection:
         self.origin, self.index, self._shards = location, index, shards
         self.options = options
         self.ids = np.arange(len(index.entries)) if ids is None else ids
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
         if self.obs == "state" and not self.has_states:
             raise OptionError(
                 f'obs = "state": {location} has observations only, no state records; take float32 or uint8'

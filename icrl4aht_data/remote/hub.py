@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,6 +13,7 @@ from icrl4aht_data.errors import OfflineError, RemoteError
 from icrl4aht_data.remote.addresses import check_redirect
 from icrl4aht_data.remote.store import RetryPolicy, Store, WrongLengthError, http_status, offline, wrap_remote_errors
 from icrl4aht_data.utils.files import TEXT_BYTES
+from icrl4aht_data.utils.fork import cached_property
 
 
 class HubStore(Store):

@@ -9,7 +9,6 @@ windows, resumed downloads and repairs all rely on this.
 from __future__ import annotations
 
 import os
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +24,7 @@ from icrl4aht_data.format.schema import CHUNK_DTYPE
 from icrl4aht_data.remote.store import Store
 from icrl4aht_data.utils.cache import cache_limit, data_folder
 from icrl4aht_data.utils.files import add_filename
+from icrl4aht_data.utils.fork import ForkSafeLock
 from icrl4aht_data.utils.hashes import file_hash
 
 T = TypeVar("T")
@@ -64,7 +64,7 @@ class PartialFile:
 
     def __init__(self, store: Store, name: str, path: Path) -> None:
         self.store, self.name, self.path = store, name, path
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
         self._overflow: OrderedDict[int, bytes] = OrderedDict()
 
     def __reduce__(self) -> tuple:

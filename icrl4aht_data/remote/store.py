@@ -7,7 +7,6 @@ import errno
 import logging
 import os
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -18,6 +17,7 @@ from urllib.parse import urljoin
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
 from icrl4aht_data.remote.addresses import address_of, check_redirect, without_credentials
+from icrl4aht_data.utils.fork import ForkSafeLock
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class Store:
         self.retry = retry or RetryPolicy()
         self._filesystem: tuple[int, Any] = 0, None
         self._traffic = Traffic()
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._address, self.retry)

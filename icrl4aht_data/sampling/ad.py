@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
+from icrl4aht_data.utils.fork import cached_property
 
 
 class ADBatch(NamedTuple):
@@ -114,8 +114,8 @@ class ADSampler(Sampler[ADBatch]):
         return position, starts, np.minimum(high - starts, self.length)
 
     def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
+        batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         position, starts, valid = self._draw(i)
-        batch = self._buffer(out)
 
         records = self._observer.records(batch.obs)
         reads = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from functools import cached_property
 from typing import Any, Generic, TypedDict, TypeVar
 
 import numpy as np
@@ -14,6 +13,8 @@ from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, Episodes, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
+from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.memory import array_bytes, fits, free_memory, gigabytes
 from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B", bound=tuple)
@@ -49,6 +50,10 @@ class Sampler(Generic[B]):
     """
 
     batch_type: type[B]
+    length_option = "length"
+    """The option that sets `length`, for messages."""
+    drawn_bytes = 0
+    """Bytes of memory that drawing takes for each step of a batch."""
 
     def __init__(
         self,
@@ -101,12 +106,17 @@ class Sampler(Generic[B]):
         """Return batch i; it is written into `out`, a batch from `empty()`, if that is given.
 
         Raises:
-            OptionError: if `out` is of another kind, shape or dtype.
+            OptionError: if `out` is of another kind, shape or dtype, or the batch is larger than the free memory.
         """
         raise NotImplementedError
 
     def empty(self) -> B:
-        """Return a batch of uninitialised arrays to pass to `batch` as `out`: reuse is faster than new memory."""
+        """Return a batch of uninitialised arrays to pass to `batch` as `out`: reuse is faster than new memory.
+
+        Raises:
+            OptionError: if it is larger than the free memory.
+        """
+        self._check_memory()
         return self.batch_type(**{name: np.empty(spec.shape, spec.dtype) for name, spec in self.specs.items()})
 
     def batches(
@@ -134,13 +144,39 @@ class Sampler(Generic[B]):
         first = self.process_index * self.local_size
         return random_uint32(self.seed, i, count, self.batch_size)[:, first : first + self.local_size]
 
+    @cached_property
+    def _bytes(self) -> int:
+        """Bytes of memory that making a batch takes: its arrays, the records they are rendered from, and the draws."""
+        arrays = sum(array_bytes(spec.shape, spec.dtype) for spec in self.specs.values())
+        records = sum(self._observer.record_bytes(spec.shape) for spec in self.specs.values() if len(spec.shape) > 3)
+        return arrays + records + self.drawn_bytes * self.local_size * self.length
+
+    def _check_memory(self) -> None:
+        """Check that a batch fits into memory.
+
+        Raises:
+            OptionError: names the sizes, and the options that change them.
+        """
+        if fits(self._bytes):
+            return
+        free, rows = free_memory(), self.local_size
+        name, spec = max(self.specs.items(), key=lambda item: array_bytes(item[1].shape, item[1].dtype))
+        most = free * rows // self._bytes // 2 * self.process_count  # half of it: the next batch is made meanwhile
+        advice = f"take batch_size = {most} or less" if most else f"take a smaller {self.length_option}"
+        lighter = ', or obs = "uint8" or "state"' if self.dataset.obs == "float32" else ""
+        raise OptionError(
+            f"batch_size = {self.batch_size}, {self.length_option} = {self.length}: a batch takes "
+            f"{gigabytes(self._bytes)} of memory ({name} {spec.dtype} {spec.shape} "
+            f"{gigabytes(array_bytes(spec.shape, spec.dtype))}), but {gigabytes(free)} are free: {advice}{lighter}"
+        )
+
     def _layout_specs(self) -> dict[str, ArraySpec]:
         """The spec of `layouts`, which batches of state records of several layouts have."""
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
     def _buffer(self, out: B | None) -> B:
-        """`out` if it has the declared arrays, or a new batch for None."""
+        """`out` if it has the declared arrays, or a new batch for None; see `empty`."""
         if out is None:
             return self.empty()
         arrays = {name: array for name, array in out._asdict().items() if array is not None}  # type: ignore[attr-defined]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -34,7 +35,7 @@ class Batches(Iterator[B], Generic[B]):
     """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
 
     An exception of the thread is raised by `next`. The thread stops at the end of a `with` block, after `close()` and
-    at the end of the iterator.
+    at the end of the iterator. A forked process does not have it: make another iterator of the sampler there.
 
     Args:
         sampler: makes the batches.
@@ -52,7 +53,7 @@ class Batches(Iterator[B], Generic[B]):
         waited: seconds that `next` has waited for batches.
 
     Raises:
-        OptionError: for impossible options, or a device without JAX.
+        OptionError: for impossible options, a device without JAX, or `next` in a forked process.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class Batches(Iterator[B], Generic[B]):
         self._put = _device_put(device) if device is not None else None
         self._reuse = reuse or device is not None
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
-        self._closed = False
+        self._closed, self._process = False, os.getpid()
         self._pool: ThreadPoolExecutor | None = None
         self._submitted = start
         self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
@@ -85,6 +86,11 @@ class Batches(Iterator[B], Generic[B]):
         if self._closed or (self._stop is not None and self.next >= self._stop):
             self.close()
             raise StopIteration
+        if self._process != os.getpid():
+            raise OptionError(
+                f"this iterator belongs to process {self._process}, and its thread does not exist in this one, a fork: "
+                f"make another here by sampler.batches(start={self.next}), or take sampler[{self.next}]"
+            )
         started = time.perf_counter()
         if self._lent is not None:
             self._free.append(self._lent)

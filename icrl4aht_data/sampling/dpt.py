@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from functools import cached_property
 from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
@@ -14,6 +13,7 @@ from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
+from icrl4aht_data.utils.fork import cached_property
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
@@ -83,7 +83,8 @@ class DPTSampler(Sampler[DPTBatch]):
             longer than some history, or than the part of it that `episodes` or `curriculum` selects.
     """
 
-    batch_type = DPTBatch
+    batch_type, length_option = DPTBatch, "context"
+    drawn_bytes = 48  # six numbers of each transition: draws, steps, rows, episodes
 
     def __init__(
         self,
@@ -129,8 +130,8 @@ class DPTSampler(Sampler[DPTBatch]):
         }
 
     def batch(self, i: int, out: DPTBatch | None = None) -> DPTBatch:
+        batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         query, query_step, context, steps = self._draw(i)
-        batch = self._buffer(out)
 
         observer, kept_steps = self._observer, self._draws.kept_steps
         query_records = observer.records(batch.query_obs)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.random import Philox  # np.random is imported when it is used, which a fork must not interrupt
 
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.reading.selection import Selection
@@ -62,7 +63,7 @@ def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
     Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
     """
     i = check_int("batch", i, 0)
-    raw = np.random.Philox(key=np.array([seed, i], np.uint64)).random_raw(count * batch_size)
+    raw = Philox(key=np.array([seed, i], np.uint64)).random_raw(count * batch_size)
     return (raw >> np.uint64(32)).reshape(count, batch_size)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +61,10 @@ class Observer:
         if self._selection.obs == "state":
             return ArraySpec("uint8", (*shape, self._size))
         return ArraySpec(self._selection.obs, (*shape, *self._layouts[0].obs_shape))
+
+    def record_bytes(self, shape: tuple[int, ...]) -> int:
+        """Bytes of the array that `records` makes for observations of this shape (..., 5, 5, C)."""
+        return math.prod(shape[:-3]) * self._size if self._renders else 0
 
     def records(self, out: np.ndarray) -> np.ndarray:
         """The array to read the records of observations `out` into: uint8 (..., S), or `out` if nothing is rendered."""

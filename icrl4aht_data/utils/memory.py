@@ -25,11 +25,27 @@ def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray
     Raises:
         OptionError: if not; names what is too large.
     """
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size < _PLENTY or size <= free_memory():
+    size = array_bytes(shape, dtype)
+    if fits(size):
         with suppress(MemoryError):
             return np.empty(shape, dtype)
-    raise OptionError(f"{what}: takes {size / 1e9:.3g} GB of memory, more than is free: read fewer steps at a time")
+    raise OptionError(f"{what}: takes {gigabytes(size)} of memory, more than is free: read fewer steps at a time")
+
+
+def array_bytes(shape: tuple[int, ...], dtype: DTypeLike) -> int:
+    """Bytes of an array."""
+    return math.prod(shape) * np.dtype(dtype).itemsize
+
+
+def fits(size: int) -> bool:
+    """Whether so many bytes of memory are free; a few are taken to be."""
+    return size < _PLENTY or size <= free_memory()
+
+
+def gigabytes(size: int) -> str:
+    """Return a number of bytes as text, in GB."""
+    number = size / 1e9
+    return f"{number:,.0f} GB" if number >= 100 else f"{number:.3g} GB"
 
 
 def free_memory() -> int:

@@ -114,7 +114,7 @@ def test_filter_by_what_the_labels_earn(measured):
     assert known.filter(min_expert_return=0).ids.tolist() == [0, 1, 2, 3]
     for wrong in ("1", True, float("nan")):
         with pytest.raises(OptionError, match="min_expert_return = "):
-            load_icrl4aht(measured, min_expert_return=wrong)
+            load_icrl4aht(measured, min_expert_return=wrong)  # type: ignore[arg-type]
 
 
 def test_a_release_without_returns_refuses_the_filter(lite):

@@ -42,6 +42,7 @@ def test_ad_windows_are_slices_of_histories(lite_or_full):
             }
             for name, array in expected.items():
                 np.testing.assert_array_equal(getattr(batch, name)[row], array[window], err_msg=name)
+            assert batch.is_first is not None
             np.testing.assert_array_equal(batch.is_first[row], np.arange(start, start + LENGTH) == 0)
         assert batch.attention_mask.all()
     assert at_the_start, "no window started at step 0, where zeros precede it"
@@ -58,6 +59,7 @@ def test_short_histories_are_padded_at_the_end(lite):
     np.testing.assert_array_equal(batch.prev_rewards[1, 1:120], written[int(ids[1])]["rewards"][:-1])
     for name in ("obs", "prev_actions", "prev_rewards", "target_actions", "dones"):
         assert not getattr(batch, name)[:, 120:].any(), name
+    assert batch.is_first is not None
     assert np.argwhere(batch.is_first).tolist() == [[0, 0], [1, 0], [2, 0]]
 
 
@@ -231,3 +233,40 @@ def test_a_one_step_episode_release_samples(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), episodes=9, length=1)
     batch = load_icrl4aht(tmp_path / "r").dpt(batch_size=4, context=9)[0]
     assert batch.context_next_obs.shape == (4, 9, 5, 5, 35)
+
+
+class TestMemory:
+    """Was MemoryError of NumPy, or a killed process."""
+
+    @pytest.mark.parametrize("kind", ["ad", "dpt"])
+    def test_a_batch_larger_than_memory_is_refused_before_it_is_made(self, lite, kind):
+        dataset = load_icrl4aht(lite[0], layout="demo_wide")
+        sampler = _sampler(dataset, kind, batch_size=10**13, steps=100)
+        message = (
+            rf"batch_size = {10**13}, (length|context) = 100: a batch takes [\d,]+ GB of memory "
+            rf"\((context_)?obs float32 \({10**13}, 100, 5, 5, 45\) 4,500,000,000 GB\), but [\d.,]+ GB are free: "
+            r'take batch_size = \d+ or less, or obs = "uint8" or "state"'
+        )
+        for make in (lambda: sampler[0], sampler.empty, lambda: next(sampler.batches(prefetch=0))):
+            with pytest.raises(OptionError, match=message):
+                make()
+
+    @pytest.mark.parametrize("kind", ["ad", "dpt"])
+    def test_the_advice_fits(self, lite, kind, monkeypatch):
+        monkeypatch.setattr("icrl4aht_data.utils.memory._PLENTY", 0)
+        monkeypatch.setattr("icrl4aht_data.utils.memory.free_memory", lambda: 2**20)
+        monkeypatch.setattr("icrl4aht_data.sampling.base.free_memory", lambda: 2**20)
+        dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8", cache="stream")
+        with pytest.raises(OptionError, match=r"take batch_size = \d+ or less$") as caught:
+            _ = _sampler(dataset, kind, batch_size=1000, steps=20)[0]
+        fitting = int(str(caught.value).split(" = ")[-1].split()[0])
+        assert 1 <= fitting < 100
+        assert len(_sampler(dataset, kind, batch_size=fitting, steps=20)[0][0]) == fitting
+        with pytest.raises(OptionError, match=r"take a smaller (length|context)$"):
+            _ = _sampler(dataset, kind, batch_size=1, steps=10**6, order="random")[0]
+
+
+def _sampler(dataset, kind, *, batch_size, steps, order="contiguous"):
+    if kind == "ad":
+        return dataset.ad(batch_size=batch_size, length=steps)
+    return dataset.dpt(batch_size=batch_size, context=steps, order=order)

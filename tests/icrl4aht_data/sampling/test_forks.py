@@ -1,0 +1,99 @@
+"""Forks while a thread of the parent makes a batch."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from icrl4aht_data.utils.fork import ForkSafeLock, cached_property
+from tests.helpers.paths import ROOT
+
+FORK = """
+import os
+import signal
+import sys
+import threading
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.reading import shard
+
+parent, decode = os.getpid(), shard.decode_chunk
+decoding, forked = threading.Event(), threading.Event()
+
+
+def decode_chunk(*arguments):
+    if os.getpid() == parent:
+        decoding.set()
+        forked.wait(60)
+    return decode(*arguments)
+
+
+shard.decode_chunk = decode_chunk
+for cache in sys.argv[2:]:
+    decoding.clear()
+    forked.clear()
+    dataset = load_icrl4aht(sys.argv[1], layout="demo_wide", cache=cache, threads=2)
+    sampler = dataset.ad(batch_size=4, length=25)
+    batches = sampler.batches()
+    thread = threading.Thread(target=lambda: next(batches))
+    thread.start()
+    assert decoding.wait(30)
+    child = os.fork()
+    if not child:
+        signal.alarm(30)
+        first = sampler[0]
+        try:
+            next(batches)
+        except OptionError as error:
+            assert f"process {parent}" in str(error) and "make another" in str(error)
+            os._exit(0 if (first.obs == sampler.batches(stop=1).__next__().obs).all() else 3)
+        os._exit(4)
+    forked.set()
+    status = os.waitpid(child, 0)[1]
+    thread.join()
+    batches.close()
+    print(cache, os.waitstatus_to_exitcode(status))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_a_child_makes_batches(lite, tmp_path):
+    """Hung for good: the child waited for locks of a thread that it did not have."""
+    script = tmp_path / "fork.py"
+    script.write_text(FORK)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "ICRL4AHT_CACHE_DIR": str(tmp_path / "cache")}
+    run = subprocess.run(
+        # Python from 3.12 on warns of every fork of a process with threads.
+        [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", script, lite[0], "ram", "mmap", "stream"],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        env=environment,
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.splitlines() == ["ram 0", "mmap 0", "stream 0"]
+
+
+def test_a_cached_property_is_computed_once_without_a_lock():
+    class Once:
+        calls = 0
+
+        @cached_property
+        def value(self) -> int:
+            self.calls += 1
+            return 7
+
+    one = Once()
+    assert (one.value, one.value, one.calls) == (7, 7, 1)
+
+
+def test_a_renewed_lock_is_free():
+    lock = ForkSafeLock()
+    lock.__enter__()
+    lock.renew()
+    with lock:
+        pass
