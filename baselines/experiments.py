@@ -25,13 +25,13 @@ from baselines.methods.registry import get_method
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import write_report
-from baselines.training.histories import TrainingTask, prepare
+from baselines.training.histories import TrainingTask, filter_histories, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
-from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -128,6 +128,7 @@ class ExperimentPlan:
         suite: folder of learned teammates; required for "heldout-rl".
         train: values of `TrainOptions` for all entries, such as steps.
         model: values of `ModelOptions` for all entries.
+        filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
         values: names of the entries to run; all by default.
         families: teammate families to evaluate with; all by default.
         tasks: tasks of each teammate kind and layout, at most.
@@ -145,6 +146,7 @@ class ExperimentPlan:
     suite: Path | None = None
     train: dict[str, Any] = field(default_factory=dict)
     model: dict[str, Any] = field(default_factory=dict)
+    filters: dict[str, tuple[str, ...]] = field(default_factory=dict)
     values: tuple[str, ...] = ()
     families: tuple[str, ...] = ()
     tasks: int | None = None
@@ -230,8 +232,14 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
 
 def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
     """Returns the layouts to train on, and a note on those that were left out."""
-    available = {layout.name for layout in load_icrl4aht(plan.root, split="train").layouts}
+    dataset = load_icrl4aht(plan.root, split="train")
+    filters = HistoryOptions((), **plan.filters).filters
+    if filters:
+        filter_histories(dataset, filters)  # a value that no history has is an error that names it
+    by_layout = {layout.name: dataset.filter(layout=layout.name) for layout in dataset.layouts}
+    available = {name for name, histories in by_layout.items() if _pass_all(histories, filters)}
     release = plan.root or "the bundled mini release"
+    kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
     if plan.layouts:
         names = [get_layout(name).name for name in plan.layouts]
         for name in names:
@@ -240,18 +248,26 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
         missing = [name for name in names if name not in available]
         if missing:
             raise EmptySelectionError(
-                f"{release}: no training histories on {', '.join(missing)}; it has {', '.join(sorted(available))}: "
+                f"{release}: no {kind} on {', '.join(missing)}; it has {', '.join(sorted(available)) or 'none'}: "
                 f"choose among them, or give a --root that has the others"
             )
         return names, []
     names = [name for name in experiment.layouts if name in available]
     if not names:
         raise EmptySelectionError(
-            f"{release}: no training histories on {', '.join(experiment.layouts)}, where the paper runs this; it has "
-            f"{', '.join(sorted(available))}: give --layout, or another --root"
+            f"{release}: no {kind} on {', '.join(experiment.layouts)}, where the paper runs this; it has "
+            f"{', '.join(sorted(available)) or 'none'}: give --layout, or another --root"
         )
     left = [name for name in experiment.layouts if name not in available]
-    return names, [f"left out, the release has no training histories of them: {', '.join(left)}"] if left else []
+    return names, [f"left out, the release has no {kind} of them: {', '.join(left)}"] if left else []
+
+
+def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
+    """Returns whether every value of the filters has histories."""
+    try:
+        return bool(filter_histories(histories, filters))
+    except EmptySelectionError:
+        return False
 
 
 def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
@@ -318,8 +334,8 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
     options = TrainOptions(**{**entry.train, **plan.train})
     model = ModelOptions(**{**entry.model, **plan.model})
     try:
-        return prepare(method, model, options, HistoryOptions((layout,), plan.root))
-    except (LabelsMissingError, OptionError) as error:
+        return prepare(method, model, options, HistoryOptions((layout,), plan.root, **plan.filters))
+    except (EmptySelectionError, LabelsMissingError, OptionError) as error:
         hint = "or leave it out, by --method, --only and --layout"
         error.args = (f"{method} {entry.name} on {layout}: {error}; {hint}",)
         raise

@@ -35,7 +35,10 @@ def load_icrl4aht(
     track: FilterValues = None,
     teammate_family: FilterValues = None,
     teammate_kind: FilterValues = None,
+    algorithm: FilterValues = None,
+    source: FilterValues = None,
     task_id: FilterValues = None,
+    min_expert_return: float | None = None,
     obs: Obs = "float32",
     cache: CacheMode = "auto",
     threads: int | None = None,
@@ -52,7 +55,11 @@ def load_icrl4aht(
         track: what the test tasks vary: "teammate" or "layout".
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
+        algorithm: the same as `teammate_kind`: the algorithm that trained the teammate, such as "fcp" or "comedi".
+        source: how the histories were made, such as "ppo".
         task_id: id of a task; a task is a layout, a teammate and a seed.
+        min_expert_return: only histories whose expert actions come from a policy that earned at least this much per
+            episode, acting greedily with the history's teammate: `entry.expert_return`.
         obs: dtype of observations: "float32", "uint8" (the same integers), or "state" for state records instead of
             observations; see `history.OBS`.
         cache: "ram" and "mmap" (files that processes share) decode the selection once for all batches, "stream" reads
@@ -64,6 +71,7 @@ def load_icrl4aht(
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
         EmptySelectionError: if nothing matches; says what exists.
         OptionError: for impossible options, such as obs="state" for a release of observations.
+        NotStoredError: for `min_expert_return`, if the release does not have the returns, as in format version 2.
         ReleaseError: if the release cannot be read.
     """
     options = ReadOptions(obs, cache, usable_cores() if threads is None else threads)
@@ -74,7 +82,10 @@ def load_icrl4aht(
         track=track,
         teammate_family=teammate_family,
         teammate_kind=teammate_kind,
+        algorithm=algorithm,
+        source=source,
         task_id=task_id,
+        min_expert_return=min_expert_return,
     )
 
 

@@ -1,4 +1,4 @@
-"""Errors that this package raises on bad input, with one base class.
+"""Errors that this package raises on bad input, with one base class, and its warnings.
 
 Messages name the file or value, what was expected, what was found, and what to do next.
 """
@@ -30,7 +30,7 @@ class LabelsMissingError(Icrl4ahtError):
 
 
 class NotStoredError(Icrl4ahtError):
-    """State records or tasks were requested from a release of observations that has none."""
+    """State records, tasks or measured returns were requested from a release that has none."""
 
 
 class ReleaseError(Icrl4ahtError):
@@ -104,6 +104,10 @@ class UploadError(Icrl4ahtError):
 
 class TaskFormatError(Icrl4ahtError, ValueError):
     """A task line is malformed."""
+
+
+class WeakLabelsWarning(UserWarning):
+    """The expert actions of some tasks come from a policy that earns far less than the histories do at their end."""
 
 
 _LISTED, _COMPARED = 50, 1000  # names that an error lists, and names compared to find the nearest

@@ -17,12 +17,16 @@ import numpy as np
 
 from icrl4aht_data.errors import NotStoredError, OptionError
 from icrl4aht_data.reading.selection import Selection
+from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.base import Sampler
 from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import datasets
     from torch.utils.data import DataLoader
+
+IGNORED = -100
+"""The target of padding in `torch_loader` and `hf_windows`: the number that PyTorch's cross entropy ignores."""
 
 
 def torch_loader(
@@ -35,6 +39,10 @@ def torch_loader(
     **options: Any,
 ) -> DataLoader:
     """Return a DataLoader over batches start..stop as named tuples of tensors, in order for any number of workers.
+
+    The tensors are what PyTorch's losses and embeddings take: integers are int64 (observations keep their dtype), and
+    `target_actions` are -100 on padding, which `F.cross_entropy` ignores. So `F.cross_entropy(logits, targets)` is
+    right as it is for logits (B, 6, L), or (B, 6) for `query_target`. Fields that a batch does not have are None.
 
     With workers, load the dataset with cache="mmap" or "stream": with "ram" each spawned worker decodes its own copy.
     Batches are random already, so DataLoader must not shuffle. To resume, pass the number of the next batch as `start`.
@@ -59,13 +67,37 @@ def torch_loader(
         _ = sampler.dataset.storage  # decoded here once: mapped by the workers, or inherited by forked ones
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
     return DataLoader(
-        sampler,  # type: ignore[arg-type]
+        _TorchBatches(sampler),  # type: ignore[arg-type]
         batch_size=None,
         sampler=numbers,
         num_workers=check_int("workers", workers, 0),
         **processes,  # type: ignore[arg-type]
         **options,
     )
+
+
+class _TorchBatches:
+    """The batches of a sampler, in PyTorch's dtypes. DataLoader makes tensors of the arrays."""
+
+    def __init__(self, sampler: Sampler) -> None:
+        self._sampler = sampler
+
+    def __len__(self) -> int:
+        return len(self._sampler)
+
+    def __getitem__(self, i: int) -> Any:
+        return _for_losses(self._sampler[i])
+
+
+def _for_losses(batch: Any) -> Any:
+    """A batch with int64 for int32, and targets that losses ignore on padding."""
+    arrays = {
+        name: array.astype(np.int64) if array is not None and array.dtype == np.int32 else array
+        for name, array in batch._asdict().items()
+    }
+    if isinstance(batch, ADBatch):
+        arrays["target_actions"][~batch.attention_mask] = IGNORED
+    return batch._replace(**arrays)
 
 
 def hf_index(dataset: Selection) -> datasets.Dataset:
@@ -130,6 +162,8 @@ def _episodes(dataset: Selection) -> Iterator[dict[str, Any]]:
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
     """The rows of batches start..stop as a `datasets.IterableDataset`, with the columns of the batch.
 
+    Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`.
+
     The `state_dict` of the result resumes after the last row taken.
 
     Args:
@@ -147,7 +181,7 @@ def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> dat
 
 def _windows(sampler: Sampler, numbers: list[int]) -> Iterator[dict[str, np.ndarray]]:
     for i in numbers:
-        batch = {name: array for name, array in sampler[i]._asdict().items() if array is not None}
+        batch = {name: array for name, array in _for_losses(sampler[i])._asdict().items() if array is not None}
         for row in range(sampler.local_size):
             yield {name: array[row] for name, array in batch.items()}
 

@@ -113,7 +113,8 @@ def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
         check_fits(run, layout, folder)
         return policy
 
-    return NamedEgo(run.label, make, {"run": run.hash, "step": run.step, "context": run.context, "acting": acting})
+    details = {"run": run.hash, "step": run.step, "context": run.context, "acting": acting}
+    return NamedEgo(run.label, make, {**details, "trained_on": run.trained_on})
 
 
 def check_fits(run: TrainedModel, layout: Layout, folder: Path) -> None:

@@ -20,6 +20,7 @@ from baselines.commands.options import (
     experiment_options,
     find_ego,
     gifs_option,
+    history_filters,
     model_options,
     protocol_option,
     root_option,
@@ -301,6 +302,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @training_options
 @model_options
 @dataclass_options(HistoryOptions, "histories")
+@history_filters
 @tensorboard_option
 @click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines.")
 @click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes.")
@@ -314,6 +316,7 @@ def train_command(
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
+    filters: dict[str, tuple[str, ...]],
     tensorboard: bool,
     coordinator: str | None,
     processes: int,
@@ -339,7 +342,7 @@ def train_command(
 
     layers, width, steps = SIZES[size]
     options = replace_given(TrainOptions(steps=steps), {"batch_size": default_batch_size()} | train)
-    choice = replace_given(HistoryOptions(layouts, root and str(root)), histories)
+    choice = replace_given(HistoryOptions(layouts, root and str(root), **filters), histories)
     sized: dict[str, Any] = {"layers": layers, "width": width}
     job = prepare(method, ModelOptions(**(sized | model)), options, choice)
     folder = out or Path("runs") / method

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import click
 
 from baselines.methods.options import ModelOptions
-from baselines.training.options import TrainOptions
+from baselines.training.options import FILTERS, TrainOptions
 from icrl4aht_data.commands.dataclass_options import dataclass_options
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
@@ -87,6 +88,41 @@ root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
 )
 
+
+def history_filters(command: Any) -> Any:
+    """Add the options that filter the histories to train on; the command receives them as the dict `filters`."""
+    options = [
+        click.option(
+            "--teammate-family",
+            type=FAMILY,
+            multiple=True,
+            help="Train only with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several.",
+        ),
+        click.option(
+            "--algorithm",
+            metavar="NAME",
+            multiple=True,
+            help="Train only with teammates of this algorithm, such as fcp, or kind of heuristic; repeat for several.",
+        ),
+        click.option(
+            "--source",
+            metavar="NAME",
+            multiple=True,
+            help="Train only on histories made by this learner, such as ppo; repeat for several.",
+        ),
+    ]
+
+    @functools.wraps(command)
+    def collect(*args: Any, **values: Any) -> Any:
+        filters = {name: chosen for name in FILTERS if (chosen := values.pop(name))}
+        return command(*args, filters=filters, **values)
+
+    decorated: Any = collect
+    for option in reversed(options):
+        decorated = option(decorated)
+    return decorated
+
+
 _PAPER_OR_CPU = "1024 as in the paper, or 8 on a CPU"
 training_options = dataclass_options(
     TrainOptions, "train", default_text={"steps": "the size's", "batch_size": _PAPER_OR_CPU}
@@ -140,8 +176,9 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             "families",
             type=FAMILY,
             multiple=True,
-            help="Only teammates of this family, such as H4; repeat for several.",
+            help="Evaluate only with teammates of this family, such as H4; repeat for several.",
         ),
+        history_filters,
         tasks_option,
         episodes_option,
         seeds_option,

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from generation.learners.resume import differing_settings
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash
 
@@ -45,10 +46,10 @@ def find_result(out: Path, task_id: str, settings: dict[str, Any]) -> Result | N
     if not path.exists():
         return None
     result = read_result(path)
-    if result.settings != settings:
-        raise OptionError(
-            f"{path}: holds a result of other settings ({result.settings}), expected {settings}; give another --out"
-        )
+    different = differing_settings(result.settings, settings)
+    if different:
+        listed = "; ".join(f"{name}: it has {one!r}, expected {two!r}" for name, (one, two) in different.items())
+        raise OptionError(f"{path}: holds a result of other settings ({listed}); give another --out")
     return result
 
 

@@ -12,6 +12,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from baselines.methods.conditional import change_if
 from baselines.methods.method import (
     Loss,
     Method,
@@ -41,11 +42,25 @@ class StepOutput(NamedTuple):
     next_obs: Float[Array, "B L N"] | None
 
 
+class WindowMemory(NamedTuple):
+    """Memory of an acting ego: the steps of its window, and what the trunk computed from them alone.
+
+    Attributes:
+        tokens: float32 (K, D), the window's steps in order, at the front.
+        steps: int32 (), number of steps in the window.
+        trunk: the trunk's memory of these steps.
+    """
+
+    tokens: Float[Array, "K D"]
+    steps: Int[Array, ""]
+    trunk: Any
+
+
 class StepModel(nn.Module):
     """Model of AD, Hybrid-AD and AMAGO-Offline: steps to tokens, a trunk, a head.
 
-    A trunk takes complete sequences of tokens (B, L, D), and one token at a time through `start(context)` and
-    `advance(token, memory)`.
+    A trunk takes complete sequences of tokens (B, L, D), and one token at a time through `start(context)` or
+    `start_after(tokens, context)` and `advance(token, memory)`.
     """
 
     tokens: StepTokens
@@ -68,9 +83,11 @@ class StepModel(nn.Module):
         return StepOutput(self.head(features_BxLxD), predicted)
 
     def start(self, context: int, cached: bool) -> Any:
-        """Returns the memory of an ego before its first step: the trunk's, or a ring buffer of tokens."""
+        """Returns the memory of an ego before its first step."""
+        if not cached:
+            return RingBuffer.empty(context, self.tokens.width)
         trunk: Any = self.trunk
-        return trunk.start(context) if cached else RingBuffer.empty(context, self.tokens.width)
+        return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), trunk.start(context))
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Any, Any]:
         """Returns the head's output for one step of an ego, and the memory with the step."""
@@ -80,8 +97,36 @@ class StepModel(nn.Module):
             memory = memory.add(token)
             window, valid = memory.last(len(memory.tokens), memory.written)
             return self.head(trunk(window[None])[0, valid - 1]), memory
-        feature, memory = trunk.advance(token, memory)
-        return self.head(feature), memory
+        tokens, steps, states = self._with_room(memory)
+        feature, states = trunk.advance(token, states)
+        return self.head(feature), WindowMemory(tokens.at[steps].set(token), steps + 1, states)
+
+    def _with_room(self, memory: WindowMemory) -> WindowMemory:
+        """Returns the memory, in which a full window has lost its oldest steps and their part in what was computed.
+
+        A kept step's keys and values were computed when it could still see the steps that go, so all are computed
+        again, as if the kept steps were all that ever happened.
+        """
+        trunk, variables = self.trunk.unbind()
+        context = len(memory.tokens)
+        kept = context - dropped_steps(context)
+
+        def drop_oldest(variables: Any, memory: WindowMemory) -> WindowMemory:
+            tokens = jnp.roll(memory.tokens, kept - context, axis=0)
+            states = trunk.start(context)
+            if kept:
+                states = trunk.apply(variables, tokens[:kept], context, method="start_after")
+            return WindowMemory(tokens, jnp.int32(kept), states)
+
+        return change_if(memory.steps == context, drop_oldest, variables, memory)
+
+
+def dropped_steps(context: int) -> int:
+    """Returns how many steps a full window of `context` steps loses at once in cached acting: a fifth.
+
+    So the window has 4/5 of the context or more, and 4 tokens are computed again for every step.
+    """
+    return max(1, context // 5)
 
 
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:

@@ -15,6 +15,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from baselines.methods.conditional import change_if
 from baselines.methods.method import (
     Method,
     World,
@@ -32,7 +33,6 @@ from baselines.methods.tokens import (
     Transition,
     TransitionTokens,
     batch_transitions,
-    visible_slots,
 )
 from baselines.methods.transformer import AttentionCache, Transformer
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -57,16 +57,17 @@ class DPTMemory(NamedTuple):
     The transitions of the running episode are stored, but not visible before the episode ends.
 
     Attributes:
-        stored: tokens, or the transformer's caches, which have one slot more, for the query.
-        written: int32 (), transitions so far.
+        buffer: tokens of the transitions; `written` counts them so far.
         complete: int32 (), transitions of finished episodes.
+        caches: the transformer's caches of the last K transitions of finished episodes, computed when an episode ends,
+            with one slot more, for the query; None if every step computes the context again.
         last_obs: float32, observation before the last action.
         started: bool (), whether a step was taken.
     """
 
-    stored: RingBuffer | tuple[AttentionCache, ...]
-    written: Int[Array, ""]
+    buffer: RingBuffer
     complete: Int[Array, ""]
+    caches: tuple[AttentionCache, ...] | None
     last_obs: Array
     started: Bool[Array, ""]
 
@@ -103,10 +104,13 @@ class DPT(nn.Module):
         return DPTOutput(self.head(answers), predicted)
 
     def start(self, context: int, cached: bool) -> DPTMemory:
-        """Returns the memory of an ego before its first step: room for K transitions and a running episode."""
-        slots = context + KEPT_STEPS
-        stored = self.trunk.empty_caches(slots + 1) if cached else RingBuffer.empty(slots, self.tokens.width)
-        return DPTMemory(stored, jnp.int32(0), jnp.int32(0), jnp.zeros(self.obs_shape), jnp.bool_(False))
+        """Returns the memory of an ego before its first step: room for K transitions and a running episode.
+
+        A context that grows by steps is not cached: it would have to be computed again in every step.
+        """
+        buffer = RingBuffer.empty(context + KEPT_STEPS, self.tokens.width)
+        caches = self.trunk.empty_caches(context + 1) if cached and self.finished_episodes_only else None
+        return DPTMemory(buffer, jnp.int32(0), caches, jnp.zeros(self.obs_shape), jnp.bool_(False))
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: DPTMemory) -> tuple[Float[Array, " A"], DPTMemory]:
         """Returns the policy for one step of an ego, and the memory with the outcome of the step before.
@@ -117,32 +121,46 @@ class DPT(nn.Module):
         obs = step.obs.astype(jnp.float32)
         transition = Transition(memory.last_obs, step.prev_action, step.prev_reward, obs, step.prev_teammate_action)
         token, query = self.tokens.context(transition), self.tokens.query(obs)
-        written = memory.written + (memory.started & ~done)
-        complete = jnp.where(done, written, memory.complete) if self.finished_episodes_only else written
-        answer = self._answer_from_tokens if isinstance(memory.stored, RingBuffer) else self._answer_from_caches
-        feature, stored = answer(token, query, memory, written, complete)
-        return self.head(feature), DPTMemory(stored, written, complete, obs, jnp.bool_(True))
-
-    def _answer_from_tokens(
-        self, token: Array, query: Array, memory: DPTMemory, written: Array, complete: Array
-    ) -> tuple:
-        """Computes the answer from the tokens of the complete context."""
+        written = memory.buffer.written + (memory.started & ~done)
         # Without a new transition `written` stays, and the next step overwrites the token added here.
-        buffer = RingBuffer(memory.stored.add(token).tokens, written)  # type: ignore[union-attr]
+        buffer = RingBuffer(memory.buffer.add(token).tokens, written)
+        complete = jnp.where(done, written, memory.complete) if self.finished_episodes_only else written
+        caches = memory.caches
+        if caches is None:
+            feature = self._answer_from_tokens(query, buffer, complete)
+        else:
+            caches = self._cache_context(done, buffer, complete, caches)
+            feature, caches = self._answer_from_caches(query, complete, caches)
+        return self.head(feature), DPTMemory(buffer, complete, caches, obs, jnp.bool_(True))
+
+    def _answer_from_tokens(self, query: Array, buffer: RingBuffer, complete: Array) -> Array:
+        """Computes the answer from the tokens of the complete context."""
         window, valid = buffer.last(len(buffer.tokens) - KEPT_STEPS, complete)
         sequence = jnp.append(window, query[None], axis=0).at[valid].set(query)  # tokens behind it are not seen
-        return self.trunk(sequence[None])[0, valid], buffer
+        return self.trunk(sequence[None])[0, valid]
+
+    def _cache_context(
+        self, done: Array, buffer: RingBuffer, complete: Array, caches: tuple[AttentionCache, ...]
+    ) -> tuple[AttentionCache, ...]:
+        """Computes the keys and values of the context if an episode has ended, which is when it changes."""
+        trunk, variables = self.trunk.unbind()
+        slots = caches[0].slots
+
+        def compute(inputs: Any, caches: Any) -> Any:
+            variables, buffer, complete = inputs
+            window, _ = buffer.last(slots - 1, complete)
+            return trunk.apply(variables, window, slots, method="caches_of")
+
+        return change_if(done, compute, (variables, buffer, complete), caches)
 
     def _answer_from_caches(
-        self, token: Array, query: Array, memory: DPTMemory, written: Array, complete: Array
-    ) -> tuple:
+        self, query: Array, complete: Array, caches: tuple[AttentionCache, ...]
+    ) -> tuple[Array, tuple[AttentionCache, ...]]:
         """Computes the answer from the cached keys and values of the context."""
-        slots = memory.stored[0].slots - 1  # type: ignore[union-attr]
-        context, position = slots - KEPT_STEPS, memory.written
-        visible_to_token = jnp.append(visible_slots(slots, position + 1, context, position + 1), False)
-        _, stored = self.trunk.step(token, memory.stored, position % slots, position, visible_to_token)  # type: ignore[arg-type]
-        visible_to_query = jnp.append(visible_slots(slots, written, context, complete), True)
-        return self.trunk.step(query, stored, jnp.int32(slots), complete, visible_to_query)
+        last = caches[0].slots - 1
+        valid = jnp.minimum(complete, last)
+        visible = jnp.append(jnp.arange(last) < valid, True)
+        return self.trunk.step(query, caches, jnp.int32(last), valid, visible)
 
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:

@@ -42,12 +42,20 @@ class RecurrentTrunk(nn.Module):
         """Returns the states before the first token, one per layer, whatever the context's length."""
         return tuple(jnp.zeros(self.width) for _ in range(self.layers))
 
+    def start_after(self, x: Float[Array, "N D"], context: int) -> tuple[Float[Array, " D"], ...]:
+        """Returns the states after a sequence of tokens."""
+        return self._advance(x, self.start(context))[1]
+
     def advance(
         self, x: Float[Array, " D"], memory: tuple[Float[Array, " D"], ...]
     ) -> tuple[Float[Array, " D"], tuple[Float[Array, " D"], ...]]:
         """Returns the features of one more token, and the states after it."""
-        features, states = self._scan(x[None, None], tuple(hidden[None] for hidden in memory), True)
-        return features[0, 0], tuple(hidden[0] for hidden in states)
+        features, states = self._advance(x[None], memory)
+        return features[0], states
+
+    def _advance(self, x: Float[Array, "N D"], states: tuple[Array, ...]) -> tuple[Float[Array, "N D"], tuple]:
+        features, states = self._scan(x[:, None], tuple(hidden[None] for hidden in states), True)
+        return features[:, 0], tuple(hidden[0] for hidden in states)
 
     def _scan(self, x: Float[Array, "N B D"], states: tuple[Array, ...], deterministic: bool) -> tuple[Array, tuple]:
         no_reset, last_states = jnp.zeros(x.shape[:2], bool), []

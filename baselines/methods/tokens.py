@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, Float, Int, Num
 
 from baselines.methods.encoder import FEATURES
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
@@ -192,10 +192,3 @@ class RingBuffer(NamedTuple):
         """Returns the entries stop - K .. stop - 1 in order, at the front of the array, and their number."""
         first = jnp.maximum(stop - context, 0)
         return self.tokens[(first + jnp.arange(context)) % len(self.tokens)], stop - first
-
-
-def visible_slots(slots: int, written: Int[Array, ""], context: int, stop: Int[Array, ""]) -> Bool[Array, " S"]:
-    """Returns which slots of a ring of `written` entries hold the entries stop - K .. stop - 1."""
-    # The newest entry of each slot: the largest number up to written - 1 that is congruent to the slot.
-    entry = written - 1 - (written - 1 - jnp.arange(slots)) % slots
-    return (entry >= jnp.maximum(stop - context, 0)) & (entry < stop)

@@ -35,11 +35,11 @@ class AttentionCache(NamedTuple):
 
 
 class TransformerMemory(NamedTuple):
-    """Memory of an acting ego: the last S tokens, as a ring.
+    """Memory of an acting ego for up to S tokens.
 
     Attributes:
         caches: one cache per layer.
-        written: int32 (), tokens written so far; token i is in slot i % S.
+        written: int32 (), number of tokens; token i is in slot i.
     """
 
     caches: tuple[AttentionCache, ...]
@@ -94,6 +94,14 @@ class TransformerBlock(nn.Module):
         cache = AttentionCache(cache.keys.at[:, slot].set(k), cache.values.at[:, slot].set(v))
         attended = _attend_to_cache(q, cache, visible_S)[None, None]
         return self._add_residuals(x_1x1xD, attended, True)[0, 0], cache
+
+    def cache(
+        self, x_NxD: Float[Array, "N D"], positions_N: Int[Array, " N"]
+    ) -> tuple[Float[Array, "N D"], AttentionCache]:
+        """Returns the features of one sequence without padding, and its keys and values, N slots."""
+        q, k, v = self._project(x_NxD[None], positions_N)  # each (1, N, H, Dh)
+        features = self._add_residuals(x_NxD[None], causal_attention(q, k, v), True)[0]
+        return features, AttentionCache(*(part[0].swapaxes(0, 1) for part in (k, v)))
 
     def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
         """Returns queries, keys and values."""
@@ -195,15 +203,28 @@ class Transformer(nn.Module):
         zeros = jnp.zeros((self.heads, slots, self.width // self.heads))
         return (AttentionCache(zeros, zeros),) * self.layers
 
+    def caches_of(self, x_NxD: Float[Array, "N D"], slots: int) -> tuple[AttentionCache, ...]:
+        """Returns caches of `slots` slots, one per layer, of which the first N hold a sequence; N is not 0."""
+        behind = ((0, 0), (0, slots - len(x_NxD)), (0, 0))
+        caches = []
+        for block in self.blocks:
+            x_NxD, cache = block.cache(x_NxD, jnp.arange(len(x_NxD)))
+            caches.append(AttentionCache(*(jnp.pad(part, behind) for part in cache)))
+        return tuple(caches)
+
     def start(self, context: int) -> TransformerMemory:
-        """Returns an empty memory for the last `context` tokens."""
+        """Returns an empty memory for `context` tokens."""
         return TransformerMemory(self.empty_caches(context), jnp.int32(0))
+
+    def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
+        """Returns a memory for `context` tokens that holds a sequence; N is not 0."""
+        return TransformerMemory(self.caches_of(x_NxD, context), jnp.int32(len(x_NxD)))
 
     def advance(
         self, x_D: Float[Array, " D"], memory: TransformerMemory
     ) -> tuple[Float[Array, " D"], TransformerMemory]:
-        """Returns the features of one more token, which replaces the oldest in a full memory."""
-        slots = memory.caches[0].slots
-        visible_S = jnp.arange(slots) <= memory.written
-        feature_D, caches = self.step(x_D, memory.caches, memory.written % slots, memory.written, visible_S)
-        return feature_D, TransformerMemory(caches, memory.written + 1)
+        """Returns the features of one more token, and the memory with it, which must not be full before."""
+        caches, written = memory
+        visible_S = jnp.arange(caches[0].slots) <= written
+        feature_D, caches = self.step(x_D, caches, written, written, visible_S)
+        return feature_D, TransformerMemory(caches, written + 1)

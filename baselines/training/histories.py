@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,17 +16,22 @@ from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
-from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.options import FILTERS, HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
 from baselines.training.trainer import TrainingData
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
+
+_CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammate_family"]} | {
+    name: FILTERS[name] for name in ("algorithm", "source")
+}
+"""Name in an entry of `training_cells` -> field of the index."""
 
 
 class TrainingTask(NamedTuple):
@@ -53,6 +60,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         histories: to train on.
 
     Raises:
+        EmptySelectionError: if no history has a value that the choice of histories filters by.
         OptionError: if a window or a context is longer than a history, or the layouts' observations differ in shape.
         LabelsMissingError: for DPT on histories without expert actions.
     """
@@ -79,6 +87,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
         },
+        "trained_on": training_cells(split.train),
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
 
@@ -87,7 +96,51 @@ def _load(histories: HistoryOptions) -> Dataset:
     """Opens the release, with state records if there are any and nothing else is required."""
     names = [get_layout(name).name for name in histories.layouts]
     found = load_icrl4aht(histories.root, split=histories.split, layout=names, obs=histories.obs or "uint8")
+    found = filter_histories(found, histories.filters)
     return found if histories.obs or not found.has_states else found.with_options(obs="state")
+
+
+def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
+    """Returns the histories that pass filters, see `HistoryOptions.filters`.
+
+    Raises:
+        EmptySelectionError: for a value that no history has, or if no history has one of each filter's values.
+    """
+    for name, values in filters.items():
+        found = sorted(set(field_values(dataset, FILTERS[name]).tolist()))
+        for value in values:
+            if value not in found:
+                raise EmptySelectionError(
+                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
+                    f"another layout or release"
+                )
+    return dataset.filter(**{FILTERS[name]: values for name, values in filters.items()}) if filters else dataset
+
+
+def field_values(dataset: Dataset, field: str) -> np.ndarray:
+    """Returns a text field of the selected histories, str (H,)."""
+    return np.array(dataset.index.values(field))[dataset.index.entries.column(field)[dataset.ids]]
+
+
+def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
+    """Returns what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
+
+    An entry has these five names, the numbers of `tasks` and `histories`, and `tasks_hash`, a hash of the task ids.
+    Histories that are held out for validation do not belong to `dataset`.
+    """
+    columns = [field_values(dataset, field) for field in _CELL_FIELDS.values()]
+    tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for *cell, task_id in zip(*columns, field_values(dataset, "task_id"), strict=True):
+        tasks[tuple(map(str, cell))].append(str(task_id))
+    return [
+        {
+            **dict(zip(_CELL_FIELDS, cell, strict=True)),
+            "tasks": len(set(ids)),
+            "histories": len(ids),
+            "tasks_hash": json_hash(sorted(set(ids))),
+        }
+        for cell, ids in sorted(tasks.items())
+    ]
 
 
 def _sampler(
@@ -134,7 +187,7 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0) -> HistorySpli
     """
     if not 0 < share < 1:
         raise OptionError(f"share = {share}: expected a number between 0 and 1")
-    names, codes = dataset.index.values("task_id"), dataset.column("task_id")
+    names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
     tasks = sorted(np.unique(codes).tolist(), key=lambda code: _rank(seed, names[code]))
     held_tasks = tasks[: _count(share, len(tasks)) if len(tasks) > 1 else 0]
     env_idx, held = dataset.column("env_idx"), np.zeros(len(dataset), bool)
@@ -173,6 +226,7 @@ class TrainedModel(NamedTuple):
         obs_shape: shape of the observations that it takes.
         label: as reports show it.
         hash: of the run's settings.
+        trained_on: the histories that it was trained on, see `training_cells`.
     """
 
     method: Method
@@ -183,6 +237,7 @@ class TrainedModel(NamedTuple):
     obs_shape: tuple[int, ...]
     label: str
     hash: str
+    trained_on: list[dict[str, Any]]
 
 
 def read_trained(folder: Path) -> TrainedModel:
@@ -199,7 +254,7 @@ def read_trained(folder: Path) -> TrainedModel:
         model = ModelOptions(**options)
         layouts = [get_layout(name) for name in histories["layouts"]]
         method = get_method(config["method"])(model, overcooked_world(layouts))
-        context, obs_shape = train["context"], histories["obs_shape"]
+        context, obs_shape, cells = train["context"], histories["obs_shape"], config["trained_on"]
     except (KeyError, TypeError) as error:
         raise OptionError(f"{folder}: its config.json is not of a run on learning histories: {error!r}") from error
     if list(layouts[0].obs_shape) != obs_shape:
@@ -210,4 +265,4 @@ def read_trained(folder: Path) -> TrainedModel:
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
-    return TrainedModel(method, params, step, context, names, layouts[0].obs_shape, label, json_hash(config))
+    return TrainedModel(method, params, step, context, names, layouts[0].obs_shape, label, json_hash(config), cells)

@@ -35,6 +35,10 @@ class TrainOptions:
         check_fields(self)
 
 
+FILTERS = {"teammate_family": "teammate_family", "algorithm": "teammate_kind", "source": "source"}
+"""Field of `HistoryOptions` -> the field of a release's index that it filters by."""
+
+
 @dataclass(frozen=True)
 class HistoryOptions:
     """Choice of the histories that a run is trained on.
@@ -43,11 +47,17 @@ class HistoryOptions:
         layouts: names of training layouts, with observations of one shape.
         root: folder or address of a release; None for the bundled mini release.
         split: split of the release.
+        teammate_family: families of teammates, "rl" or "H1".."H4"; any by default.
+        algorithm: algorithms of learned teammates or kinds of heuristics, such as "fcp"; any by default.
+        source: how histories were made, such as "ppo"; any by default.
     """
 
     layouts: tuple[str, ...]
     root: str | None = None
     split: str = "train"
+    teammate_family: tuple[str, ...] = ()
+    algorithm: tuple[str, ...] = ()
+    source: tuple[str, ...] = ()
     order: ContextOrder = option_field("contiguous", "Order of the transitions in DPT's contexts.")
     held_out: float = option_field(
         0.1, "Share of the tasks, and of the other tasks' histories, held out for validation.", above=0, below=1
@@ -60,3 +70,8 @@ class HistoryOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    @property
+    def filters(self) -> dict[str, tuple[str, ...]]:
+        """The filters that are set: name of the field -> accepted values."""
+        return {name: getattr(self, name) for name in FILTERS if getattr(self, name)}

@@ -79,7 +79,7 @@ def _check_info(index: Index, tasks: list[Task], chosen: set[str], report: Repor
     """Check that meta/info.json has the totals of the index and, if all shards are here and valid, their statistics."""
     root, info, shards = index.root, index.info, index.values("shard")
     kept_steps = info.environment.kept_steps
-    described = describe(info.kind, info.data_version, kept_steps, list(index.entries))
+    described = describe(info.kind, info.data_version, kept_steps, list(index.entries), info.format_version)
     if report.ok and report.level != "quick" and all(name in chosen and (root / name).is_file() for name in shards):
         try:
             provenance = read_provenance(resolve_inside(root, PROVENANCE))

@@ -129,7 +129,7 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
     total = sum(map(len, members.values()))
     for name, entries in members.items():
         try:
-            shard = Shard(local, name, index.info.kind, entries)
+            shard = Shard(local, name, index.info, entries)
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue

@@ -152,7 +152,9 @@ def show(
         facts = {
             "root": str(dataset.origin),
             **({"revision": remote.revision, "folder": str(dataset.root)} if (remote := dataset.origin.remote) else {}),
-            **describe(info.kind, info.data_version, info.environment.kept_steps, dataset.entries).to_json(),
+            **describe(
+                info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
+            ).to_json(),
             **({"missing": missing} if (missing := _missing(dataset)) else {}),
             "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
         }

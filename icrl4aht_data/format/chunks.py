@@ -1,11 +1,12 @@
 """Chunks of a shard: the chunk table that locates them, and the codec of their bytes.
 
-A shard is an HDF5 file, but is read without libhdf5: the chunk table gives the position, size and checksum of every
-chunk, and the codec reverses HDF5's shuffle and deflate filters.
+A shard is an HDF5 file, but is read without libhdf5: the chunk table gives the position, size and hash of every chunk,
+and the codec reverses HDF5's shuffle and deflate filters.
 """
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import ChunkTableError
-from icrl4aht_data.format.schema import CHUNK_DTYPE, Entry, Kind
+from icrl4aht_data.format.schema import CHUNK_DTYPE, CHUNK_DTYPES, Entry, Kind
 
 if TYPE_CHECKING:
     import h5py  # takes 50 ms to import, and reading does not need it
@@ -46,7 +47,7 @@ def chunk_table_path(root: Path, shard: str) -> Path:
 
 
 def read_table(path: Path) -> np.ndarray:
-    """A chunk table, `CHUNK_DTYPE` (rows,), mapped from its file because it may be larger than it should be.
+    """A chunk table (rows,) of one of the `CHUNK_DTYPES`, mapped from its file because it may be too large for memory.
 
     Raises:
         ChunkTableError: if it is missing, or not a chunk table.
@@ -59,7 +60,7 @@ def read_table(path: Path) -> np.ndarray:
         raise ChunkTableError(f"{path}: the chunk table is missing") from error
     except Exception as error:  # NumPy's parser raises errors of any type for a damaged header
         raise ChunkTableError(f"{path}: not a chunk table: {error!r}") from error
-    if table.dtype != CHUNK_DTYPE or table.ndim != 1:
+    if table.dtype not in CHUNK_DTYPES.values() or table.ndim != 1:
         raise ChunkTableError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
     if (table["size"] > _ROW_BYTES).any():
         raise ChunkTableError(f"{path}: a row covers more than {_ROW_BYTES:,} bytes")
@@ -76,6 +77,30 @@ def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int
             info = dataset.id.get_chunk_info_by_coord(position)
             locations.append((info.byte_offset or 0, info.size, min(field.chunk, entry.rows(field) - start)))
     return locations
+
+
+def chunk_hash(data: bytes) -> bytes:
+    """The hash of stored bytes in a chunk table: BLAKE2b of 16 bytes."""
+    return hashlib.blake2b(data, digest_size=16).digest()
+
+
+def check_chunk(data: bytes, row: np.void) -> None:
+    """Check stored bytes against their row of the chunk table: their size, CRC-32, and hash.
+
+    Args:
+        data: the bytes read from `row["offset"]` on.
+        row: a row of `CHUNK_DTYPE`; those of version 2 have no hash, so that only an accident is noticed.
+
+    Raises:
+        ValueError: says what differs, what was expected, and what was found.
+    """
+    _, size, _, crc32, *hashes = row.item()
+    if len(data) != size:
+        raise ValueError(f"expected {size} bytes, found {len(data)}")
+    if (found := zlib.crc32(data)) != crc32:
+        raise ValueError(f"expected crc32 {crc32:08x}, found {found:08x}")
+    if hashes and (digest := chunk_hash(data)) != (expected := hashes[0].tobytes()):
+        raise ValueError(f"expected blake2b {expected.hex()}, found {digest.hex()}")
 
 
 def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
@@ -104,7 +129,7 @@ def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
         itemsize: bytes of one element; 1 where the shuffle filter was not used.
 
     Raises:
-        ValueError: if the data does not inflate to exactly `size` bytes.
+        ValueError: if the data does not inflate to exactly `size` bytes, or goes on behind the end of the stream.
     """
     inflater = zlib.decompressobj()
     try:
@@ -113,6 +138,8 @@ def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
         raise ValueError(str(error)) from error
     if len(raw) != size or inflater.decompress(inflater.unconsumed_tail, 1) or not inflater.eof:
         raise ValueError(f"does not inflate to {size} bytes")
+    if inflater.unused_data:  # what follows could give any content any checksum
+        raise ValueError(f"{len(inflater.unused_data)} bytes behind the end of the deflate stream")
     if itemsize > 1:
         raw = np.frombuffer(raw, np.uint8).reshape(itemsize, -1).T.tobytes()
     return raw

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,16 +20,17 @@ from icrl4aht_data.utils.cache import cached_arrays, content_hash
 from icrl4aht_data.utils.files import LINE_BYTES, plain_size, wrap_read_errors
 from icrl4aht_data.utils.paths import LARGEST
 
-QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id")
+QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")
 """The entry fields that can be filtered by."""
 
-_VERSION = 1  # of the cached columns
+_VERSION = 2  # of the cached columns
 _UNCACHED = 2**20  # bytes: a smaller index is decoded as quickly as its columns are opened
 _BLOCK = 2**19  # bytes decoded at a time
 
 _DERIVED = ("history_id", "obs_shape")  # checked, but not stored: they follow from the row and the layout
-_DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64}
+_DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
+_OPTIONAL = {name: hint for name, hint in ENTRY_HINTS.items() if hint in (int | None, float | None)}
 _STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint is str)
 _RELATED = ("track", "split", "layout", "teammate_family", "obs_shape", "shard")
 
@@ -38,14 +40,14 @@ _DECODER = msgspec.json.Decoder(Entry)
 class Columns(Sequence[Entry]):
     """The index as arrays with one row per history; also the sequence of its entries, which are made on access.
 
-    A string column is int32 codes into its values; `h5_row` is -1 for None. Histories that agree in all of
-    `QUERY_FIELDS` form a combination.
+    A string column is int32 codes into its values; None is -1 among integers and NaN among floats. Histories
+    that agree in all of `QUERY_FIELDS` form a combination.
 
     Args:
         arrays: every column by name; see `combinations`, `order` and `starts`.
 
     Attributes:
-        combinations: int64 (N, 6), codes of `QUERY_FIELDS`.
+        combinations: int64 (N, 7), codes of `QUERY_FIELDS`.
         order: int64 (H,), the rows combination by combination, ascending within each.
         starts: int64 (N + 1,), position of each combination's first row in `order`.
     """
@@ -107,8 +109,9 @@ class Columns(Sequence[Entry]):
         values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
         for name in _STRINGS:
             values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].item().decode()
-        if values["h5_row"] < 0:
-            values["h5_row"] = None
+        for name, hint in _OPTIONAL.items():
+            if values[name] == -1 if hint == int | None else math.isnan(values[name]):
+                values[name] = None
         return Entry(history_id=row, obs_shape=LAYOUTS[values["layout"]].obs_shape, **values)
 
 
@@ -232,7 +235,9 @@ def _encode(entries: list[Entry], codes: dict[str, _Codes], first: int) -> dict[
         except IndexFormatError as error:
             row = next(row for row, value in enumerate(values[name]) if value not in known)
             raise _LineError(row, f"field {name!r}: {error}") from error
-    values["h5_row"] = [-1 if row is None else row for row in values["h5_row"]]
+    for name, hint in _OPTIONAL.items():
+        absent = -1 if hint == int | None else np.nan
+        values[name] = [absent if value is None else value for value in values[name]]
     for name, dtype in (*_NUMBERS.items(), ("history_id", np.int64)):
         block[name] = np.array(values[name], dtype)
 

@@ -17,6 +17,9 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.paths import resolve_inside
 
+ALIASES = {"algorithm": "teammate_kind"}
+"""Other names of filters: the kind of a learned teammate is the algorithm that trained it."""
+
 _KNOWN_VALUES = {"split": SPLITS, "track": tuple(TRACKS), "teammate_family": FAMILIES}
 
 
@@ -54,7 +57,7 @@ class Index:
         The time grows with the number of combinations of fields and of ids found, not with the number of histories.
 
         Args:
-            wanted: field of `QUERY_FIELDS` -> a value or several.
+            wanted: field of `QUERY_FIELDS` or `ALIASES` -> a value or several.
 
         Raises:
             UnknownNameError: for a field or a value that the benchmark does not know; lists the valid ones.
@@ -63,11 +66,13 @@ class Index:
         filters = {name: value for name, value in wanted.items() if value is not None}
         combinations = self.entries.combinations
         matching = np.ones(len(combinations), bool)
-        for name, value in filters.items():
+        for given, value in filters.items():
+            name = ALIASES.get(given, given)
             if name not in QUERY_FIELDS:
-                raise unknown("filter", name, QUERY_FIELDS)
+                raise unknown("filter", given, (*QUERY_FIELDS, *ALIASES))
             names = [value] if isinstance(value, str) else value
-            matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], [self._code(name, one) for one in names])
+            codes = [self._code(name, one, given) for one in names]
+            matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], codes)
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
             raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {self.summary()}")
@@ -76,12 +81,17 @@ class Index:
         ids = np.concatenate([self.entries.rows(c) for c in np.flatnonzero(matching).tolist()])
         return ids if (np.diff(ids) > 0).all() else np.sort(ids)
 
-    def _code(self, name: str, value: str) -> int:
-        """The code of a value, also of a layout's alias; -1 for a valid value that no history has."""
+    def _code(self, name: str, value: str, given: str) -> int:
+        """The code of a value, also of a layout's alias; -1 for a valid value that no history has.
+
+        Args:
+            name, value: of `QUERY_FIELDS`, and the wanted value.
+            given: the field's name in messages.
+        """
         canonical = get_layout(value).name if name == "layout" else value
         code = self.entries.code(name, canonical) if isinstance(canonical, str) else None
         if code is None and name != "layout" and canonical not in _KNOWN_VALUES.get(name, ()):
-            raise unknown(name, value, _KNOWN_VALUES.get(name) or self.values(name))
+            raise unknown(given, value, _KNOWN_VALUES.get(name) or self.values(name))
         return -1 if code is None else code
 
     def summary(self) -> str:

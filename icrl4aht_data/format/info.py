@@ -21,7 +21,7 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, Entry, Kind, check_name
+from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
@@ -103,7 +103,7 @@ class ReleaseInfo:
     """The content of meta/info.json.
 
     Args:
-        format_version: version of the file format, `schema.FORMAT_VERSION`.
+        format_version: version of the file format, one of `schema.READABLE_VERSIONS`.
         data_version: version of the data, SemVer.
         kind: which arrays the shards store, see `schema.Kind`.
         actions: the actions' names by number.
@@ -133,7 +133,7 @@ class ReleaseInfo:
 
     @classmethod
     def from_json(cls, content: Any) -> ReleaseInfo:
-        """Parse the content of an info.json of this format version.
+        """Parse the content of an info.json of a readable format version.
 
         Raises:
             IndexFormatError: without the file, which the caller adds.
@@ -169,11 +169,11 @@ def read_info(root: Path) -> ReleaseInfo:
         version = content.get("format_version") if isinstance(content, dict) else None
         if not isinstance(version, int):
             raise IndexFormatError("expected an object with an integer format_version")
-        if version == FORMAT_VERSION:
+        if version in READABLE_VERSIONS:
             return ReleaseInfo.from_json(content)
     except IndexFormatError as error:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
-    found = f"{path}: format version {version}, this package reads {FORMAT_VERSION}"
+    found = f"{path}: format version {version}, this package reads {' and '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
         raise FormatTooNewError(f"{found}: `pip install -U icrl4aht-data`")
     raise FormatTooOldError(f"{found}: rebuild or fetch the release again")
@@ -201,7 +201,9 @@ def check_version(version: str) -> str:
     return version
 
 
-def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry]) -> ReleaseInfo:
+def describe(
+    kind: Kind, data_version: str, kept_steps: int, entries: list[Entry], format_version: int = FORMAT_VERSION
+) -> ReleaseInfo:
     """The info of a release with these histories, without sizes of shards and statistics."""
     layouts = {}
     for name in dict.fromkeys(entry.layout for entry in entries):
@@ -218,7 +220,7 @@ def describe(kind: Kind, data_version: str, kept_steps: int, entries: list[Entry
             mean_final_return=round(float(np.mean([entry.return_end for entry in members])), 3),
         )
     return ReleaseInfo(
-        format_version=FORMAT_VERSION,
+        format_version=format_version,
         data_version=data_version,
         kind=kind,
         actions=list(ACTIONS),

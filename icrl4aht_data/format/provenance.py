@@ -13,6 +13,8 @@ from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.utils.files import parse_json, read_text
 
 _Streams = Annotated[int, Meta(ge=0, lt=2**31)]
+_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,24 @@ class ExpertLabels:
     Args:
         policy_sha256: SHA-256 of the policy's weights.
         action: how the policy chose actions.
+        step: environment steps that the policy was trained for.
+        return_greedy: its mean return over `episodes` episodes with the task's teammate, acting greedily.
+        return_sampled: its mean return with sampled actions.
+        episodes: number of episodes of each measurement.
+        last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
     """
 
     policy_sha256: str
     action: str
+    step: _Count | None = None
+    return_greedy: _Return | None = None
+    return_sampled: _Return | None = None
+    episodes: _Count | None = None
+    last_return_greedy: _Return | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The object to write, without what was not recorded."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +105,7 @@ class Provenance:
         code_version: version of this package.
         jax_version: version of JAX.
         platform: JAX backend, such as "cpu".
+        xla_threads: threads that XLA computed with; results differ in the last bits between numbers of threads.
         seed: the learner's seed.
         teammate: how the teammate played: its `slot` and the source of its `noise`.
         streams_recorded: environment streams of the learner.
@@ -106,6 +123,7 @@ class Provenance:
     code_version: str | None = None
     jax_version: str | None = None
     platform: str | None = None
+    xla_threads: _Count | None = None
     seed: int | None = None
     teammate: dict[str, Any] | None = None
     streams_recorded: _Streams | None = None
@@ -118,6 +136,8 @@ class Provenance:
     def to_json(self) -> dict[str, Any]:
         """The object to write, without what was not recorded."""
         content = {name: value for name, value in asdict(self).items() if name != "other" and value is not None}
+        if self.expert is not None:
+            content["expert"] = self.expert.to_json()
         if self.suite is not None and self.suite.layouts is None:
             del content["suite"]["layouts"]
         return content | self.other

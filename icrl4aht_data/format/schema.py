@@ -4,9 +4,10 @@
     meta/histories.jsonl    one line per learning history: `Entry`
     meta/tasks.jsonl        one line per task, see `benchmark.tasks`; may be empty in releases of observations
     meta/provenance.json    task_id -> how its histories were made
-    meta/chunks/**.npy      for each shard: offset, size, rows, crc32 of every chunk
+    meta/chunks/**.npy      for each shard: offset, size, rows, crc32, hash of every chunk
     data/<track>/<layout>/<split>-00000-of-00001.h5
     teammates/<sha256>/     checkpoints of learned teammates, in folders named by the SHA-256 of their weights
+    experts/<sha256>/       checkpoints of the egos that the expert actions come from; optional
     MANIFEST.sha256         every file above, in sha256sum's format
 
 A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard leaves
@@ -27,8 +28,12 @@ from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-FORMAT_VERSION = 2
-"""Version of the file format. A reader accepts exactly this one, see `FormatTooOldError` and `FormatTooNewError`."""
+FORMAT_VERSION = 3
+"""Version of the file format that is written."""
+
+READABLE_VERSIONS = (2, FORMAT_VERSION)
+"""Versions that are read; for others see `FormatTooOldError` and `FormatTooNewError`. Version 2 has no hashes of chunks
+and no `source`, `expert_return`, `expert_return_sampled` and `expert_step` in the index."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
@@ -37,6 +42,9 @@ INFO, HISTORIES, TASKS, PROVENANCE = (
 
 TEAMMATES = "teammates"
 """The folder of learned teammates."""
+
+EXPERTS = "experts"
+"""The folder of the egos' checkpoints whose greedy actions are the labels; a release may be without it."""
 
 Kind = Literal["full", "lite", "observations"]
 KINDS: tuple[Kind, ...] = ("full", "lite")
@@ -47,12 +55,17 @@ OBSERVATIONS: Kind = "observations"
 
 ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
-CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")])
+_POSITION = [("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")]
+
+CHUNK_DTYPE = np.dtype([*_POSITION, ("hash", "u1", (16,))])
 """One row of a chunk table: position and size of the stored bytes, how many of the chunk's rows belong to the history
-(the last chunk is padded), and the checksum of the stored bytes. The bytes between the chunks follow in rows with
-`rows` = 0, so that the table covers every byte of a shard exactly once. Rows are ordered by history, then by `FIELDS`,
-then by chunk. In the file a history's chunks are ordered by time, so that a window of steps is one range of bytes, see
-`shard_writer.file_order`."""
+(the last chunk is padded), and checksum and hash of the stored bytes, see `chunks.check_chunk`. The bytes between the
+chunks follow in rows with `rows` = 0, so that the table covers every byte of a shard exactly once. Rows are ordered by
+history, then by `FIELDS`, then by chunk. In the file a history's chunks are ordered by time, so that a window of steps
+is one range of bytes, see `shard_writer.file_order`."""
+
+CHUNK_DTYPES: dict[int, np.dtype] = {2: np.dtype(_POSITION), 3: CHUNK_DTYPE}
+"""Format version -> dtype of its chunk tables."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +175,12 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return_start: mean return of the first episodes.
         return_end: mean return of the last episodes.
         return_mean: mean return of all episodes.
+        source: how the history was made, such as "ppo".
+        expert_return: mean return of 200 episodes of 100 steps of the policy that the expert actions come from, acting
+            greedily with the task's teammate; None where it was not measured. All histories of a task agree in this
+            and the next two fields.
+        expert_return_sampled: the mean return with sampled actions.
+        expert_step: environment steps that the policy was trained for; None where it is unknown.
     """
 
     history_id: _Int
@@ -186,6 +205,10 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     return_start: _Number
     return_end: _Number
     return_mean: _Number
+    source: _Name = "ppo"
+    expert_return: _Number | None = None
+    expert_return_sampled: _Number | None = None
+    expert_step: _Row | None = None
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """The fields that this history's shard stores."""
@@ -218,6 +241,7 @@ JSON_TYPES: dict[str, set[type]] = {
         bool: {bool},
         float: {float, int},
         int | None: {int, type(None)},
+        float | None: {float, int, type(None)},
         tuple[int, int, int]: {list},
     }[hint]
     for name, hint in ENTRY_HINTS.items()

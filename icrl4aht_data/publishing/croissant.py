@@ -35,7 +35,8 @@ _FORMATS = {
     ".safetensors": "application/vnd.safetensors",
 }
 _SHAPE = tuple[int, int, int]
-_TYPES = {str: "TEXT", bool: "BOOL", float: "FLOAT", int: "INTEGER", int | None: "INTEGER", _SHAPE: "INTEGER"}
+_TYPES = {str: "TEXT", bool: "BOOL", float: "FLOAT", int: "INTEGER", _SHAPE: "INTEGER"}
+_TYPES |= {int | None: "INTEGER", float | None: "FLOAT"}
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",

@@ -1,8 +1,9 @@
-"""One learning history with its fields as lazy arrays, which read only the rows that are indexed."""
+"""One learning history with its fields as lazy arrays."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -11,6 +12,7 @@ from icrl4aht_data.errors import LabelsMissingError, NotStoredError, unknown
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.reading.lazy_array import LazyArray
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.memory import new_array
 
@@ -23,7 +25,8 @@ OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
 class History:
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
-    `history.actions`, `.rewards`, `.obs` and so on are lazy arrays: indexing them reads only the chunks it needs.
+    `history.actions`, `.rewards`, `.obs` and so on are lazy arrays, which behave as NumPy arrays: indexing them reads
+    only the chunks it needs, anything else (`history.actions == history.expert_actions`) reads the field.
 
     Args:
         entry: the history's entry of the index.
@@ -98,96 +101,63 @@ class History:
             )
         return field
 
+    def _lazy(self, name: str, dtype: DTypeLike | None = None) -> LazyArray:
+        """A field that is read when it is used, in the field's dtype or another one."""
+        field = self._field(name)
+        dtype = np.dtype(field.dtype if dtype is None else dtype)
+        row = {"scalar": (), "obs": self.entry.obs_shape}.get(field.row)
+        if row is None:
+            row = field.element(get_layout(self.entry.layout), "full").shape
+        read = partial(self._rows, name, dtype)
+        return LazyArray(f"{name} of history {self.entry.history_id}", (self.entry.rows(field), *row), dtype, read)
+
+    def _rows(self, name: str, dtype: np.dtype, start: int, stop: int) -> np.ndarray:
+        if self.kind in FIELDS[name].absent:
+            return self._rendered(start, stop, dtype)
+        return self.read(name, start, stop).astype(dtype, copy=False)
+
     @property
     def obs(self) -> LazyArray:
         """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state"."""
-        return LazyArray(self, "state" if self._obs == "state" else "obs", self._obs)
+        if self._obs == "state":
+            return self._lazy("state")
+        return self._lazy("obs", self._obs)
 
     @property
     def state(self) -> LazyArray:
         """(T, S) uint8: the state record before each step; see `overcooked.state`."""
-        return LazyArray(self, "state")
+        return self._lazy("state")
 
     @property
     def actions(self) -> LazyArray:
         """(T,) int32: the ego's actions, 0..5."""
-        return LazyArray(self, "actions")
+        return self._lazy("actions")
 
     @property
     def rewards(self) -> LazyArray:
         """(T,) float32: the team's reward of each step, without shaping."""
-        return LazyArray(self, "rewards")
+        return self._lazy("rewards")
 
     @property
     def dones(self) -> LazyArray:
         """(T,) bool: True at the last kept step of each episode."""
-        return LazyArray(self, "dones")
+        return self._lazy("dones")
 
     @property
     def teammate_actions(self) -> LazyArray:
         """(T,) int32: the teammate's actions, 0..5."""
-        return LazyArray(self, "teammate_actions")
+        return self._lazy("teammate_actions")
 
     @property
     def expert_actions(self) -> LazyArray:
         """(T,) int32: greedy actions of the final ego at the same steps, 0..5 (paper, App. D.1)."""
-        return LazyArray(self, "expert_actions")
+        return self._lazy("expert_actions")
 
     @property
     def episode_end_state(self) -> LazyArray:
         """(E, S) uint8: the state after each episode's last kept step."""
-        return LazyArray(self, "episode_end_state")
+        return self._lazy("episode_end_state")
 
     def returns(self) -> np.ndarray:
         """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
         return episode_returns(self.read("rewards"), self.read("dones"))
-
-
-class LazyArray:
-    """One field of a history that is read when it is indexed. Supports NumPy indexing.
-
-    Args:
-        history: the history.
-        name: the field, one of `schema.FIELDS`.
-        obs: for the field `obs`, "float32" or "uint8".
-
-    Attributes:
-        dtype: the rows' dtype.
-        shape: (T, ...), or (E, ...) for `episode_end_state`.
-    """
-
-    def __init__(self, history: History, name: str, obs: Obs | None = None) -> None:
-        self._history, self._name = history, name
-        entry, field = history.entry, history._field(name)
-        self.dtype = np.dtype(field.dtype)
-        if name == "obs" and obs == "float32":
-            self.dtype = np.dtype("float32")
-        row = {"scalar": (), "obs": entry.obs_shape}.get(field.row)
-        if row is None:
-            row = field.element(get_layout(entry.layout), "full").shape
-        self.shape = (entry.rows(field), *row)
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __repr__(self) -> str:
-        return f"LazyArray({self._name}, shape={self.shape}, dtype={self.dtype})"
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        first, *rest = key if isinstance(key, tuple) else (key,)
-        if isinstance(first, slice):
-            rows = range(len(self))[first]
-            low, high = sorted((rows[0], rows[-1])) if rows else (0, -1)
-            return self._read(low, high + 1)[:: rows.step][(slice(None), *rest)]
-        if isinstance(first, (int, np.integer)):
-            row = range(len(self))[first]
-            return self._read(row, row + 1)[(0, *rest)]
-        return self._read(0, len(self))[key]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return self[:].astype(dtype or self.dtype, copy=False)
-
-    def _read(self, start: int, stop: int) -> np.ndarray:
-        if self._name == "obs" and self._history.kind in FIELDS["obs"].absent:
-            return self._history._rendered(start, stop, self.dtype)
-        return self._history.read(self._name, start, stop).astype(self.dtype, copy=False)

@@ -8,14 +8,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self, overload
+from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 
-from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import KINDS, Entry
+from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import OBS, History, Obs
 from icrl4aht_data.reading.shard import Shards
@@ -32,6 +32,9 @@ from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
+
+if TYPE_CHECKING:
+    import pandas
 
 FilterValues = str | Sequence[str] | None
 """One value of an index field, several, or None for any."""
@@ -158,7 +161,7 @@ class Selection:
 
     def __repr__(self) -> str:
         layouts = [layout.name for layout in self.layouts]
-        tasks = len(np.unique(self.column("task_id")))
+        tasks = len(np.unique(self.column_codes("task_id")))
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
@@ -175,16 +178,62 @@ class Selection:
         return History(entry, self._shards.open(entry.shard), self.obs)
 
     def column(self, name: str) -> np.ndarray:
-        """Return one index field of the selected histories, shape (H,).
+        """Return one index field of the selected histories: a field of `Entry`, such as "layout" or "return_end".
 
-        Numbers are returned as they are, text fields as integer codes (decode with `Index.values`).
+        Args:
+            name: the field.
+
+        Returns:
+            (H,): names as NumPy strings, numbers as int64 or float64, where None is -1 or NaN, and bool; (H, 3) for
+            `obs_shape`.
+
+        Raises:
+            UnknownNameError: if there is no such field; names the nearest one.
         """
+        if name not in ENTRY_HINTS:
+            raise unknown("column", name, ENTRY_HINTS)
+        if name == "history_id":
+            return self.ids.astype(np.int64)
+        if name == "obs_shape":
+            return np.array([layout.obs_shape for layout in self.layouts])[self.layout_numbers]
+        if ENTRY_HINTS[name] is str:
+            return np.array(self.index.values(name) or [""])[self.column_codes(name)]
         return self.index.entries.column(name)[self.ids]
+
+    def column_codes(self, name: str) -> np.ndarray:
+        """Return one index field of names as numbers, int32 (H,): the name with number n is `index.values(name)[n]`."""
+        return self.index.entries.column(name)[self.ids]
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the index entries as a data frame with one row per history and the columns of `Entry`.
+
+        Names are categories, integers that may be unknown `Int64`, unknown floats NaN, observation shapes tuples.
+
+        Raises:
+            OptionError: if pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise OptionError("a data frame needs pandas: pip install pandas") from error
+        columns: dict[str, Any] = {}
+        for name, hint in ENTRY_HINTS.items():
+            if hint is str:
+                codes = pandas.Categorical.from_codes(self.column_codes(name), self.index.values(name))
+                columns[name] = codes.remove_unused_categories()
+            elif hint == int | None:
+                numbers = self.column(name)
+                columns[name] = pandas.arrays.IntegerArray(numbers, numbers == -1)
+            elif name == "obs_shape":
+                columns[name] = list(map(tuple, self.column(name).tolist()))
+            else:
+                columns[name] = self.column(name)
+        return pandas.DataFrame(columns)
 
     @cached_property
     def layouts(self) -> list[Layout]:
         """The layouts of the selection, in order of appearance."""
-        codes, first = np.unique(self.column("layout"), return_index=True)
+        codes, first = np.unique(self.column_codes("layout"), return_index=True)
         names = self.index.values("layout")
         return [get_layout(names[code]) for code in codes[np.argsort(first)].tolist()]
 
@@ -194,7 +243,7 @@ class Selection:
         names = self.index.values("layout")
         number = np.zeros(len(names), np.int32)
         number[[names.index(layout.name) for layout in self.layouts]] = np.arange(len(self.layouts))
-        return number[self.column("layout")]
+        return number[self.column_codes("layout")]
 
     @cached_property
     def entries(self) -> list[Entry]:
@@ -205,7 +254,7 @@ class Selection:
     def shards(self) -> list[str]:
         """Paths in the release of the shards that store the selection."""
         names = self.index.values("shard")
-        return [names[code] for code in np.unique(self.column("shard")).tolist()]
+        return [names[code] for code in np.unique(self.column_codes("shard")).tolist()]
 
     @cached_property
     def cache(self) -> CacheChoice:
@@ -248,22 +297,50 @@ class Selection:
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 
-    def filter(self, **wanted: FilterValues) -> Self:
+    def filter(self, *, min_expert_return: float | None = None, **wanted: FilterValues) -> Self:
         """Return the histories of this selection whose index fields have one of the wanted values.
 
         Args:
+            min_expert_return: only histories whose labels come from a policy that earned at least this much, acting
+                greedily: `Entry.expert_return`.
             wanted: field=value, several values, or None for any: split, layout, track, teammate_family, teammate_kind
-                or task_id, as in `load_icrl4aht`.
+                (or algorithm, which is the same), source or task_id, as in `load_icrl4aht`.
 
         Raises:
             UnknownNameError: for a field or value that does not exist.
             EmptySelectionError: if no history is left.
+            OptionError: if `min_expert_return` is not a number.
+            NotStoredError: for `min_expert_return`, if of some history that is left it is not known.
         """
         matching = self.index.query(**wanted)
         ids = self.ids[np.isin(self.ids, matching)]
         if not len(ids):
             raise EmptySelectionError(f"{self.root}: no history of this selection has {wanted}; it is {self!r}")
-        return type(self)(self.origin, self.index, self._shards, self.options, ids)
+        found = type(self)(self.origin, self.index, self._shards, self.options, ids)
+        return found if min_expert_return is None else found._earning(min_expert_return)
+
+    def _earning(self, least: float) -> Self:
+        """The histories whose labels come from a policy that earned at least so much; see `filter`."""
+        if isinstance(least, bool) or not isinstance(least, (int, float, np.integer, np.floating)) or np.isnan(least):
+            raise OptionError(f"min_expert_return = {least!r}: expected a number, the return of an episode")
+        returns = self.column("expert_return")
+        absent = np.isnan(returns)
+        if absent.any():
+            tasks = np.unique(self.column("task_id")[absent])
+            known = 'ds.select(ds.ids[~np.isnan(ds.column("expert_return"))])'
+            raise NotStoredError(
+                f"min_expert_return: {self.origin} does not say what the policies behind the labels of "
+                f"{int(absent.sum())} of {len(self)} histories earn (first task: {tasks[0]}), as releases of format "
+                f"version 2 and those converted from them. Leave out min_expert_return"
+                + ("" if absent.all() else f", or take the histories where it is known: {known}")
+            )
+        kept = returns >= least
+        if not kept.any():
+            raise EmptySelectionError(
+                f"{self.root}: no history of this selection has expert_return >= {least:g}; the highest is "
+                f"{returns.max():g}; it is {self!r}"
+            )
+        return self.select(self.ids[kept])
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
         """Return the histories of this selection with these ids, in this order.

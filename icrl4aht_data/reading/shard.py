@@ -1,21 +1,34 @@
-"""Reading of one HDF5 shard by stored offsets, with a checksum on every chunk; `writing.shard_writer` writes shards.
+"""Reading of one HDF5 shard by stored offsets, with a hash of every chunk; `writing.shard_writer` writes shards.
 
 Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. This reader does not use libhdf5: it
-reads a chunk's bytes at the offset in the chunk table, checks their CRC-32 and inflates them, without a global lock.
+reads a chunk's bytes at the offset in the chunk table, checks their hash and inflates them, without a global lock.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.errors import ShardCorruptError, ShardMismatchError, ShardMissingError, ShardTruncatedError
-from icrl4aht_data.format.chunks import DEFLATE_RATIO, chunk_table_name, decode_chunk, read_table
+from icrl4aht_data.errors import (
+    ChunkTableError,
+    ShardCorruptError,
+    ShardMismatchError,
+    ShardMissingError,
+    ShardTruncatedError,
+)
+from icrl4aht_data.format.chunks import (
+    DEFLATE_RATIO,
+    check_chunk,
+    chunk_hash,
+    chunk_table_name,
+    decode_chunk,
+    read_table,
+)
 from icrl4aht_data.format.index import Index
-from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
+from icrl4aht_data.format.info import ReleaseInfo
+from icrl4aht_data.format.schema import CHUNK_DTYPES, FIELDS, Entry, Field
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
 from icrl4aht_data.remote.partial_file import PartialFile, fetch_chunks
@@ -30,13 +43,15 @@ class Shard:
     Args:
         location: the release. If it is remote, opening downloads the chunk table, and reading the chunks it needs.
         name: path of the shard in the release.
-        kind: the release's kind.
+        info: the release's info.
         entries: all histories of the shard, in index order.
         cache: decoded chunks, shared with other shards; a new cache by default.
 
     Attributes:
         entries: history id -> index entry.
-        table: CHUNK_DTYPE (N,), the chunk table.
+        table: (N,), the chunk table, see `schema.CHUNK_DTYPES`.
+        kind: the release's kind.
+        format_version: the release's format version.
 
     Raises:
         ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError: if shard and chunk table do not fit
@@ -47,17 +62,17 @@ class Shard:
         self,
         location: ReleaseLocation,
         name: str,
-        kind: Kind,
+        info: ReleaseInfo,
         entries: Sequence[Entry],
         cache: ChunkCache | None = None,
     ) -> None:
         self.path, self.name = resolve_inside(location.folder, name), name
-        self.kind: Kind = kind
+        self.kind, self.format_version = info.kind, info.format_version
         self.layout = get_layout(entries[0].layout)
         self.entries = {entry.history_id: entry for entry in entries}
         self._remote = location.remote
         self._cache = cache or ChunkCache()
-        self._elements = {field.name: field.element(self.layout, kind) for field in FIELDS.values()}
+        self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
         self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()
@@ -67,6 +82,10 @@ class Shard:
     def _check_table(self) -> None:
         """Check that the chunk table has the chunks and rows that the index implies, in sizes that can be true."""
         table = self.table
+        if table.dtype != CHUNK_DTYPES[self.format_version]:
+            raise ChunkTableError(
+                f"{self.path}: the chunk table is not of format version {self.format_version}; fetch meta/ again"
+            )
         members = [(entry, field) for entry in self.entries.values() for field in entry.stored_fields(self.kind)]
         chunks = [entry.chunks(field) for entry, field in members]
         *firsts, total = np.cumsum([0, *chunks]).tolist()
@@ -124,7 +143,7 @@ class Shard:
         """Rows start..stop of a field, in the field's dtype. The range must be within the history.
 
         Raises:
-            ShardCorruptError: names the chunk whose checksum or size is wrong.
+            ShardCorruptError: names the chunk whose hash or size is wrong.
         """
         what = f"{self.path}: history {history_id}: {field.name}"
         rows = new_array((stop - start, *self._elements[field.name].shape), field.dtype, what)
@@ -149,7 +168,7 @@ class Shard:
         """Read all rows of a history's field into `out` without adding them to the cache.
 
         Raises:
-            ShardCorruptError: names the chunk whose checksum or size is wrong.
+            ShardCorruptError: names the chunk whose hash or size is wrong.
             ShardMismatchError: if the dtype of `out` cannot represent a value.
         """
         first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
@@ -171,14 +190,7 @@ class Shard:
             history_id, field: what the chunk belongs to.
         """
         element, length = self._elements[field.name], self._chunk_rows(history_id, field)
-        offset, size, _, expected = self.table[row].item()
-        data = self.stored_bytes(offset, size, expected)
-        found = zlib.crc32(data)
-        if found != expected or len(data) != size:
-            raise ShardCorruptError(
-                f"{self.path}: {self.describe(row)}: expected crc32 {expected:08x}, found {found:08x}; "
-                f"the file is damaged, fetch the shard again"
-            )
+        data = self.checked_bytes(row)
         try:
             raw = decode_chunk(data, length * element.itemsize, element.itemsize)
         except ValueError as error:
@@ -187,8 +199,24 @@ class Shard:
         rows.flags.writeable = False  # the cache hands it to several readers
         return rows
 
-    def stored_bytes(self, offset: int, size: int, crc32: int) -> bytes:
-        """Bytes of the file; a remote's are downloaded if no bytes with that CRC-32 are here."""
+    def checked_bytes(self, row: int) -> bytes:
+        """The stored bytes of one row of the chunk table.
+
+        Raises:
+            ShardCorruptError: if they are damaged; names the chunk.
+        """
+        data = self.stored_bytes(self.table[row])
+        try:
+            check_chunk(data, self.table[row])
+        except ValueError as error:
+            raise ShardCorruptError(
+                f"{self.path}: {self.describe(row)}: {error}; the file is damaged, fetch the shard again"
+            ) from error
+        return data
+
+    def stored_bytes(self, row: np.void) -> bytes:
+        """Bytes of the file, unchecked; a remote's are downloaded if those here are not the ones of the chunk table."""
+        offset, size = row.item()[:2]
         try:
             with self.path.open("rb", buffering=0) as stream:
                 stream.seek(offset)
@@ -196,7 +224,7 @@ class Shard:
         except FileNotFoundError as error:
             if self._remote is None:
                 raise self._missing() from error
-            return self._remote.part(self.name).chunk(offset, size, crc32)
+            return self._remote.part(self.name).chunk(row)
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self.entries[history_id].rows(field))
@@ -216,11 +244,14 @@ class Shard:
         return [(self._remote.part(self.name), self.table[rows])] if rows else []
 
     def fingerprint(self, history_id: int) -> bytes:
-        """Sizes and checksums of a history's chunks, which differ where its stored content differs."""
+        """Hashes of a history's chunks, which differ where its stored content differs."""
         entry = self.entries[history_id]
         stored = entry.stored_fields(self.kind)
         first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
-        return self.table[first : first + chunks][["size", "rows", "crc32"]].tobytes()
+        if self.format_version >= 3:
+            return self.table["hash"][first : first + chunks].tobytes()
+        # Whoever knows a CRC-32 can make other content with it, so the stored bytes themselves are hashed.
+        return b"".join(chunk_hash(self.checked_bytes(row)) for row in range(first, first + chunks))
 
     def chunks(self) -> Iterator[tuple[int, int, Field]]:
         """Every chunk as (row in the chunk table, history id, field)."""
@@ -230,10 +261,12 @@ class Shard:
 
     def describe(self, row: int) -> str:
         """A chunk for messages: its number, field, history and bytes."""
+        offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
+        if not self.table["rows"][row]:
+            return f"bytes {offset}..{offset + size}, between the chunks"
         (history_id, name), first = max(
             ((key, first) for key, first in self._first.items() if first <= row), key=lambda item: item[1]
         )
-        offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         return f"chunk {row - first} of {name} in history {history_id} (bytes {offset}..{offset + size})"
 
 
@@ -285,5 +318,5 @@ class Shards:
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
-            self._open[name] = Shard(self._location, name, self._index.info.kind, members, self.cache)
+            self._open[name] = Shard(self._location, name, self._index.info, members, self.cache)
         return self._open[name]

@@ -9,7 +9,6 @@ windows, resumed downloads and repairs all rely on this.
 from __future__ import annotations
 
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from icrl4aht_data.errors import ChunkTableError, RemoteError
+from icrl4aht_data.format.chunks import check_chunk
 from icrl4aht_data.format.schema import CHUNK_DTYPE
 from icrl4aht_data.remote.store import Store
 from icrl4aht_data.utils.cache import cache_limit, data_folder
@@ -68,8 +68,9 @@ class PartialFile:
     def __reduce__(self) -> tuple:
         return type(self), (self.store, self.name, self.path)
 
-    def get(self, offset: int, size: int, crc32: int) -> bytes | None:
-        """The bytes of a chunk, or None if it is not downloaded or damaged."""
+    def get(self, row: np.void) -> bytes | None:
+        """The bytes of a chunk, a row of the chunk table, or None if it is not downloaded or damaged."""
+        offset, size = row.item()[:2]
         with self._lock:
             data = self._overflow.get(offset)
         if data is None:
@@ -79,7 +80,11 @@ class PartialFile:
                     data = stream.read(size)
             except OSError:  # no such file, or a bad sector
                 return None
-        return data if len(data) == size and zlib.crc32(data) == crc32 else None
+        try:
+            check_chunk(data, row)
+        except ValueError:
+            return None
+        return data
 
     def put(self, start: int, data: bytes) -> None:
         """Write bytes at their offset.
@@ -106,15 +111,16 @@ class PartialFile:
                 while excess > 0 and len(self._overflow) > 1:
                     excess -= len(self._overflow.popitem(last=False)[1])
 
-    def chunk(self, offset: int, size: int, crc32: int) -> bytes:
-        """The bytes of a chunk, fetched if necessary.
+    def chunk(self, row: np.void) -> bytes:
+        """The bytes of a chunk, a row of the chunk table, fetched if necessary.
 
         Raises:
             RemoteError: if it cannot be fetched, or arrives with a wrong checksum.
         """
-        data = self.get(offset, size, crc32)
+        data = self.get(row)
         if data is None:
-            wanted = ByteRange(offset, offset + size, np.array([(offset, size, 0, crc32)], CHUNK_DTYPE))
+            offset, size = row.item()[:2]
+            wanted = ByteRange(offset, offset + size, np.array([row]))
             data = _fetch(self, wanted)
             self.cache(wanted, data)
         return data
@@ -122,7 +128,7 @@ class PartialFile:
     def missing_chunks(self, chunks: np.ndarray) -> np.ndarray:
         """The chunks (CHUNK_DTYPE) that are not downloaded or damaged, by offset."""
         if self.path.exists() or self._overflow:
-            chunks = chunks[[self.get(offset, size, crc) is None for offset, size, _, crc in chunks.tolist()]]
+            chunks = chunks[[self.get(row) is None for row in chunks]]
         return np.sort(chunks, order="offset")
 
 
@@ -231,18 +237,21 @@ def _ranges(chunks: np.ndarray, gap: int = _GAP) -> list[ByteRange]:
 
 def _fetch(file: PartialFile, wanted: ByteRange) -> bytes:
     """The bytes of a range, requested until the checksum of every chunk in it is right."""
-    damaged = 0, 0, 0
+    damaged = ""
     for _ in range(_ATTEMPTS):
         data = file.store.read(file.name, wanted.start, wanted.stop)
-        for offset, size, _, crc in wanted.chunks.tolist():
-            if zlib.crc32(data[offset - wanted.start : offset - wanted.start + size]) != crc:
-                damaged = offset, offset + size, crc
+        for row in wanted.chunks:
+            offset, size = row.item()[:2]
+            try:
+                check_chunk(data[offset - wanted.start : offset - wanted.start + size], row)
+            except ValueError as error:
+                damaged = f"bytes {offset}..{offset + size}: {error}"
                 break
         else:
             return data
     raise RemoteError(
-        f"{file.store.url}/{file.name}: bytes {damaged[0]}..{damaged[1]}: expected crc32 {damaged[2]:08x}, got others "
-        f"{_ATTEMPTS} times: the remote's file is damaged or not of this version; report it to its publisher"
+        f"{file.store.url}/{file.name}: {damaged}, {_ATTEMPTS} times: the remote's file is damaged or not of this "
+        f"version; report it to its publisher"
     )
 
 

@@ -17,7 +17,8 @@ class ADBatch(NamedTuple):
     """Windows of learning histories (paper, App. D.4).
 
     Rows are padded with zeros if the history, or the part selected by `episodes` or `curriculum`, is shorter than L.
-    The `prev_*` fields hold the values of the previous step of the history, also at the first step of a window.
+    The `prev_*` fields hold the values of the previous step of the history, also at the first step of a window or of an
+    episode. Where `is_first` is True no step precedes; the zeros there are no values, though 0 is the action "up".
 
     Attributes:
         obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
@@ -30,6 +31,8 @@ class ADBatch(NamedTuple):
             first step; None unless the sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
+        is_first: bool (B, L): True at a history's first step, where the `prev_*` fields are fillers. Samplers always
+            set it.
     """
 
     obs: np.ndarray
@@ -40,6 +43,7 @@ class ADBatch(NamedTuple):
     attention_mask: np.ndarray
     prev_teammate_actions: np.ndarray | None = None
     layouts: np.ndarray | None = None
+    is_first: np.ndarray | None = None
 
     def describe(self) -> str:
         """Return the fields with dtypes and shapes as text, one per line."""
@@ -88,6 +92,7 @@ class ADSampler(Sampler[ADBatch]):
             "attention_mask": ArraySpec("bool", shape),
             **({"prev_teammate_actions": ArraySpec("int32", shape)} if self.teammate_actions else {}),
             **self._layout_specs(),
+            "is_first": ArraySpec("bool", shape),
         }
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
@@ -128,6 +133,9 @@ class ADSampler(Sampler[ADBatch]):
         self._observer.observe(position, records, batch.obs)
         if batch.layouts is not None:
             batch.layouts[...] = self.dataset.layout_numbers[position]
+        assert batch.is_first is not None
+        batch.is_first[...] = False
+        batch.is_first[:, 0] = starts == 0
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
 
-from icrl4aht_data.errors import LabelsMissingError, OptionError, unknown
+from icrl4aht_data.errors import LabelsMissingError, OptionError, WeakLabelsWarning, unknown
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
@@ -72,6 +73,10 @@ class DPTSampler(Sampler[DPTBatch]):
             `curriculum`, the part of each history that queries and contexts are drawn from; `process_index` and
             `process_count`.
 
+    Warns:
+        WeakLabelsWarning: for tasks whose expert actions come from a policy that earns less than half of what their
+            histories earn at the end, as far as the release says what it earns.
+
     Raises:
         LabelsMissingError: if a history has no expert actions.
         OptionError: for impossible options, a selection with observations of several shapes, or contiguous contexts
@@ -103,6 +108,7 @@ class DPTSampler(Sampler[DPTBatch]):
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
         self.order: ContextOrder = order
+        _warn_of_weak_labels(dataset)
 
     def options(self) -> dict[str, Any]:
         excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
@@ -190,7 +196,7 @@ class DPTSampler(Sampler[DPTBatch]):
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions in the selection (H,), task by task in order of appearance; begin and end of each task in them."""
-        _, first, task = np.unique(self.dataset.column("task_id"), return_index=True, return_inverse=True)
+        _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
         sizes = np.bincount(rank[task])
@@ -206,3 +212,33 @@ class DPTSampler(Sampler[DPTBatch]):
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
         """Numbers of steps from numbers of transitions, both counted from the first one of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
+
+
+_NAMED = 5  # tasks that a warning names
+
+
+def _warn_of_weak_labels(dataset: Selection) -> None:
+    """Warn of tasks whose labels come from a policy that earns less than half of what their histories earn at the end.
+
+    The end is the mean of `return_end` over a task's selected histories. Where it is negative, labels are weak if they
+    earn less than one and a half times it.
+    """
+    codes, first, task = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
+    ends = np.bincount(task, dataset.column("return_end")) / np.bincount(task)
+    greedy, sampled = (dataset.column(name)[first] for name in ("expert_return", "expert_return_sampled"))
+    weak = np.flatnonzero(greedy < ends - np.abs(ends) / 2)  # False where the return is NaN, unknown
+    if not len(weak):
+        return
+    names = dataset.index.values("task_id")
+    named = ", ".join(
+        f"{names[codes[k]]} (labels {greedy[k]:.1f}, sampled {sampled[k]:.1f}, histories {ends[k]:.1f})"
+        for k in weak[:_NAMED].tolist()
+    )
+    more = f" and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
+    warnings.warn(
+        f"the expert actions of {len(weak)} of {len(codes)} tasks come from a policy that earns, acting greedily, less "
+        f"than half of what their histories earn at the end: {named}{more}. A model would learn to play worse than its "
+        f"contexts: leave these tasks out by min_expert_return, or select by ds.column('expert_return')",
+        WeakLabelsWarning,
+        stacklevel=4,  # the call of Dataset.dpt
+    )

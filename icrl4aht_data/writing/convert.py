@@ -1,4 +1,4 @@
-"""Conversion of releases between the kinds full, lite and observations."""
+"""Conversion of releases between the kinds full, lite and observations, and to the current format version."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from pathlib import Path
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, Kind
+from icrl4aht_data.utils.files import read_text
+from icrl4aht_data.writing.dataset_card import SOURCE_CARD
 from icrl4aht_data.writing.release import write_release
 from icrl4aht_data.writing.stored import HistoryProgress, release_tasks, stored_task
 
@@ -15,7 +18,7 @@ from icrl4aht_data.writing.stored import HistoryProgress, release_tasks, stored_
 def to_release(
     dataset: Dataset, target: Path, kind: Kind, *, advance: HistoryProgress = lambda done, total: None
 ) -> Path:
-    """Write a selection as a release of another kind, its histories in order and numbered from 0.
+    """Write a selection as a release of the current format version, its histories in order and numbered from 0.
 
     Args:
         dataset: a release, or a part of one.
@@ -39,6 +42,7 @@ def to_release(
     by_task: dict[str, list[int]] = {}
     for entry in dataset.entries:
         by_task.setdefault(entry.task_id, []).append(entry.history_id)
+    listed = read_manifest(dataset.root)
     numbers = iter(range(1, len(dataset) + 1))
 
     def done() -> None:
@@ -52,5 +56,6 @@ def to_release(
             for name, ids in by_task.items()
         ],
         data_version=dataset.info.data_version,
+        source_card=read_text(dataset.origin.file(SOURCE_CARD)) if SOURCE_CARD in listed else None,
         kept_steps=dataset.info.environment.kept_steps,
     )

@@ -22,7 +22,7 @@ def to_parquet(dataset: Dataset, path: Path) -> Path:
     except ImportError as error:
         raise OptionError("Parquet needs pyarrow: pip install 'icrl4aht-data[hf]'") from error
     types = {float: pa.float64(), int: pa.int64(), int | None: pa.int64(), str: pa.string(), bool: pa.bool_()}
-    types[tuple[int, int, int]] = pa.list_(pa.int64())
+    types |= {float | None: pa.float64(), tuple[int, int, int]: pa.list_(pa.int64())}
     schema = pa.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()])
     rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
     with atomic_write(path) as partial:

@@ -78,6 +78,7 @@ class NewTask:
         streams: the number of histories that `load` returns.
         load: returns the histories; called once, when their shard is written.
         files: path in the release -> file to copy there; see `checkpoint_files`.
+        source: how the histories were made, see `Entry.source`.
     """
 
     task: Task
@@ -85,6 +86,7 @@ class NewTask:
     streams: int
     load: Callable[[], Iterable[NewHistory]]
     files: Mapping[str, Path] = field(default_factory=dict)
+    source: str = "ppo"
 
 
 def write_release(
@@ -214,7 +216,7 @@ class _ShardWriter:
     def _load(self, new: NewTask) -> Iterator[_LoadedHistory]:
         given = 0
         for history in new.load():
-            yield _LoadedHistory(new.task, self._entry(new.task, history), history.arrays)
+            yield _LoadedHistory(new.task, self._entry(new, history), history.arrays)
             given += 1
         if given != new.streams:
             raise OptionError(f"task {new.task.task_id}: {given} histories, but {new.streams} were announced")
@@ -226,9 +228,9 @@ class _ShardWriter:
             arrays = {**arrays, "obs": observe(history.task.layout, arrays["state"], EGO)}
         return encode_history(self.kind, history.entry, arrays)
 
-    def _entry(self, task: Task, history: NewHistory) -> Entry:
+    def _entry(self, new: NewTask, history: NewHistory) -> Entry:
         """Return the index entry of a history, without id and position in a shard."""
-        arrays = history.arrays
+        arrays, task, expert = history.arrays, new.task, new.provenance.expert
         needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():
             raise OptionError(f"task {task.task_id}: a history has no arrays {sorted(needed - arrays.keys())}")
@@ -261,6 +263,10 @@ class _ShardWriter:
             return_start=float(start[0]),
             return_end=float(end[0]),
             return_mean=float(returns.mean()),
+            source=new.source,
+            expert_return=None if expert is None else expert.return_greedy,
+            expert_return_sampled=None if expert is None else expert.return_sampled,
+            expert_step=None if expert is None else expert.step,
         )
 
     def _with_positions(self, entries: list[Entry], shard: str) -> list[Entry]:

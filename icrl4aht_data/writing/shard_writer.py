@@ -11,7 +11,14 @@ import h5py
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.chunks import BETWEEN, DEFLATE_LEVEL, chunk_locations, chunk_table_path, encode_chunk
+from icrl4aht_data.format.chunks import (
+    BETWEEN,
+    DEFLATE_LEVEL,
+    chunk_hash,
+    chunk_locations,
+    chunk_table_path,
+    encode_chunk,
+)
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
@@ -48,7 +55,7 @@ def write_shard(
     path.parent.mkdir(parents=True, exist_ok=True)
     table_path.parent.mkdir(parents=True, exist_ok=True)
     layout = get_layout(entries[0].layout)
-    checksums: list[int] = []
+    checksums: list[tuple[int, np.ndarray]] = []
     with h5py.File(path, "w", libver=("v110", "v110")) as file:
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["layout"] = layout.name
@@ -59,9 +66,10 @@ def write_shard(
             for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
                 group[field.name].id.write_direct_chunk(position, data)
-            checksums += [zlib.crc32(chunk.data) for chunk in chunks]
+            checksums += [_checksums(chunk.data) for chunk in chunks]
         table = np.zeros(len(checksums), CHUNK_DTYPE)
-        table["crc32"] = checksums
+        table["crc32"] = [crc32 for crc32, _ in checksums]
+        table["hash"] = [digest for _, digest in checksums]
         locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(locations, np.uint64).T
     np.save(table_path, np.concatenate([table, _metadata_lines(path, table)]), allow_pickle=False)
@@ -78,8 +86,13 @@ def _metadata_lines(path: Path, chunks: np.ndarray) -> np.ndarray:
             for low in range(stop, start, BETWEEN):
                 stream.seek(low)
                 data = stream.read(min(BETWEEN, start - low))
-                lines.append((low, len(data), 0, zlib.crc32(data)))
+                lines.append((low, len(data), 0, *_checksums(data)))
     return np.array(lines, CHUNK_DTYPE)
+
+
+def _checksums(data: bytes) -> tuple[int, np.ndarray]:
+    """Return the last two values of a chunk table's row."""
+    return zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
 
 
 def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:

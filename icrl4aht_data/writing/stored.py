@@ -70,4 +70,4 @@ def stored_task(
             done()
 
     files = checkpoint_files(dataset.origin.below(TEAMMATES), task, dataset.root)
-    return NewTask(task, provenance, len(dataset), load, files)
+    return NewTask(task, provenance, len(dataset), load, files, dataset.entries[0].source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -12,7 +13,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance
 from icrl4aht_data.format.schema import Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.rules import step
@@ -78,12 +79,17 @@ def random_release(
     labels: bool = True,
     seed: int = 0,
     shard_histories: int = 1024,
+    experts: Sequence[ExpertLabels | None] = (),
+    sources: Sequence[str] = (),
 ) -> dict[int, dict[str, np.ndarray]]:
-    """Write a release of random actions; returns the written arrays by history id."""
+    """Write a release of random actions; returns the written arrays by history id.
+
+    `experts` and `sources` say where the labels and the histories of each task come from.
+    """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
     tasks = []
-    for task in make_tasks(list(layouts), teammates):
+    for number, task in enumerate(make_tasks(list(layouts), teammates)):
         histories = []
         for stream in range(streams):
             arrays = random_history(get_layout(task.layout_name), episodes, length, rng)
@@ -91,7 +97,9 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
-        tasks.append(NewTask(task, Provenance(seed=seed), streams, lambda histories=histories: histories))
+        made = Provenance(seed=seed, expert=experts[number] if experts else None)
+        source = sources[number] if sources else "ppo"
+        tasks.append(NewTask(task, made, streams, lambda histories=histories: histories, source=source))
     write_release(
         root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, shard_histories=shard_histories
     )

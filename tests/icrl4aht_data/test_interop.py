@@ -7,12 +7,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from torch.nn import functional
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows, torch_loader
+from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
 from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
@@ -147,6 +150,41 @@ class TestHuggingFace:
         again = hf_windows(sampler, stop=3)
         again.load_state_dict(windows.state_dict())
         np.testing.assert_array_equal(next(iter(again))["obs"], rows[5]["obs"])
+
+
+def by_torch(sampler):
+    return next(iter(torch_loader(sampler, stop=1)))
+
+
+def by_hugging_face(sampler):
+    rows = list(hf_windows(sampler, stop=1).with_format("torch"))
+    return SimpleNamespace(**{name: torch.stack([row[name] for row in rows]) for name in rows[0]})
+
+
+@pytest.mark.parametrize("take", [by_torch, by_hugging_face])
+class TestLosses:
+    """Targets were int32, which PyTorch's losses refuse; padding was the action "up"."""
+
+    def test_cross_entropy_takes_the_targets_as_they_come(self, lite, take):
+        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=3, length=150, teammate_actions=True)
+        batch = take(sampler)
+        for name in ("prev_actions", "target_actions", "prev_teammate_actions"):
+            assert getattr(batch, name).dtype == torch.int64, name
+        logits = torch.randn(3, 150, 6, generator=torch.Generator().manual_seed(0))
+        loss = functional.cross_entropy(logits.transpose(1, 2), batch.target_actions)
+        mask, targets = sampler[0].attention_mask, sampler[0].target_actions
+        assert not mask.all()
+        np.testing.assert_allclose(loss, -logits.log_softmax(-1).numpy()[mask, targets[mask]].mean(), rtol=1e-5)
+        np.testing.assert_array_equal(batch.target_actions == IGNORED, ~mask)
+
+    def test_queries(self, lite, take):
+        batch = take(load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=3, context=7))
+        assert batch.query_target.dtype == batch.context_actions.dtype == torch.int64
+        assert functional.cross_entropy(torch.zeros(3, 6), batch.query_target) > 0
+
+    def test_steps_without_a_previous_one_are_marked(self, lite, take):
+        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=2, length=120)
+        np.testing.assert_array_equal(take(sampler).is_first, np.arange(120) == np.zeros((2, 1)))
 
 
 @pytest.mark.parametrize(

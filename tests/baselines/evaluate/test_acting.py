@@ -59,8 +59,9 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
     (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(result.returns) == (1, 2)
     run = read_trained(runs / name)
-    assert result.settings["details"] == {"run": run.hash, "step": 2, "context": 30, "acting": acting}
-    with pytest.raises(OptionError, match="holds a result of other settings"):
+    settings = {"run": run.hash, "step": 2, "context": 30, "acting": acting, "trained_on": run.trained_on}
+    assert result.settings["details"] == settings
+    with pytest.raises(OptionError, match=r"of other settings \(details.acting: it has .*; details.step: it has 2"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
 
 
@@ -120,7 +121,7 @@ class TestBadRuns:
             (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
             return str(tmp_path / name)
 
-        with pytest.raises(OptionError, match=r"run_format 99, expected 2: written by version .*; use that version"):
+        with pytest.raises(OptionError, match=r"run_format 99, expected 3: written by version .*; use that version"):
             find_agent(copy("newer", run_format=99))
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
         with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):
@@ -145,6 +146,9 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
         again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
+    (cell,) = config["trained_on"]
+    named = {"layout": "demo_wide", "split": "train", "family": "H4", "algorithm": "utility_greedy", "source": "ppo"}
+    assert cell.items() >= (named | {"tasks": 1, "histories": 2}).items()
     assert config["histories"]["data_version"] == "0.0.1"
     assert config["histories"]["root"] == server.url
     assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")

@@ -15,6 +15,7 @@ import pytest
 
 from baselines.agents.host import Percept
 from baselines.methods import attention
+from baselines.methods.conditional import change_if
 from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
@@ -25,7 +26,6 @@ from baselines.methods.tokens import (
     percept_step,
     plain_view,
     state_view,
-    visible_slots,
 )
 from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
@@ -212,12 +212,6 @@ def test_long_contexts_make_no_square(name):
     assert largest < TINY.heads * 3072 * 1024
 
 
-def test_slots_of_a_ring():
-    assert np.flatnonzero(visible_slots(5, jnp.int32(0), 3, jnp.int32(0))).tolist() == []
-    assert np.flatnonzero(visible_slots(5, jnp.int32(4), 3, jnp.int32(3))).tolist() == [0, 1, 2]
-    assert np.flatnonzero(visible_slots(5, jnp.int32(7), 3, jnp.int32(6))).tolist() == [0, 3, 4]  # entries 3, 4, 5
-
-
 @pytest.mark.parametrize("name", STEPS)
 def test_padding_has_no_part_in_the_loss(name):
     method, params = tiny(name, layers=1)
@@ -375,16 +369,63 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
     np.testing.assert_allclose(player("dpt", context, False)(seen)[8:], np.stack(expected), rtol=1e-4, atol=1e-5)
 
 
-def test_a_cached_window_forgets_what_is_older_than_it():
-    """Older steps only affect what was computed while they were in the window."""
+@pytest.mark.parametrize("cached", [True, False])
+@pytest.mark.parametrize(("name", "context", "first_without"), [("ad", 5, 5), ("hybrid_ad", 5, 5), ("dpt", 5, 8)])
+def test_steps_outside_the_context_have_no_part(name, context, first_without, cached):
+    """The first step changes: AD's window of 5 steps loses it after 5, DPT's 5 transitions after two episodes of 3."""
     seen = percepts(12, episode=4)
-    play = player("ad", 4, False)
+    play = player(name, context, cached)
     changed = seen._replace(obs=seen.obs.at[0].add(3.0))
-    exact = np.abs(play(seen) - play(changed)).max(axis=-1)
-    assert (exact[:4] > 0).all() and not exact[4:].any()
-    play = player("ad", 4, True)
-    cached = np.abs(play(seen) - play(changed)).max(axis=-1)
-    assert (cached[:4] > 0).all() and cached[-1] < cached[:4].max()
+    difference = np.abs(play(seen) - play(changed)).max(axis=-1)
+    assert (difference[first_without - 4 : first_without] > 0).all()
+    assert not difference[first_without:].any()
+
+
+def test_a_full_cached_window_drops_a_fifth():
+    """With K = 10 it drops 2 steps, and so has the last 9 and 10 steps in turn; DPT's context is exact."""
+    seen = percepts(16, episode=4)
+    cached, ten, nine = (player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False)))
+    np.testing.assert_allclose(cached[:10], ten[:10], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(cached[11::2], ten[11::2], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(cached[10::2], nine[10::2], rtol=1e-4, atol=1e-5)
+    assert np.abs(ten - nine)[10:].max() > 1e-3
+    exact, cached = (player("dpt", 5, way)(seen) for way in (False, True))
+    np.testing.assert_allclose(cached, exact, rtol=1e-4, atol=1e-5)
+
+
+class TestChangeIf:
+    """A change that a batch computes only when a row needs it."""
+
+    CONDITION = jnp.array([True, False, True])
+
+    @staticmethod
+    def change(params, memory):
+        return {"a": memory["a"] * params["scale"], "b": memory["b"] + params["add"]}
+
+    def rows(self, condition, add, memory):
+        return change_if(condition, self.change, {"scale": jnp.float32(3), "add": add}, memory)
+
+    def test_rows_are_changed_by_their_own_condition(self):
+        add, memory = jnp.array([10, 20, 30]), {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
+        changed = jax.jit(jax.vmap(self.rows))(self.CONDITION, add, memory)
+        np.testing.assert_array_equal(changed["a"], [[0, 3], [2, 3], [12, 15]])
+        np.testing.assert_array_equal(changed["b"], [10, 1, 32])
+        one = jax.jit(self.rows)(self.CONDITION[0], add[0], {"a": memory["a"][0], "b": memory["b"][0]})
+        np.testing.assert_array_equal(one["b"], changed["b"][0])
+        alike = jax.vmap(self.rows, in_axes=(0, None, None))(self.CONDITION, 5, {"a": jnp.ones(2), "b": jnp.int32(1)})
+        np.testing.assert_array_equal(alike["b"], [6, 1, 6])
+
+    def test_nothing_is_computed_for_a_batch_that_needs_no_change(self):
+        calls = []
+
+        def noted(params, memory):
+            jax.debug.callback(lambda: calls.append(1))
+            return memory
+
+        for condition in (jnp.zeros(3, bool), self.CONDITION):
+            jax.block_until_ready(jax.vmap(lambda c: change_if(c, noted, (), jnp.float32(0)))(condition))
+            jax.effects_barrier()
+            assert bool(calls) == bool(condition.any())
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from baselines.training.trainer import (
 )
 from generation.learners.resume import Checkpoints
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import LabelsMissingError, OptionError
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start
@@ -209,6 +209,35 @@ class TestHeldOut:
         split = hold_out(load_icrl4aht(layout="coord_simple"))
         assert split.teammates is None
         assert [len(split.train), len(split.histories)] == [7, 1]
+
+    def test_filters_choose_the_histories_and_are_recorded(self):
+        """The bundled release has teammates of several families and algorithms on asymm_both."""
+
+        def job(**filters: tuple[str, ...]) -> dict[str, Any]:
+            return prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters)).about
+
+        everything, learned = job()["trained_on"], job(teammate_family=("rl",))
+        assert {cell["family"] for cell in everything} == {"rl", "H4"}
+        assert {cell["family"] for cell in learned["trained_on"]} == {"rl"}
+        assert learned["histories"]["teammate_family"] == ("rl",)
+        one = load_icrl4aht(layout="asymm_both", teammate_family="rl").entries[0].teammate_kind
+        (cell,) = job(algorithm=(one,), source=("ppo",))["trained_on"]
+        names = {"layout": "asymm_both", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
+        assert cell.items() >= names.items()
+        assert cell["histories"] < len(load_icrl4aht(layout="asymm_both", teammate_kind=one))  # some are held out
+
+    def test_filters_that_no_history_passes(self):
+        def fails(match: str, **filters: tuple[str, ...]) -> None:
+            with pytest.raises(EmptySelectionError, match=match):
+                prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters))
+
+        fails(
+            r"algorithm = fpc: none of .* on asymm_both.*; these have .*, utility_greedy: choose",
+            algorithm=("fpc",),
+        )
+        fails("source = dqn: none of .*; these have ppo: choose", source=("ppo", "dqn"))
+        fails("teammate_family = H1: none of", teammate_family=("rl", "H1"))
+        fails("no history has teammate_family", teammate_family=("rl",), algorithm=("utility_greedy",))
 
     def test_impossible_trainings(self, tmp_path, lite):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)

@@ -32,7 +32,7 @@ def test_list(lite):
 
 def test_show_release_and_history(lite):
     release = json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)
-    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, 2)
+    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, 3)
     history = json.loads(CliRunner().invoke(cli, ["show", "--json", "--history", "7", str(lite[0])]).output)
     assert (history["history_id"], history["layout"], history["T"]) == (7, "demo_wide", 120)
     assert history["teammate"]["family"] == "utility_greedy"

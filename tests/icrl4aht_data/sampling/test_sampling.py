@@ -42,6 +42,7 @@ def test_ad_windows_are_slices_of_histories(lite_or_full):
             }
             for name, array in expected.items():
                 np.testing.assert_array_equal(getattr(batch, name)[row], array[window], err_msg=name)
+            np.testing.assert_array_equal(batch.is_first[row], np.arange(start, start + LENGTH) == 0)
         assert batch.attention_mask.all()
     assert at_the_start, "no window started at step 0, where zeros precede it"
 
@@ -57,6 +58,7 @@ def test_short_histories_are_padded_at_the_end(lite):
     np.testing.assert_array_equal(batch.prev_rewards[1, 1:120], written[int(ids[1])]["rewards"][:-1])
     for name in ("obs", "prev_actions", "prev_rewards", "target_actions", "dones"):
         assert not getattr(batch, name)[:, 120:].any(), name
+    assert np.argwhere(batch.is_first).tolist() == [[0, 0], [1, 0], [2, 0]]
 
 
 @pytest.mark.parametrize("order", ["contiguous", "random"])
@@ -135,6 +137,7 @@ def test_what_follows_an_episodes_last_step_is_its_own_end(lite, order):
                 "target_actions": ("int32", (4, 50)),
                 "dones": ("bool", (4, 50)),
                 "attention_mask": ("bool", (4, 50)),
+                "is_first": ("bool", (4, 50)),
             },
         ),
         (

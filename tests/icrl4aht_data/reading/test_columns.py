@@ -1,0 +1,154 @@
+"""Columns of the index, data frames, and filters by what the labels' policies earn."""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import (
+    EmptySelectionError,
+    NotStoredError,
+    OptionError,
+    UnknownNameError,
+    WeakLabelsWarning,
+)
+from icrl4aht_data.format.provenance import ExpertLabels
+from icrl4aht_data.format.schema import ENTRY_HINTS
+from tests.helpers.random_releases import random_release
+
+
+def expert(greedy: float | None, sampled: float | None = None) -> ExpertLabels:
+    return ExpertLabels("0" * 64, "greedy", step=1000, return_greedy=greedy, return_sampled=sampled, episodes=200)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """Four tasks: labels that earn 9.5, 0.0 greedily and 16.9 sampled, -30.0, and of which nothing is known."""
+    root = tmp_path_factory.mktemp("measured") / "release"
+    experts = [expert(9.5, 10.0), expert(0.0, 16.9), expert(-30.0, 1.0), None]
+    random_release(root, streams=2, experts=experts, sources=["ppo", "ppo", "search", "search"])
+    return root
+
+
+def test_columns_of_names_are_names(lite):
+    """Were integer codes: comparison with a name found nothing."""
+    dataset = load_icrl4aht(lite[0])
+    layouts = dataset.column("layout")
+    assert layouts.dtype.kind == "U"
+    assert (layouts == "demo_wide").sum() == 6
+    assert dataset.ids[layouts == "demo_wide"].tolist() == dataset.filter(layout="demo_wide").ids.tolist()
+    assert np.unique(dataset.select([7, 0]).column("layout")).tolist() == ["coord_simple", "demo_wide"]
+
+
+def test_every_column_agrees_with_the_entries(measured):
+    dataset = load_icrl4aht(measured).select([7, 0, 3])
+    for name in ENTRY_HINTS:
+        found = dataset.column(name).tolist()
+        for value, entry in zip(found, dataset.entries, strict=True):
+            expected = getattr(entry, name)
+            if expected is None:
+                assert value == -1 or math.isnan(value)
+            else:
+                assert value == (list(expected) if name == "obs_shape" else expected), name
+    assert dataset.column("obs_shape").shape == (3, 3)
+
+
+@pytest.mark.parametrize(("name", "nearest"), [("layot", "layout"), ("return", "return_end"), ("nope", "obs_shape")])
+def test_an_unknown_column_names_the_nearest(lite, name, nearest):
+    with pytest.raises(UnknownNameError, match=rf"unknown column '{name}'; valid: history_id, .* mean '{nearest}'"):
+        load_icrl4aht(lite[0]).column(name)
+
+
+def test_data_frame(measured):
+    dataset = load_icrl4aht(measured, layout=["demo_wide", "coord_simple"]).select([7, 0, 3])
+    frame = dataset.to_pandas()
+    assert list(frame.columns) == list(ENTRY_HINTS)
+    assert len(frame) == 3
+    assert (frame.layout == "demo_wide").tolist() == [True, False, False]
+    assert [str(frame.dtypes[name]) for name in ("layout", "task_id", "source")] == ["category"] * 3
+    assert frame.source.tolist() == ["search", "ppo", "ppo"]
+    assert dataset[1:].to_pandas().layout.cat.categories.tolist() == ["coord_simple"]
+    assert frame.expert_return.isna().tolist() == [True, False, False]
+    assert frame.expert_step.isna().tolist() == [True, False, False]
+    assert frame.expert_step.tolist()[1:] == [1000, 1000]
+    for name in ("history_id", "T", "return_end", "has_expert_actions"):
+        assert frame[name].tolist() == [getattr(entry, name) for entry in dataset.entries]
+    assert frame.obs_shape.tolist() == [entry.obs_shape for entry in dataset.entries]
+
+
+def test_a_data_frame_without_pandas(lite, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(OptionError, match="pip install pandas"):
+        load_icrl4aht(lite[0]).to_pandas()
+
+
+def test_filters_of_sources_and_algorithms(measured):
+    assert load_icrl4aht(measured, source="search").ids.tolist() == [4, 5, 6, 7]
+    both = load_icrl4aht(measured).filter(source=["ppo", "search"], algorithm="utility_greedy")
+    assert both.ids.tolist() == [*range(8)]
+    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, search"):
+        load_icrl4aht(measured, source="sac")
+    with pytest.raises(UnknownNameError, match=r"unknown algorithm 'utility'; .* mean 'utility_greedy'"):
+        load_icrl4aht(measured, algorithm="utility")
+    with pytest.raises(UnknownNameError, match=r"unknown filter 'algoritm'; .* mean 'algorithm'"):
+        load_icrl4aht(measured).filter(algoritm="utility")
+    with pytest.raises(EmptySelectionError, match=r"no history has layout='coord_simple', source='search'"):
+        load_icrl4aht(measured, layout="coord_simple", source="search")
+
+
+def test_filter_by_what_the_labels_earn(measured):
+    dataset = load_icrl4aht(measured, source="ppo", min_expert_return=9.5)
+    assert dataset.ids.tolist() == [0, 1]
+    assert load_icrl4aht(measured).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
+    with pytest.raises(EmptySelectionError, match=r"expert_return >= 10; the highest is 9\.5"):
+        load_icrl4aht(measured, source="ppo", min_expert_return=10)
+    with pytest.raises(NotStoredError, match=r"2 of 8 histories .*version 2.*take the histories where it is known"):
+        load_icrl4aht(measured, min_expert_return=0)
+    known = load_icrl4aht(measured)
+    known = known.select(known.ids[~np.isnan(known.column("expert_return"))])
+    assert known.filter(min_expert_return=0).ids.tolist() == [0, 1, 2, 3]
+    for wrong in ("1", True, float("nan")):
+        with pytest.raises(OptionError, match="min_expert_return = "):
+            load_icrl4aht(measured, min_expert_return=wrong)
+
+
+def test_a_release_without_returns_refuses_the_filter(lite):
+    with pytest.raises(NotStoredError, match=r"12 of 12 histories .*Leave out min_expert_return$"):
+        load_icrl4aht(lite[0], min_expert_return=0.0)
+
+
+class TestWeakLabels:
+    """Random play loses a little in all these tasks."""
+
+    def test_warning_names_tasks_and_numbers(self, measured):
+        dataset = load_icrl4aht(measured, layout="demo_wide")
+        with pytest.warns(WeakLabelsWarning) as caught:
+            dataset.dpt(batch_size=2, context=5)
+        (warning,) = caught
+        entry = dataset.entries[0]
+        assert "1 of 2 tasks come from a policy that earns" in str(warning.message)
+        end = dataset.column("return_end")[:2].mean()
+        assert f"{entry.task_id} (labels -30.0, sampled 1.0, histories {end:.1f})" in str(warning.message)
+        assert warning.filename == __file__
+
+    @pytest.mark.parametrize(("ends", "weak"), [([20.0, 18.2], True), ([20.0, 17.0], False), ([-4.0, -1.0], False)])
+    def test_less_than_half_of_the_mean_of_the_ends(self, measured, monkeypatch, ends, weak):
+        dataset = load_icrl4aht(measured).select([0, 1])
+        column = type(dataset).column
+        monkeypatch.setattr(
+            type(dataset), "column", lambda self, name: np.array(ends) if name == "return_end" else column(self, name)
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            dataset.dpt(batch_size=2, context=5)
+        assert [one.category for one in caught] == [WeakLabelsWarning] * weak  # labels earn 9.5
+
+    def test_nothing_is_said_of_what_was_not_measured(self, lite):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=2, context=5)
