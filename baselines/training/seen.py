@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,11 +45,10 @@ def teammate_id(teammate: Mapping[str, Any]) -> str:
     return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
 
 
-def teammate_ids(dataset: Dataset, history_ids: np.ndarray) -> list[str] | None:
+def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
     """Returns the sorted ids of the teammates of some histories, or None if the release does not describe them all."""
-    _, first = np.unique([dataset.index.entry(int(row)).task_id for row in history_ids], return_index=True)
     try:
-        return sorted({teammate_id(dataset.recover_teammate(int(row))) for row in history_ids[first]})
+        return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
     except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
         return None
 
