@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +22,7 @@ from baselines.report.results import (
     cell_order,
     count_text,
     group_of,
+    instances_range,
     read_published,
 )
 from baselines.report.tables import (
@@ -34,6 +35,7 @@ from baselines.report.tables import (
     score_cells,
     sweep_points,
     sweep_scores,
+    table_cells,
 )
 from generation.teammates.instances import INSTANCES
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, Cell, has_headroom, read_headroom
@@ -185,11 +187,11 @@ def _protocol_section(protocol: str, runs: list[EvaluationRun], folder: Path) ->
     return [*parts, "<h3>Headroom</h3>", _headroom_table(protocol)]
 
 
-def _conditions(runs: Iterable[EvaluationRun]) -> str:
-    """Returns text with protocol, seeds, instances and length of the evaluation of some runs."""
-    texts = dict.fromkeys(source.conditions for run in runs for source in run.sources)
-    numbers = sorted({len(returns) for run in runs for returns in run.cells.values()})
-    instances = count_text(numbers[0], "instance") if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} instances"
+def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = None) -> str:
+    """Returns text with protocol, seeds, length and instances of the results of some runs, all or those of `cells`."""
+    shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
+    texts = dict.fromkeys(run.source(cell).conditions for run, cell in shown)
+    instances = instances_range(len(run.cells[cell]) for run, cell in shown)
     return f"Evaluated under {'; '.join(texts)}; {instances} in a cell"
 
 
@@ -207,8 +209,9 @@ def _overlap_note(runs: Sequence[EvaluationRun]) -> str:
 
 def _table_caption(table: PaperTable, rows: Sequence[TableRow], runs: Sequence[EvaluationRun], protocol: str) -> str:
     agents = {row.agent for row in rows}
-    shown = [run for run in runs if run.label in agents]
-    text = f"{_conditions(shown)}." if shown else "Not run."
+    cells = table_cells(table)
+    shown = [run for run in runs if run.label in agents and not cells.isdisjoint(run.cells)]
+    text = f"{_conditions(shown, cells)}." if shown else "Not run."
     if protocol == PUBLISHED_PROTOCOL:
         text += f" Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
     if table.group != "cell":
@@ -267,7 +270,7 @@ def _other_cells(runs: list[EvaluationRun]) -> list[str]:
                 for run in shown
             ]
             columns = ["agent", *map(_cell_name, of_group)]
-            caption = escape(f"{text} {_conditions(shown)}.")
+            caption = escape(f"{text} {_conditions(shown, of_group)}.")
             parts += [f"<p class=caption>{caption}</p>", _html_table(columns, body)]
     return parts
 

@@ -16,10 +16,10 @@ from baselines.report.results import (
     GROUP_TEXTS,
     TEST_LAYOUTS,
     EvaluationRun,
-    count_text,
     family_of,
     group_of,
     groups_of,
+    instances_range,
     instances_text,
     normalised_score,
     published_cells,
@@ -137,16 +137,10 @@ def track_tables(run: EvaluationRun) -> Iterator[tuple[str, str]]:
 def table_caption(run: EvaluationRun, cells: Sequence[Cell]) -> list[str]:
     """Returns sentences on the conditions, instances and tasks of some of a run's cells."""
     conditions = dict.fromkeys(run.source(cell).conditions for cell in cells)
-    sentences = [f"{text[0].upper()}{text[1:]}, {_instances_text(run, cells)}." for text in conditions]
+    instances = instances_range(len(run.cells[cell]) for cell in cells)
+    sentences = [f"{text[0].upper()}{text[1:]}, {instances} in a cell." for text in conditions]
     groups = {group_of(cell) for cell in cells}
     return sentences + [text for group, text in GROUP_TEXTS.items() if group in groups]
-
-
-def _instances_text(run: EvaluationRun, cells: Sequence[Cell]) -> str:
-    numbers = sorted({len(run.cells[cell]) for cell in cells})
-    if len(numbers) == 1:
-        return f"{count_text(numbers[0], 'instance')} in each cell"
-    return f"{numbers[0]} to {numbers[-1]} instances in each cell"
 
 
 def _cell_text(cell: Cell, row: dict[str, Any] | None) -> str:
