@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -102,6 +102,7 @@ def write_page_with_episodes(
     episodes: bool = True,
     notes: Sequence[str] = (),
     suite: Path | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
     """Write the page with an episode per family of teammates, of at most three runs. Returns its path.
 
@@ -109,13 +110,14 @@ def write_page_with_episodes(
         runs, path, notes: see `write_page`.
         episodes: False for a page without episodes.
         suite: folder of learned teammates' checkpoints.
+        progress: called with (description, episodes drawn, episodes).
     """
     shown = _most_informative(runs)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
         notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
     with TemporaryDirectory() as folder:
-        return write_page(runs, path, family_gifs(shown, Path(folder), suite), notes)
+        return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 
 
 def _most_informative(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:

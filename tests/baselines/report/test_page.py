@@ -223,7 +223,10 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
 
     runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
     runs.insert(3, with_tasks("AD", variant=("K", 250)))
-    text = write_page_with_episodes(runs, tmp_path / "report.html").read_text()
+    drawn: list[tuple[int, int]] = []
+    options = {"progress": lambda what, done, total: drawn.append((done, total))}
+    text = write_page_with_episodes(runs, tmp_path / "report.html", **options).read_text()
+    assert drawn == [(done, 6) for done in range(7)]
     found = re.findall(r"<figcaption>([^<]+? with \S+ on \S+): team return 7 ", text)
     assert found == [
         f"{agent} with {mate} on demo_wide" for mate in ("H1/t0", "H4/t0") for agent in ("AD", "DPT", "AD, K = 250")
