@@ -13,7 +13,8 @@ import numpy as np
 from baselines.agents.egos import AGENTS, find_agent, get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import Protocol
-from baselines.report.results import EvaluationRun, ResultSource, cell_order, families_of
+from baselines.report.overlap import describe_overlap
+from baselines.report.results import EvaluationRun, ResultSource, cell_order, groups_of
 from generation.policy import Policy
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
@@ -71,11 +72,11 @@ def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None 
     for run in runs:
         headroom = read_headroom(run.protocol)
         played = [(source, cell) for source in run.sources for cell in source.tasks]
-        for family in families_of(cell for _, cell in played):
+        for family in groups_of(cell for _, cell in played):
             of_family = [found for found in played if found[1][1] == family]
             open_cells = [found for found in of_family if found[1] in headroom and has_headroom(headroom[found[1]])]
             source, cell = min(open_cells or of_family, key=lambda found: cell_order(found[1]))
-            chosen.append((run, source, source.tasks[cell]))
+            chosen.append((run, source, source.tasks[cell][0]))
     egos = {source.folder: _restore(source) for _, source, _ in chosen}
 
     def draw(number: int) -> EpisodeGif:
@@ -97,7 +98,8 @@ def _draw_result(
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
     family = task.teammate_family
     players = f"{run.label} with {family}/t{task.teammate['theta_id']} on {task.layout.name}"
-    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}."
+    trained = describe_overlap([task], source.seen)
+    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {trained}"
     try:
         if isinstance(ego, Icrl4ahtError):
             raise ego

@@ -1,0 +1,93 @@
+"""Layouts and teammates that a model has seen in training, which reports compare with those it is tested on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.utils.files import json_hash
+
+TRAINED_ON = "trained_on"
+"""Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
+
+_KINDS = {family: tuple(kind for kind, of in HEURISTIC_KINDS.items() if of == family) for family in FAMILIES}
+_KINDS["rl"] = ALGORITHMS
+
+
+class SeenInTraining(NamedTuple):
+    """Layouts and teammates of the histories that a model was trained on.
+
+    Attributes:
+        layouts: short names.
+        teammates: teammate kind, such as "utility_greedy" or "fcp" -> ids of its teammates, see `teammate_id`; None if
+            they are not known.
+    """
+
+    layouts: tuple[str, ...] = ()
+    teammates: Mapping[str, tuple[str, ...] | None] = {}
+
+
+def teammate_id(teammate: Mapping[str, Any]) -> str:
+    """Returns 16 hexadecimal digits that are the same for teammates of one kind with one policy.
+
+    Args:
+        teammate: kind and theta, as in a task. The numbers of a heuristic are compared in single precision, since some
+            manifests round them.
+    """
+    theta = teammate["theta"]
+    if teammate["kind"] == "rl":
+        return theta["sha256"][:16]
+    return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
+
+
+def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
+    """Returns the sorted ids of the teammates of some histories, or None if the release does not describe them all."""
+    try:
+        return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
+    except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
+        return None
+
+
+def read_trained_on(entries: Any, where: str) -> SeenInTraining:
+    """Returns what a record of training data says.
+
+    Args:
+        entries: JSON list of entries with `layout` and `family`, usually also `algorithm` (the kind of a heuristic, or
+            the algorithm of a learned teammate) and `teammates` (ids, see `teammate_id`); empty for an agent that was
+            not trained.
+        where: origin of the record, for the message.
+
+    Raises:
+        OptionError: if it is no such list.
+    """
+    if not isinstance(entries, list | tuple):
+        raise OptionError(f"{where}: {TRAINED_ON}: expected a list of entries, found {str(entries)[:200]!r}")
+    seen: dict[str, tuple[str, ...] | None] = {}
+    layouts = []
+    for entry in entries:
+        layout, kinds, ids = _read_entry(entry, where)
+        layouts.append(layout)
+        for kind in kinds:
+            known = seen.get(kind, ())
+            seen[kind] = None if ids is None or known is None else tuple(sorted({*known, *ids}))
+    return SeenInTraining(tuple(dict.fromkeys(layouts)), seen)
+
+
+def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str] | None]:
+    """Returns an entry's layout, teammate kinds and teammate ids."""
+    fields = entry if isinstance(entry, dict) else {}
+    layout, family, algorithm = (fields.get(name) for name in ("layout", "family", "algorithm"))
+    ids = fields.get("teammates")
+    kinds = _KINDS.get(family, ()) if isinstance(family, str) else ()
+    valid_ids = ids is None or (isinstance(ids, list | tuple) and all(isinstance(name, str) for name in ids))
+    if not isinstance(layout, str) or not kinds or algorithm not in (None, *kinds) or not valid_ids:
+        raise OptionError(
+            f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(FAMILIES)}), perhaps an algorithm of this "
+            f"family and a list of teammates' ids; found {str(entry)[:200]!r}"
+        )
+    return layout, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)

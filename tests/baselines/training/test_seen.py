@@ -1,0 +1,85 @@
+"""Record of the layouts and teammates that a model was trained on."""
+
+from __future__ import annotations
+
+import pytest
+
+from baselines.training.histories import hold_out, training_cells
+from baselines.training.seen import SeenInTraining, read_trained_on, teammate_id, teammate_ids
+from generation.teammates.instances import published_task
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import NotStoredError, OptionError
+
+
+def test_held_out_teammates_are_not_among_those_in_training():
+    dataset = load_icrl4aht(split="train", layout="demo_simple")
+    split = hold_out(dataset, 0.1)
+    assert split.teammates is not None
+    held = teammate_ids(dataset, split.teammates.ids.tolist())
+    trained = teammate_ids(dataset, split.train.ids.tolist())
+    assert held
+    assert trained
+    assert not set(held) & set(trained)
+    assert len(trained) == len({entry.task_id for entry in split.train.entries})
+
+
+def test_training_cells_name_their_teammates():
+    dataset = load_icrl4aht(split="train", layout="demo_simple")
+    found = {}
+    for cell in training_cells(dataset):
+        of_cell = dataset.filter(teammate_kind=cell["algorithm"])
+        assert cell["teammates"] == teammate_ids(dataset, of_cell.ids.tolist())
+        assert len(cell["teammates"]) == cell["tasks"]
+        found[cell["algorithm"]] = tuple(cell["teammates"])
+    assert read_trained_on(training_cells(dataset), "run.json") == SeenInTraining(("demo_simple",), found)
+
+
+def test_teammates_of_one_policy_have_one_id():
+    h1 = published_task("demo_wide", "H1/t0").teammate
+    exact = {name: round(value, 6) for name, value in h1["theta"].items()}  # manifests round to single precision
+    assert exact != h1["theta"]
+    assert teammate_id(h1 | {"theta": exact, "theta_id": 9, "base_seed": 3}) == teammate_id(h1)
+    assert teammate_id(published_task("demo_wide", "H1/t1").teammate) != teammate_id(h1)
+    policy = {"kind": "rl", "family": "fcp", "theta": {"checkpoint": "a/b", "sha256": "ab" * 32}}
+    assert teammate_id(policy) == "ab" * 8
+
+
+def test_releases_without_tasks_do_not_know_their_teammates(monkeypatch):
+    dataset = load_icrl4aht(split="train", layout="demo_simple")
+
+    def recover(history_id):
+        raise NotStoredError("no tasks")
+
+    monkeypatch.setattr(dataset, "recover_teammate", recover)
+    assert teammate_ids(dataset, dataset.ids.tolist()) is None
+
+
+def test_records_join_the_entries_of_a_kind():
+    greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["b"]}
+    learned = {"layout": "demo_wide", "split": "train", "family": "rl", "algorithm": "fcp", "teammates": ["a", "c"]}
+    found = read_trained_on([greedy, greedy | {"layout": "demo_simple", "teammates": ["a"]}, learned], "run.json")
+    expected = {"utility_greedy": ("a", "b"), "fcp": ("a", "c")}
+    assert found == SeenInTraining(("demo_wide", "demo_simple"), expected)
+    unknown = read_trained_on([learned, learned | {"teammates": None}], "run.json")
+    assert unknown.teammates == {"fcp": None}
+    any_algorithm = read_trained_on([{"layout": "demo_wide", "family": "rl"}], "run.json")
+    assert any_algorithm.teammates == dict.fromkeys(("fcp", "brdiv", "lbrdiv", "comedi"))
+    assert read_trained_on([], "run.json") == SeenInTraining()
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        None,
+        "demo_wide",
+        ["demo_wide"],
+        [{"layout": "demo_wide"}],
+        [{"layout": 3, "family": "H4"}],
+        [{"layout": "demo_wide", "family": "H5"}],
+        [{"layout": "demo_wide", "family": "H4", "algorithm": "fcp"}],
+        [{"layout": "demo_wide", "family": "H4", "teammates": [3]}],
+    ],
+)
+def test_records_of_another_form_are_refused(entries):
+    with pytest.raises(OptionError, match=r"run\.json: trained_on: expected "):
+        read_trained_on(entries, "run.json")
