@@ -24,6 +24,7 @@ from baselines.commands.options import (
     model_options,
     protocol_option,
     root_option,
+    save_minutes_option,
     seeds_option,
     suite_option,
     tasks_option,
@@ -33,6 +34,7 @@ from baselines.commands.options import (
 )
 from baselines.methods.options import SIZES, ModelOptions
 from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
@@ -82,7 +84,7 @@ def cli() -> None:
     """Train reference learners and evaluate agents on the ICRL4AHT benchmark.
 
     Needs the extra baselines. Finished work is kept: the same command resumes a stopped one. Exit codes: 0 done, 1 a
-    failure or a failed check, 2 a misused command.
+    failure or a failed check, 2 a misused command, 130 or 143 training stopped by SIGINT or SIGTERM, and saved.
     """
 
 
@@ -304,6 +306,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @model_options
 @dataclass_options(HistoryOptions, "histories")
 @history_filters
+@save_minutes_option
 @tensorboard_option
 @click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines.")
 @click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes.")
@@ -318,6 +321,7 @@ def train_command(
     model: dict[str, Any],
     histories: dict[str, Any],
     filters: dict[str, tuple[str, ...]],
+    save_minutes: float,
     tensorboard: bool,
     coordinator: str | None,
     processes: int,
@@ -326,7 +330,7 @@ def train_command(
     """Train a model on learning histories.
 
     METHOD is ad, dpt, hybrid_ad or amago_offline. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
-    the same command resumes from the last checkpoint.
+    the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one.
     """
     import jax
 
@@ -352,7 +356,16 @@ def train_command(
         def done(step: int, loss: float) -> None:
             show(method, step, options.steps, f", loss {loss:.3f}")
 
-        run_training(job.method, job.data, job.options, folder, job.about, tensorboard=tensorboard, done=done)
+        run_training(
+            job.method,
+            job.data,
+            job.options,
+            folder,
+            job.about,
+            tensorboard=tensorboard,
+            save_minutes=save_minutes,
+            done=done,
+        )
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
@@ -464,4 +477,8 @@ def demo_command(out: Path) -> None:
 
 def main() -> None:
     """Entry point of `python -m baselines`."""
-    run(cli)
+    try:
+        run(cli)
+    except TrainingStopped as stopped:
+        click.echo(stopped.message, err=True)
+        raise
