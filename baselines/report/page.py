@@ -307,6 +307,7 @@ def _gain_cell(run: EvaluationRun, cell: Cell) -> str:
 
 def _headroom_table(protocol: str) -> str:
     measured = read_headroom(protocol)
+    conditions = f"protocol {protocol}, {INSTANCES} instances, 1 seed (0), 100 episodes of 100 steps"
     body = []
     for family in HEURISTICS:
         row = [_th(family)]
@@ -316,12 +317,13 @@ def _headroom_table(protocol: str) -> str:
                 row.append('<td class="none">not measured</td>')
             else:
                 kind = "" if has_headroom(references) else "flat"
-                row.append(f'<td class="{kind}">{" / ".join(f"{references[a]:z.1f}" for a in REFERENCES)}</td>')
+                tooltip = _tooltip(f"stay / random / oracle, {layout}, {family}: {conditions}.")
+                means = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
+                row.append(f'<td class="{kind}"{tooltip}>{means}</td>')
         body.append((False, row))
     note = (
-        f"<p class=caption>Mean return of the reference egos stay / random / oracle (scripted, full information), "
-        f"measured under protocol {escape(protocol)} with the published test tasks: {INSTANCES} instances in each "
-        f"cell, 1 seed (0), 100 episodes of 100 steps.</p>"
+        f"<p class=caption>Mean return of the reference egos stay / random / oracle (scripted, full information) with "
+        f"the published test tasks: {escape(conditions)}.</p>"
     )
     return note + _html_table(["family", *TEST_LAYOUTS], body)
 
