@@ -224,8 +224,11 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
     runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
     runs.insert(3, with_tasks("AD", variant=("K", 250)))
     drawn: list[tuple[int, int]] = []
-    options = {"progress": lambda what, done, total: drawn.append((done, total))}
-    text = write_page_with_episodes(runs, tmp_path / "report.html", **options).read_text()
+
+    def progress(what: str, done: int, total: int) -> None:
+        drawn.append((done, total))
+
+    text = write_page_with_episodes(runs, tmp_path / "report.html", progress=progress).read_text()
     assert drawn == [(done, 6) for done in range(7)]
     found = re.findall(r"<figcaption>([^<]+? with \S+ on \S+): team return 7 ", text)
     assert found == [
