@@ -80,11 +80,11 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
                 "gain": run.gain(cell),
                 "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
                 "normalised": normalised_score(run, cell, headroom),
-                "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
                 "tasks": group_of(cell),
                 "seeds": len(settings["seeds"]),
                 "steps": settings["protocol"]["steps"],
                 "overlap": " ".join(run.overlaps([cell])),
+                "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
             }
         )
     return found
