@@ -26,7 +26,7 @@ from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import REPORT_BEGINS, write_report
 from baselines.training.histories import TrainingTask, filter_histories, prepare
-from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.options import SAVE_MINUTES, HistoryOptions, TrainOptions
 from baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
@@ -72,6 +72,7 @@ class Experiment(NamedTuple):
         layouts: to train on.
         varies: options that distinguish the entries and can therefore not be set for all of them.
         held_out: whether to evaluate with learned teammates held out of training, on the training layouts.
+        acting: way of acting of the trained models; see `agents.egos.ACTING`.
     """
 
     title: str
@@ -79,6 +80,7 @@ class Experiment(NamedTuple):
     layouts: tuple[str, ...]
     varies: tuple[str, ...] = ()
     held_out: bool = False
+    acting: Acting = "cached"
 
 
 def _size_entry(name: str) -> ExperimentEntry:
@@ -93,6 +95,7 @@ EXPERIMENTS = {
         tuple(ExperimentEntry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
         ("test_wide", "demo_wide"),
         varies=("context",),
+        acting="exact",  # K is what is compared, and a cached window has down to 4/5 K steps
     ),
     "sweep size": Experiment(
         "Model scale and training budget",
@@ -136,9 +139,10 @@ class ExperimentPlan:
         episodes: of a task; the protocol's by default.
         seeds: number of times that every task is played.
         protocol: name of the evaluation protocol.
-        acting: see `agents.egos.ACTING`.
+        acting: see `agents.egos.ACTING`; the experiment's by default.
         gifs: whether the page shows an episode per family.
         tensorboard: whether training also writes a log for TensorBoard.
+        save_minutes: most minutes between checkpoints of a training.
     """
 
     methods: tuple[str, ...] = ("ad", "dpt")
@@ -154,9 +158,10 @@ class ExperimentPlan:
     episodes: int | None = None
     seeds: int = 1
     protocol: str = "seeded"
-    acting: Acting = "cached"
+    acting: Acting | None = None
     gifs: bool = True
     tensorboard: bool = False
+    save_minutes: float = SAVE_MINUTES
 
 
 class ExperimentOutcome(NamedTuple):
@@ -193,6 +198,7 @@ def run_experiment(
         OptionError: if a context is longer than a history, the plan sets what the experiment varies, or a folder holds
             a run of other settings; for "heldout-rl", if the suite has no held-out teammates, or one of them is in
             training.
+        TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
     if name not in EXPERIMENTS:
         raise unknown("experiment", name, EXPERIMENTS)
@@ -208,13 +214,14 @@ def run_experiment(
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
         _train_entry(method, entry, layout, plan, folder / "run", progress)
-        _evaluate_entry(entry, tasks[layout], plan, folder, progress, own_tasks=experiment.held_out)
+        _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"
-    report.append(write_page_with_episodes(runs, page, episodes=plan.gifs, notes=notes, suite=plan.suite))
+    options: dict[str, Any] = {"episodes": plan.gifs, "notes": notes, "suite": plan.suite, "progress": progress}
+    report.append(write_page_with_episodes(runs, page, **options))
     return ExperimentOutcome(report, notes)
 
 
@@ -362,21 +369,21 @@ def _train_entry(
         folder,
         job.about,
         tensorboard=plan.tensorboard,
+        save_minutes=plan.save_minutes,
         done=lambda step, loss: progress(what, step, steps),
     )
     progress(what, steps, steps)
 
 
 def _evaluate_entry(
+    experiment: Experiment,
     entry: ExperimentEntry,
     tasks: Sequence[Task],
     plan: ExperimentPlan,
     folder: Path,
     progress: ExperimentProgress,
-    *,
-    own_tasks: bool,
 ) -> None:
-    agent = find_agent(str(folder / "run"), plan.acting)
+    agent = find_agent(str(folder / "run"), plan.acting or experiment.acting)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
     what = f"{agent.name} {entry.name} on {tasks[0].layout.name}: evaluation"
     evaluate(
@@ -390,4 +397,4 @@ def _evaluate_entry(
         details=details,
         done=counted(progress, what, len(tasks)),
     )
-    note_results(folder / "results", folder / "run", tasks if own_tasks else ())
+    note_results(folder / "results", folder / "run", tasks if experiment.held_out else ())

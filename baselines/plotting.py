@@ -22,13 +22,13 @@ class SweepPoint(NamedTuple):
     Attributes:
         value: of what is varied.
         mean: return, over the cells played.
-        std: of the cells' means.
-        published: the paper's mean, if it states one.
+        std: of the cells' means; None for a single cell.
+        published: the paper's mean, if it states one for these conditions.
     """
 
     value: Any
     mean: float
-    std: float
+    std: float | None
     published: float | None
 
 
@@ -58,15 +58,16 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
 
 
 def plot_return_curves(runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]], path: Path) -> None:
-    """Plot the return per episode: a panel per cell, a line per run with the range over instances as a band.
+    """Plot the return per episode: a panel per cell, a line per run, with the range over several instances as a band.
 
     Args:
-        runs: (label, cell -> returns (instances, episodes)).
+        runs: (label, cell -> returns (instances, episodes)); the second part of a cell starts with its family.
         path: PNG file to write.
     """
     cells = {cell for _, returns in runs for cell in returns}
     layouts = [layout for layout in LAYOUT_NAMES if any(cell[0] == layout for cell in cells)]
-    families = [family for family in FAMILIES if any(cell[1] == family for cell in cells)]
+    groups = {cell[1] for cell in cells}
+    families = sorted(groups, key=lambda group: (FAMILIES.index(group.partition(" ")[0]), group))
     figure = Figure(figsize=(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6), layout="constrained")
     axes = figure.subplots(len(families), len(layouts), squeeze=False, sharex=True)
     for i, family in enumerate(families):
@@ -101,9 +102,8 @@ def plot_sweep(panels: Mapping[str, Mapping[str, Sequence[SweepPoint]]], quantit
         names = list(dict.fromkeys(str(point.value) for points in lines.values() for point in points))
         for agent, points in lines.items():
             x = [names.index(str(point.value)) for point in points]
-            drawn = axis.errorbar(
-                x, [p.mean for p in points], [p.std for p in points], label=agent, marker="o", capsize=3, linewidth=1.3
-            )
+            bars = [np.nan if p.std is None else p.std for p in points]
+            drawn = axis.errorbar(x, [p.mean for p in points], bars, label=agent, marker="o", capsize=3, linewidth=1.3)
             stated = [(k, p.published) for k, p in zip(x, points, strict=True) if p.published is not None]
             if stated:
                 colour = drawn.lines[0].get_color()

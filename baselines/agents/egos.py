@@ -20,9 +20,12 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 Acting = Literal["cached", "exact"]
 ACTING: tuple[Acting, ...] = ("cached", "exact")
-"""Ways of acting of a trained model: `cached` keeps the keys and values of each step, `exact` recomputes the window at
-every step. Both are equal until the window is full; afterwards cached values still depend on steps that have left the
-window."""
+"""Ways of acting of a trained model with a context of K. In neither has a step outside the last K a part.
+
+`exact` computes the complete context again at every step, as the paper's rolling buffer does. `cached` keeps the keys
+and values of each step. When the window of AD, Hybrid-AD or AMAGO-Offline is full, its oldest fifth is dropped and the
+rest is computed again, so that it has between 4/5 K and K steps. The context of DPT changes only when an episode ends;
+it is computed once for each episode and is that of `exact`."""
 
 
 class NamedEgo(NamedTuple):
@@ -60,7 +63,7 @@ def learned(method: Method, params: Any, context: int, acting: Acting = "cached"
         method: the method with which the model was trained.
         params: parameters of the model, float32.
         context: K, number of steps or transitions in the memory.
-        acting: "cached" or "exact", see `ACTING`.
+        acting: "cached", the default of evaluations, or "exact"; see `ACTING`.
         greedy: whether to take the most probable action, as published, or to draw one from the policy.
 
     Raises:

@@ -24,6 +24,7 @@ from baselines.commands.options import (
     model_options,
     protocol_option,
     root_option,
+    save_minutes_option,
     seeds_option,
     suite_option,
     tasks_option,
@@ -33,6 +34,7 @@ from baselines.commands.options import (
 )
 from baselines.methods.options import SIZES, ModelOptions
 from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
@@ -85,7 +87,7 @@ def cli() -> None:
     """Train reference learners and evaluate agents on the ICRL4AHT benchmark.
 
     Needs the extra baselines. Finished work is kept: the same command resumes a stopped one. Exit codes: 0 done, 1 a
-    failure or a failed check, 2 a misused command.
+    failure or a failed check, 2 a misused command, 130 or 143 training stopped by SIGINT or SIGTERM, and saved.
     """
 
 
@@ -181,7 +183,8 @@ def report_command(
 ) -> None:
     """Compare results with the paper's.
 
-    RESULTS are folders that `evaluate` made. Prints the paper's tables with its numbers and ours, and writes them as
+    RESULTS are folders that `evaluate` made. Prints a table for each agent and track, with the paper's numbers next to
+    results of protocol published, and marks scores with teammates or on layouts that were in training. Writes them as
     Markdown, CSV and curves, with a card for each trained model. Results of one agent on different layouts are merged.
     """
     from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
@@ -195,7 +198,8 @@ def report_command(
         check_new_file(html, overwrite)
     paths = write_report(loaded, folder)
     if html:
-        paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite))
+        with bars() as show:
+            paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
     paths += write_model_cards(loaded, paths[0].parent)
     click.echo(markdown(loaded))
     for path in paths:
@@ -318,6 +322,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @model_options
 @dataclass_options(HistoryOptions, "histories")
 @history_filters
+@save_minutes_option
 @tensorboard_option
 @click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines.")
 @click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes.")
@@ -332,6 +337,7 @@ def train_command(
     model: dict[str, Any],
     histories: dict[str, Any],
     filters: dict[str, tuple[str, ...]],
+    save_minutes: float,
     tensorboard: bool,
     coordinator: str | None,
     processes: int,
@@ -340,7 +346,7 @@ def train_command(
     """Train a model on learning histories.
 
     METHOD is ad, dpt, hybrid_ad or amago_offline. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
-    the same command resumes from the last checkpoint.
+    the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one.
     """
     import jax
 
@@ -366,7 +372,16 @@ def train_command(
         def done(step: int, loss: float) -> None:
             show(method, step, options.steps, f", loss {loss:.3f}")
 
-        run_training(job.method, job.data, job.options, folder, job.about, tensorboard=tensorboard, done=done)
+        run_training(
+            job.method,
+            job.data,
+            job.options,
+            folder,
+            job.about,
+            tensorboard=tensorboard,
+            save_minutes=save_minutes,
+            done=done,
+        )
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
@@ -406,7 +421,8 @@ def ablate_command(what: str, **options: Any) -> None:
 def tracks_command(**options: Any) -> None:
     """Train and evaluate on both tracks.
 
-    The paper's Tables 1 and 2; with other methods 4 and 5. Writes runs, results and OUT/report.
+    The paper's Tables 1 and 2; with other methods 4 and 5. Its numbers are shown with --protocol published. Writes
+    runs, results and OUT/report.
     """
     _run_experiment("tracks", **options)
 
@@ -478,4 +494,8 @@ def demo_command(out: Path) -> None:
 
 def main() -> None:
     """Entry point of `python -m baselines`."""
-    run(cli)
+    try:
+        run(cli)
+    except TrainingStopped as stopped:
+        click.echo(stopped.message, err=True)
+        raise

@@ -11,8 +11,8 @@ from typing import Any
 import click
 
 from baselines.methods.options import ModelOptions
-from baselines.training.options import FILTERS, TrainOptions
-from icrl4aht_data.commands.dataclass_options import dataclass_options
+from baselines.training.options import FILTERS, SAVE_MINUTES, TrainOptions
+from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
 
@@ -68,11 +68,11 @@ protocol_option = click.option(
     default="seeded",
     help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
 )
-acting_option = click.option(
-    "--acting",
-    type=Names("acting", lazy_attribute("baselines.agents.egos", "ACTING")),
-    default="cached",
-    help="Memory of a trained model: cached, or exact and slower.",
+_ACTING = Names("acting", lazy_attribute("baselines.agents.egos", "ACTING"))
+_ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
+acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
+experiment_acting_option = click.option(
+    "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
 )
 tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
 episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
@@ -82,6 +82,12 @@ suite_option = click.option(
 )
 tensorboard_option = click.option(
     "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
+)
+save_minutes_option = click.option(
+    "--save-minutes",
+    type=FiniteRange(min=0, min_open=True),
+    default=SAVE_MINUTES,
+    help="Most minutes between checkpoints, which are also written every --save-every steps.",
 )
 gifs_option = click.option("--films/--no-films", "gifs", default=True, help="A GIF per teammate family on the page.")
 root_option = click.option(
@@ -183,8 +189,9 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         episodes_option,
         seeds_option,
         protocol_option,
-        acting_option,
+        experiment_acting_option,
         gifs_option,
+        save_minutes_option,
         tensorboard_option,
         click.option("--out", type=Folder(), metavar="FOLDER", help="Write runs and report here.", show_default=out),
         dataclass_options(

@@ -76,9 +76,9 @@ class Method:
         """Returns the memory of an ego before its first step.
 
         Args:
-            context: K, the steps or transitions that it remembers.
-            cached: whether the memory keeps what was computed for each step, which makes a step O(1); otherwise it
-                keeps tokens, and each step computes the complete window.
+            context: K, the steps or transitions that it remembers; older ones have no part in its actions.
+            cached: whether the memory keeps what was computed for each step; otherwise it keeps tokens, and each step
+                computes the complete context. See `agents.egos.ACTING`.
         """
         return self.model.apply({}, context, cached, method="start")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,8 @@ import numpy as np
 from baselines.agents.egos import AGENTS, find_agent, get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import Protocol
-from baselines.report.results import EvaluationRun, ResultSource, cell_order, families_of
+from baselines.report.overlap import describe_overlap
+from baselines.report.results import EvaluationRun, ResultSource, cell_order, groups_of
 from generation.policy import Policy
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
@@ -21,6 +22,8 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.utils.threads import usable_cores
+
+_PROGRESS = "episodes of the report"
 
 
 class EpisodeGif(NamedTuple):
@@ -54,7 +57,12 @@ def episode_gif(
     return float(reward.sum())
 
 
-def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None = None) -> list[EpisodeGif]:
+def family_gifs(
+    runs: Sequence[EvaluationRun],
+    folder: Path,
+    suite: Path | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> list[EpisodeGif]:
     """Write the first episode of an evaluated task for each agent and family of teammates.
 
     The task is on a layout where that family leaves headroom, if there is one among the results.
@@ -63,6 +71,7 @@ def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None 
         runs: what is reported.
         folder: for the GIFs.
         suite: folder of learned teammates' checkpoints.
+        progress: called with (description, episodes drawn, episodes), from the calling thread.
 
     Returns:
         Run after run, families in order. If an agent cannot be restored, the caption says why.
@@ -71,19 +80,24 @@ def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None 
     for run in runs:
         headroom = read_headroom(run.protocol)
         played = [(source, cell) for source in run.sources for cell in source.tasks]
-        for family in families_of(cell for _, cell in played):
+        for family in groups_of(cell for _, cell in played):
             of_family = [found for found in played if found[1][1] == family]
             open_cells = [found for found in of_family if found[1] in headroom and has_headroom(headroom[found[1]])]
             source, cell = min(open_cells or of_family, key=lambda found: cell_order(found[1]))
-            chosen.append((run, source, source.tasks[cell]))
+            chosen.append((run, source, source.tasks[cell][0]))
     egos = {source.folder: _restore(source) for _, source, _ in chosen}
 
     def draw(number: int) -> EpisodeGif:
         run, source, task = chosen[number]
         return _draw_result(run, source, task, egos[source.folder], folder / f"{number}.gif", suite)
 
+    progress(_PROGRESS, 0, len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
-        return list(pool.map(draw, range(len(chosen))))
+        drawn = [pool.submit(draw, number) for number in range(len(chosen))]
+        for done, future in enumerate(as_completed(drawn), start=1):
+            future.result()
+            progress(_PROGRESS, done, len(chosen))
+    return [future.result() for future in drawn]
 
 
 def _draw_result(
@@ -97,7 +111,8 @@ def _draw_result(
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
     family = task.teammate_family
     players = f"{run.label} with {family}/t{task.teammate['theta_id']} on {task.layout.name}"
-    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}."
+    trained = describe_overlap([task], source.seen)
+    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {trained}"
     try:
         if isinstance(ego, Icrl4ahtError):
             raise ego

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from baselines.report.results import EvaluationRun
+from baselines.report.overlap import describe_training, overlap_legend
+from baselines.report.results import EvaluationRun, ResultSource, instances_range
 from baselines.report.summary import track_tables
 from icrl4aht_data.utils.templates import fill_template
 
@@ -17,27 +18,32 @@ CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
 
-def model_card(run: EvaluationRun, trained: Mapping[str, Any]) -> str:
+def model_card(run: EvaluationRun) -> str:
     """Returns README.md of a model, to publish with its run folder.
 
     Args:
-        run: its results.
-        trained: settings of its training, see `ResultSource.trained`.
+        run: results of a model that was trained here. A run that was merged from models of several layouts has one
+            card, with a row of the table of models for each; settings are those of the first.
     """
+    sources = [(source, source.trained) for source in run.sources if source.trained]
+    trained = sources[0][1]
     config, histories = trained["config"], trained["config"]["histories"]
     on_hub = _HUB.match(histories["root"])
+    seeds = list(dict.fromkeys(str(trained["config"]["train"]["seed"]) for _, trained in sources))
+    single = len(sources) == 1
     limits = [
-        f"It is one run, of seed {config['train']['seed']}: the variation between seeds is not known.",
+        f"{'It is one run' if single else 'Each model is one run'}, of seed {', '.join(seeds)}: the variation between "
+        f"seeds is not known.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
+        *overlap_legend(run.overlaps(run.cells)),
     ]
     return fill_template(
         "baseline.md",
         method=run.agent,
         dataset=on_hub[1] if on_hub else "icrl4aht",
         data_version=histories["data_version"],
-        selection=f"{histories['sizes']['train']} of {', '.join(histories['layouts'])}; the release's manifest has "
-        f"SHA-256 `{trained['manifest_sha256']}`",
         code_version=config["package_version"],
+        models="\n".join(_model_row(run, source, trained) for source, trained in sources),
         settings=_bullets({**config["model"], **config["train"]}),
         protocol=run.protocol,
         results="\n\n".join(table for _, table in track_tables(run)),
@@ -45,17 +51,31 @@ def model_card(run: EvaluationRun, trained: Mapping[str, Any]) -> str:
     )
 
 
-def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:
-    """Write the card of every trained model into a folder; a merged run has the settings of its first source.
+def _model_row(run: EvaluationRun, source: ResultSource, trained: Mapping[str, Any]) -> str:
+    """Returns a row of the table of models: training data and seed, and the evaluation."""
+    histories = trained["config"]["histories"]
+    instances = instances_range(len(run.cells[cell]) for cell in source.tasks)
+    selection = (
+        f"{histories['sizes']['train']} of {', '.join(histories['layouts'])}; the release's manifest has SHA-256 "
+        f"`{trained['manifest_sha256']}`"
+    )
+    values = [
+        ", ".join(source.layouts),
+        selection,
+        describe_training(source.seen),
+        str(trained["config"]["train"]["seed"]),
+        f"{source.conditions}, {instances} in a cell",
+    ]
+    return f"| {' | '.join(values)} |"
 
-    Returns their paths, NAME.md by the run's name.
-    """
+
+def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:
+    """Write the card of every model that was trained here into a folder. Returns their paths, NAME.md by run's name."""
     paths = []
     for run in runs:
-        trained = next((source.trained for source in run.sources if source.trained), None)
-        if trained:
+        if any(source.trained for source in run.sources):
             paths.append(folder / card_name(run))
-            paths[-1].write_text(model_card(run, trained), encoding="utf-8")
+            paths[-1].write_text(model_card(run), encoding="utf-8")
     return paths
 
 

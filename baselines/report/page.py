@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from baselines.plotting import SweepPoint, plot_adaptation_gain, plot_return_curves, plot_sweep
+from baselines.plotting import plot_adaptation_gain, plot_return_curves, plot_sweep
 from baselines.report.episode_gifs import EpisodeGif, family_gifs
-from baselines.report.results import TEST_LAYOUTS, EvaluationRun, read_published
+from baselines.report.overlap import describe_training, overlap_legend, overlap_marks
+from baselines.report.results import (
+    GROUP_TEXTS,
+    PUBLISHED_PROTOCOL,
+    TEST_LAYOUTS,
+    EvaluationRun,
+    cell_order,
+    count_text,
+    group_of,
+    instances_range,
+    read_published,
+)
 from baselines.report.tables import (
     AVERAGE,
     PAPER_TABLES,
@@ -22,8 +34,11 @@ from baselines.report.tables import (
     fill_table,
     score_cells,
     sweep_points,
+    sweep_scores,
+    table_cells,
 )
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, has_headroom, read_headroom
+from generation.teammates.instances import INSTANCES
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, Cell, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash
 
@@ -39,7 +54,7 @@ h1 { font-size: 1.6em } h2 { margin-top: 2em; border-bottom: 1px solid #ccc } h3
 th, td { border: 1px solid #d5d8dd; padding: .25em .55em; text-align: left; vertical-align: top }
 th { background: #f1f3f6 } td.flat { background: #e8e8e8 } td.none { color: #999 }
 tr.first td, tr.first th { border-top: 2px solid #8a9099 }
-small { color: #5a6472; display: block } .norm { color: #1f5fa8 }
+small, .caption { color: #5a6472 } small { display: block } .caption { max-width: 75em } .norm { color: #1f5fa8 }
 figure { display: inline-block; margin: .5em 1em .5em 0; vertical-align: top } figure.episode { width: 22em }
 td.long { min-width: 11em; max-width: 22em } td.long, figcaption { overflow-wrap: anywhere }
 img { max-width: 100%; height: auto } figcaption { font-size: 13px; color: #444 } code { font-size: 12px }
@@ -87,6 +102,7 @@ def write_page_with_episodes(
     episodes: bool = True,
     notes: Sequence[str] = (),
     suite: Path | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
     """Write the page with an episode per family of teammates, of at most three runs. Returns its path.
 
@@ -94,13 +110,14 @@ def write_page_with_episodes(
         runs, path, notes: see `write_page`.
         episodes: False for a page without episodes.
         suite: folder of learned teammates' checkpoints.
+        progress: called with (description, episodes drawn, episodes).
     """
     shown = _most_informative(runs)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
         notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
     with TemporaryDirectory() as folder:
-        return write_page(runs, path, family_gifs(shown, Path(folder), suite), notes)
+        return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 
 
 def _most_informative(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
@@ -111,63 +128,118 @@ def _most_informative(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
 
 
 def _introduction(runs: Sequence[EvaluationRun], notes: Sequence[str]) -> str:
+    overlaps = {name for run in runs for name in run.overlaps(run.cells)}
+    marks = "".join(f"<li>{escape(text)}</li>" for text in overlap_legend(overlaps))
+    if marks:
+        marks = (
+            f"<p>Marks behind a score say how training and test overlap; the tooltip has details:</p><ul>{marks}</ul>"
+        )
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return f"""<h1>ICRL4AHT report</h1>
-<p>{len(runs)} runs, package version {escape(version("icrl4aht-data"))}. Large: ours, mean ± std over the teammate
-instances of a cell; over the cells' means if several are averaged. Small: the paper's number, and the
-headroom-normalised score, (return − stay) / (oracle − stay), if the cell has headroom. <b>Grey</b>:
-no reference ego earns more in this cell than one that only stays, so it says nothing about adaptation. A
-dash: not run.</p>
+<p>{count_text(len(runs), "run")}, package version {escape(version("icrl4aht-data"))}. Large: ours, mean ± std over the
+teammate instances of a cell; over the cells' means if several are averaged; without ± if there is only one. Small: the
+paper's number, which stands only beside results of its protocol <code>{PUBLISHED_PROTOCOL}</code>; the number of
+instances if it is not the benchmark's; and the headroom-normalised score, (return − stay) / (oracle − stay), if the
+cell has headroom and all its instances were played. <b>Grey</b>: no reference ego earns more in this cell than one that
+only stays, so it says nothing about adaptation. A dash: not run. Every score has a tooltip with its instances, seeds,
+episodes and protocol, and with what the agent was trained on.</p>
+{marks}
 <ul>{items}</ul>"""
 
 
 def _protocol_section(protocol: str, runs: list[EvaluationRun], folder: Path) -> list[str]:
     plain = [run for run in runs if run.variant is None]
     parts = [f"<h2>Protocol <code>{escape(protocol)}</code></h2>"]
-    if plain:
-        for number, table in enumerate(PAPER_TABLES, start=1):
+    if protocol != PUBLISHED_PROTOCOL:
+        parts.append(
+            f"<p>The paper's numbers belong to protocol <code>{PUBLISHED_PROTOCOL}</code>, so none are in this "
+            f"section; evaluate with <code>--protocol {PUBLISHED_PROTOCOL}</code> to compare with them.</p>"
+        )
+    for number, table in enumerate(PAPER_TABLES, start=1):
+        filled = fill_table(table, plain, protocol) if plain else []
+        if filled:
             parts.append(f"<h3>Table {number}. {table.title}</h3>")
-            parts.append(_paper_table(table, fill_table(table, plain, protocol)))
-        parts += _other_cells(plain, protocol)
+            parts += [_table_caption(table, filled, plain, protocol), _paper_table(table, filled)]
+    parts += _other_cells(plain)
     for quantity, title in _SWEEPS.items():
-        panels = sweep_points(runs, quantity)
+        panels = sweep_scores(runs, quantity)
         if panels:
             path = folder / f"{protocol}-{quantity}.png"
-            plot_sweep(panels, quantity, path)
-            figure = _figure(path, "Bars: std over families' means.")
-            parts += [f"<h3>{title}</h3>", figure, _sweep_table(panels, quantity)]
+            plot_sweep(sweep_points(runs, quantity), quantity, path)
+            swept = [run for run in runs if run.variant and run.variant[0] == quantity]
+            diamonds = "Hollow diamonds: the paper. " if protocol == PUBLISHED_PROTOCOL else ""
+            caption = f"{_conditions(swept)}. Bars: std over families' means. {diamonds}{_overlap_note(swept)}"
+            parts += [f"<h3>{title}</h3>", _figure(path, caption), _sweep_table(panels, quantity)]
     for name, some in (("of the agents", plain), ("of the sweeps", [run for run in runs if run.variant])):
         if some:
             path = folder / f"{protocol}-curves.png"
             plot_return_curves([(run.name, run.cells) for run in some], path)
-            caption = "Return per episode, running mean over 10; mean and range over instances."
+            caption = (
+                f"{_conditions(some)}. Return per episode, running mean over 10; mean over a cell's instances, and "
+                f"their range if there are several. {_overlap_note(some)}"
+            )
             parts += [f"<h3>Adaptation curves {name}</h3>", _figure(path, caption)]
     path = folder / f"{protocol}-gain.png"
     plot_adaptation_gain([(run.name, {cell: run.gain(cell) for cell in run.cells}) for run in runs], path)
     caption = (
-        "Mean over a track's cells, a dot per cell; of the halves, if there are fewer than 40 episodes. The paper "
-        "states no numbers: “small on average” (App. F)."
+        f"{_conditions(runs)}. Mean over a track's test cells, a dot per cell; of the halves, if there are fewer than "
+        f"40 episodes. The paper states no numbers: “small on average” (App. F). {_overlap_note(runs)}"
     )
     parts += ["<h3>Adaptation gain</h3>", _figure(path, caption), _gain_table(runs)]
     return [*parts, "<h3>Headroom</h3>", _headroom_table(protocol)]
 
 
+def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = None) -> str:
+    """Returns text with protocol, seeds, length and instances of the results of some runs, all or those of `cells`."""
+    shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
+    texts = dict.fromkeys(run.source(cell).conditions for run, cell in shown)
+    instances = instances_range(len(run.cells[cell]) for run, cell in shown)
+    return f"Evaluated under {'; '.join(texts)}; {instances} in a cell"
+
+
+def _overlap_note(runs: Sequence[EvaluationRun]) -> str:
+    """Returns a sentence that names the cells of a figure with overlaps of training and test; a figure has no marks."""
+    marked = []
+    for run in runs:
+        cells = [(cell, overlap_marks(run.overlaps([cell]))) for cell in run.cells]
+        named = [f"{layout} {group}{marks}" for (layout, group), marks in cells if marks]
+        if named:
+            everywhere = len(named) == len(cells) and len({marks for _, marks in cells}) == 1
+            marked.append(f"{run.label}: {f'all cells{cells[0][1]}' if everywhere else ', '.join(named)}")
+    return f"Overlap of training and test: {'; '.join(marked)}." if marked else ""
+
+
+def _table_caption(table: PaperTable, rows: Sequence[TableRow], runs: Sequence[EvaluationRun], protocol: str) -> str:
+    agents = {row.agent for row in rows}
+    cells = table_cells(table)
+    shown = [run for run in runs if run.label in agents and not cells.isdisjoint(run.cells)]
+    text = f"{_conditions(shown, cells)}." if shown else "Not run."
+    if protocol == PUBLISHED_PROTOCOL:
+        text += f" Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
+    if table.group != "cell":
+        text += " ± is the std over cells."
+    return f"<p class=caption>{escape(text)}</p>"
+
+
 def _paper_table(table: PaperTable, rows: list[TableRow]) -> str:
     body, before = [], None
     for row in rows:
-        cells = [_th(row.label), _th(row.agent), *map(_score_cell, row.scores)]
+        cells = [_th(row.label), _th(row.agent), *(_score_cell(score, row.agent) for score in row.scores)]
         body.append((row.label != before, cells[0 if table.group == "cell" else 1 :]))
         before = row.label
     return _html_table([*(["family"] if table.group == "cell" else []), "agent", *table.columns], body)
 
 
-def _score_cell(score: TableScore) -> str:
+def _score_cell(score: TableScore, agent: str) -> str:
     lines = []
     with_headroom, measured = score.headroom
-    if score.mean is not None and score.std is not None:
-        lines.append(f"{score.mean:z.1f} ± {score.std:.1f}")
+    if score.mean is not None:
+        spread = "" if score.std is None else f" ± {score.std:.1f}"
+        lines.append(f"{score.mean:z.1f}{spread}{escape(overlap_marks(score.overlaps))}")
         if score.played[0] < score.played[1]:
             lines.append(f"<small>{score.played[0]} of {score.played[1]} cells</small>")
+        if score.shortfall:
+            lines.append(f"<small>{score.shortfall}</small>")
     else:
         lines.append("–")
     if score.published:
@@ -178,51 +250,64 @@ def _score_cell(score: TableScore) -> str:
     if measured and not with_headroom and score.mean is not None:
         lines.append("<small>no headroom</small>")
     kind = "flat" if measured and not with_headroom else "none" if score.mean is None else ""
-    return f'<td class="{kind}">{"".join(lines)}</td>'
+    return f'<td class="{kind}"{_tooltip(f"{agent}. {score.details}" if score.details else "")}>{"".join(lines)}</td>'
 
 
-def _other_cells(runs: list[EvaluationRun], protocol: str) -> list[str]:
-    """Returns the table of cells that no paper table has: learned teammates, training layouts."""
-    usual = {(layout, family) for layout in TEST_LAYOUTS for family in HEURISTICS}
-    cells = list(dict.fromkeys(cell for run in runs for cell in run.cells if cell not in usual))
+def _tooltip(text: str) -> str:
+    return f' title="{escape(text)}"' if text else ""
+
+
+def _other_cells(runs: list[EvaluationRun]) -> list[str]:
+    """Returns the tables of cells that no paper table has: training tasks, held-out teammates, tasks of one's own."""
+    cells = sorted({cell for run in runs for cell in run.cells if group_of(cell) in GROUP_TEXTS}, key=cell_order)
     if not cells:
         return []
-    headroom = read_headroom(protocol)
-    shown = [run for run in runs if any(cell in run.cells for cell in cells)]
-    body = [
-        (False, [_th(run.label), *(_score_cell(score_cells([cell], run, headroom)) for cell in cells)]) for run in shown
-    ]
-    columns = ["agent", *(f"{layout}, {'learned' if family == 'rl' else family}" for layout, family in cells)]
-    note = (
-        "<p>Learned teammates are held out of training. The paper gives this as a figure without numbers (App. F).</p>"
-    )
-    return ["<h3>Other teammates</h3>", note, _html_table(columns, body)]
+    parts = ["<h3>Other tasks</h3>"]
+    for group, text in GROUP_TEXTS.items():
+        of_group = [cell for cell in cells if group_of(cell) == group]
+        if of_group:
+            shown = [run for run in runs if any(cell in run.cells for cell in of_group)]
+            body = [
+                (False, [_th(run.label), *(_score_cell(score_cells([cell], run, {}), run.label) for cell in of_group)])
+                for run in shown
+            ]
+            columns = ["agent", *map(_cell_name, of_group)]
+            caption = escape(f"{text} {_conditions(shown, of_group)}.")
+            parts += [f"<p class=caption>{caption}</p>", _html_table(columns, body)]
+    return parts
 
 
-def _sweep_table(panels: Mapping[str, Mapping[str, Sequence[SweepPoint]]], quantity: str) -> str:
+def _cell_name(cell: Cell) -> str:
+    return f"{cell[0]}, {cell[1].replace('rl', 'learned', 1)}"
+
+
+def _sweep_table(panels: Mapping[str, Mapping[str, Sequence[tuple[Any, TableScore]]]], quantity: str) -> str:
     body = []
     for layout, lines in panels.items():
-        for agent, points in lines.items():
-            for point in points:
-                published = None if point.published is None else (point.published, None)
-                score = TableScore(point.mean, point.std, published, None, (0, 0), (1, 1))
-                body.append(
-                    (False, [_th(layout), _th(agent), f"<td>{escape(str(point.value))}</td>", _score_cell(score)])
-                )
+        for agent, scores in lines.items():
+            for value, score in scores:
+                named = f"{agent}, {quantity} = {value}"
+                row = [_th(layout), _th(agent), f"<td>{escape(str(value))}</td>", _score_cell(score, named)]
+                body.append((False, row))
     return _html_table(["layout", "agent", quantity, AVERAGE], body)
 
 
 def _gain_table(runs: list[EvaluationRun]) -> str:
     cells = list(dict.fromkeys(cell for run in runs for cell in run.cells))
-    body = []
-    for run in runs:
-        gains = [f"<td>{run.gain(cell):+z.1f}</td>" if cell in run.cells else "<td></td>" for cell in cells]
-        body.append((False, [_th(run.label), *gains]))
-    return _html_table(["agent", *(f"{layout} {family}" for layout, family in cells)], body)
+    body = [(False, [_th(run.label), *(_gain_cell(run, cell) for cell in cells)]) for run in runs]
+    return _html_table(["agent", *map(_cell_name, cells)], body)
+
+
+def _gain_cell(run: EvaluationRun, cell: Cell) -> str:
+    if cell not in run.cells:
+        return "<td></td>"
+    tooltip = _tooltip(f"{run.label}. {score_cells([cell], run, {}).details}")
+    return f"<td{tooltip}>{run.gain(cell):+z.1f}{escape(overlap_marks(run.overlaps([cell])))}</td>"
 
 
 def _headroom_table(protocol: str) -> str:
     measured = read_headroom(protocol)
+    conditions = f"protocol {protocol}, {INSTANCES} instances, 1 seed (0), 100 episodes of 100 steps"
     body = []
     for family in HEURISTICS:
         row = [_th(family)]
@@ -232,9 +317,14 @@ def _headroom_table(protocol: str) -> str:
                 row.append('<td class="none">not measured</td>')
             else:
                 kind = "" if has_headroom(references) else "flat"
-                row.append(f'<td class="{kind}">{" / ".join(f"{references[a]:z.1f}" for a in REFERENCES)}</td>')
+                tooltip = _tooltip(f"stay / random / oracle, {layout}, {family}: {conditions}.")
+                means = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
+                row.append(f'<td class="{kind}"{tooltip}>{means}</td>')
         body.append((False, row))
-    note = "<p>Mean return of the reference egos stay / random / oracle (scripted, full information).</p>"
+    note = (
+        f"<p class=caption>Mean return of the reference egos stay / random / oracle (scripted, full information) with "
+        f"the published test tasks: {escape(conditions)}.</p>"
+    )
     return note + _html_table(["family", *TEST_LAYOUTS], body)
 
 
@@ -253,7 +343,7 @@ def _episode_section(gifs: Sequence[EpisodeGif]) -> list[str]:
 def _settings_section(runs: Sequence[EvaluationRun]) -> str:
     columns = [
         "agent", "layouts", "protocol", "episodes x steps", "seeds", "settings hash", "version", "trained on",
-        "training", "run hash", "data manifest (SHA-256)", "results",
+        "data version", "training", "run hash", "data manifest (SHA-256)", "results",
     ]  # fmt: skip
     body = []
     for run in runs:
@@ -272,7 +362,8 @@ def _settings_section(runs: Sequence[EvaluationRun]) -> str:
                 ", ".join(map(str, settings["seeds"])),
                 json_hash(settings),
                 settings["code_version"],
-                f"{', '.join(histories['layouts'])}; data {histories['data_version']}" if histories else "",
+                describe_training(source.seen),
+                histories.get("data_version", ""),
                 ", ".join(f"{name} {value}" for name, value in training.items()),
                 trained.get("run_hash", ""),
                 trained.get("manifest_sha256") or "",

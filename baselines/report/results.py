@@ -1,8 +1,14 @@
-"""Results of evaluation as runs of one agent, and the paper's published numbers."""
+"""Results of evaluation as runs of one agent, and the paper's published numbers.
+
+Reports group results by cell, a layout and a group of teammates. The cells of the benchmark consist of the published
+test tasks: ("demo_wide", "H4"). Other tasks never share a cell with those, since the paper's numbers and the headroom
+do not apply to them: ("demo_wide", "H4 (training)") are tasks of the split `train`, "(held out)" of the split
+`heldout`, and "(own)" other tasks of the split `test`.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -13,9 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.evaluate.results import Result, read_result
+from baselines.report.overlap import OVERLAPS, find_overlaps
 from baselines.training.run_folder import read_config
-from icrl4aht_data.benchmark.facts import FAMILIES, LAYOUT_NAMES, TRACKS
-from icrl4aht_data.benchmark.reference_returns import Cell, has_headroom
+from baselines.training.seen import TRAINED_ON, SeenInTraining, read_trained_on
+from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LAYOUT_NAMES, TRACKS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
@@ -26,6 +34,22 @@ TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["te
 
 OWN_TASKS, TRAINED_RUN = "tasks.jsonl", "run.json"
 """Files next to results: tasks that are not among the published ones; settings of the evaluated model."""
+
+PUBLISHED_PROTOCOL = "published"
+"""Name of the protocol that the paper's numbers belong to."""
+
+_GROUPS = {"train": "training", "heldout": "held out", "test": "own"}
+"""Split of tasks that are not published test tasks -> name of their group in reports."""
+
+GROUP_TEXTS = {
+    "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
+    "Their returns do not show generalisation.",
+    "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
+    "Where an agent was trained with one of them or with others of their algorithm, its score is marked. The paper "
+    "gives these as a figure without numbers (App. F).",
+    "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
+}
+"""Group of tasks that are not published test tasks -> explanation."""
 
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 
@@ -38,14 +62,26 @@ class ResultSource(NamedTuple):
         layouts: layouts that were played.
         settings: settings of the evaluation, see `evaluate.results.Result`.
         trained: content of run.json, see `note_results`; None for an agent that was not trained here.
-        tasks: cell -> the first task of the cell that was played.
+        tasks: cell -> the tasks that were played, in the order of the returns.
+        seen: what the agent was trained on; None if that is not known.
     """
 
     folder: str
     layouts: tuple[str, ...]
     settings: dict[str, Any]
     trained: dict[str, Any] | None
-    tasks: Mapping[Cell, Task] = MappingProxyType({})
+    tasks: Mapping[Cell, tuple[Task, ...]] = MappingProxyType({})
+    seen: SeenInTraining | None = None
+
+    @property
+    def conditions(self) -> str:
+        """Text with protocol, seeds, episodes and steps of the evaluation."""
+        protocol, seeds = self.settings["protocol"], self.settings["seeds"]
+        listed = ", ".join(map(str, seeds))
+        return (
+            f"protocol {protocol['name']}, {count_text(len(seeds), 'seed')} ({listed}), "
+            f"{count_text(protocol['episodes'], 'episode')} of {count_text(protocol['steps'], 'step')}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +91,11 @@ class EvaluationRun:
     Attributes:
         agent: name of the agent.
         protocol: name of the protocol.
-        cells: (layout, family) -> returns of the team, float64 (instances, episodes), means over the seeds.
+        cells: cell, see the module's docstring -> returns of the team, float64 (instances, episodes), means over the
+            seeds.
         variant: name and value of the varied quantity in a sweep, such as ("K", 250); None otherwise.
         note: text that distinguishes results of one agent on the same cells; usually empty.
-        sources: origins of the results.
+        sources: origins of the results; each cell has one.
     """
 
     agent: str
@@ -67,6 +104,31 @@ class EvaluationRun:
     variant: tuple[str, Any] | None = None
     note: str = ""
     sources: tuple[ResultSource, ...] = ()
+
+    def source(self, cell: Cell) -> ResultSource:
+        """Returns the origin of a cell's results."""
+        return next(source for source in self.sources if cell in source.tasks)
+
+    def tasks(self, cell: Cell) -> tuple[Task, ...]:
+        """Returns the tasks of a cell that were played."""
+        return self.source(cell).tasks[cell]
+
+    def overlaps(self, cells: Iterable[Cell]) -> tuple[str, ...]:
+        """Returns the kinds of overlap between the training data and the tasks of some cells, see `OVERLAPS`."""
+        found = {name for cell in cells for name in find_overlaps(self.tasks(cell), self.source(cell).seen)}
+        return tuple(name for name in OVERLAPS if name in found)
+
+    def is_complete(self, cell: Cell) -> bool:
+        """Returns whether all published test tasks of a cell were played, and no others."""
+        return len(self.tasks(cell)) == published_instances(cell)
+
+    def has_usual_steps(self, cell: Cell) -> bool:
+        """Returns whether episodes have the benchmark's length; returns of other lengths compare with nothing."""
+        return self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
+
+    def is_like_the_papers(self, cell: Cell) -> bool:
+        """Returns whether the paper's numbers of a cell are of the same tasks, protocol and episode length."""
+        return self.protocol == PUBLISHED_PROTOCOL and bool(published_instances(cell)) and self.has_usual_steps(cell)
 
     def means(self, cell: Cell) -> np.ndarray:
         """Returns the mean return of each instance of a cell, float64 (instances,)."""
@@ -158,10 +220,9 @@ def as_run(
     settings = results[0].settings
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: results of different settings in one run")
-    published = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
-    known = {task.task_id: task for task in (*published, *tasks)}
+    known = published_test_tasks() | {task.task_id: task for task in tasks}
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
-    first: dict[Cell, Task] = {}
+    played: dict[Cell, list[Task]] = defaultdict(list)
     for result in results:
         if result.task_id not in known:
             raise OptionError(
@@ -169,47 +230,111 @@ def as_run(
                 f"evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
             )
         task = known[result.task_id]
-        cell = task.layout.name, task.teammate_family
-        cells[cell].append(np.mean(result.returns, axis=0))
-        first.setdefault(cell, task)
+        cells[cell_of(task)].append(np.mean(result.returns, axis=0))
+        played[cell_of(task)].append(task)
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
     arrays = {cell: np.array(cells[cell]) for cell in sorted(cells, key=cell_order)}
-    source = ResultSource(where, tuple(dict.fromkeys(layout for layout, _ in arrays)), settings, trained, first)
+    layouts = tuple(dict.fromkeys(layout for layout, _ in arrays))
+    of_cell = {cell: tuple(found) for cell, found in played.items()}
+    source = ResultSource(where, layouts, settings, trained, of_cell, _find_seen(settings, trained, where))
     return EvaluationRun(settings["agent"], settings["protocol"]["name"], arrays, variant, sources=(source,))
+
+
+def _find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> SeenInTraining | None:
+    """Returns what an agent was trained on: nothing for reference egos, None if the results do not say."""
+    details = settings.get("details", {})
+    config = (trained or {}).get("config", {})
+    for record in (details, config):
+        if TRAINED_ON in record:
+            return read_trained_on(record[TRAINED_ON], where)
+    is_reference = settings["agent"] in REFERENCES and not details and trained is None
+    return SeenInTraining() if is_reference else None
+
+
+@cache
+def published_test_tasks() -> dict[str, Task]:
+    """Returns the 160 published test tasks by id."""
+    return {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))}
+
+
+@cache
+def _instances() -> Counter[Cell]:
+    return Counter((task.layout.name, task.teammate_family) for task in published_test_tasks().values())
+
+
+def published_instances(cell: Cell) -> int:
+    """Returns the number of published test tasks of a cell; 0 for cells of other tasks."""
+    return _instances()[cell]
+
+
+def cell_of(task: Task) -> Cell:
+    """Returns the cell of a task, see the module's docstring."""
+    published = task.task_id in published_test_tasks()
+    return task.layout.name, task.teammate_family + ("" if published else f" ({_GROUPS[task.split]})")
+
+
+def count_text(number: int, noun: str) -> str:
+    """Returns a number with its noun, such as "1 seed" or "5 seeds"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def instances_text(cell: Cell, played: int) -> str:
+    """Returns the number of instances, such as "1 of 5 instances", or "1 instance" for tasks that are not published."""
+    total = published_instances(cell)
+    return f"{played} of {count_text(total, 'instance')}" if total else count_text(played, "instance")
+
+
+def instances_range(numbers: Iterable[int]) -> str:
+    """Returns numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    found = sorted(set(numbers))
+    return count_text(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     """Returns the runs with those of one agent on different cells, such as models of each layout, merged into one run.
 
-    Runs that played the same cell are not merged; the `note` of the later ones is their folder.
+    Runs that played the same cell, or under other rules or seeds, are not merged; the `note` of the later ones is their
+    folder.
     """
     merged: list[EvaluationRun] = []
     for run in runs:
-        same = [k for k, other in enumerate(merged) if (other.name, _episodes(other)) == (run.name, _episodes(run))]
-        disjoint = [k for k in same if not merged[k].cells.keys() & run.cells.keys()]
-        if disjoint:
-            other = merged[disjoint[0]]
+        same = [k for k, other in enumerate(merged) if other.name == run.name]
+        fitting = [
+            k for k in same if _rules(merged[k]) == _rules(run) and not merged[k].cells.keys() & run.cells.keys()
+        ]
+        if fitting:
+            other = merged[fitting[0]]
             cells = other.cells | run.cells
             ordered = {cell: cells[cell] for cell in sorted(cells, key=cell_order)}
-            merged[disjoint[0]] = replace(other, cells=ordered, sources=other.sources + run.sources)
+            merged[fitting[0]] = replace(other, cells=ordered, sources=other.sources + run.sources)
         else:
-            merged.append(replace(run, note=run.sources[0].folder) if same and run.sources else run)
+            merged.append(replace(run, note=run.sources[0].folder) if same else run)
     return merged
 
 
-def _episodes(run: EvaluationRun) -> set[int]:
-    return {returns.shape[1] for returns in run.cells.values()}
+def _rules(run: EvaluationRun) -> tuple[Any, ...]:
+    """Returns what merged results must agree in: protocol with episodes and steps, and seeds."""
+    return run.sources[0].settings["protocol"], run.sources[0].settings["seeds"]
 
 
-def cell_order(cell: Cell) -> tuple[int, int]:
+def cell_order(cell: Cell) -> tuple[int, int, str]:
     """Returns the sort key of a cell in the paper's order."""
-    return LAYOUT_NAMES.index(cell[0]), FAMILIES.index(cell[1])
+    return LAYOUT_NAMES.index(cell[0]), FAMILIES.index(family_of(cell)), cell[1]
 
 
-def families_of(cells: Iterable[Cell]) -> list[str]:
-    """Returns the families of cells, in the paper's order."""
-    found = {family for _, family in cells}
-    return [family for family in FAMILIES if family in found]
+def family_of(cell: Cell) -> str:
+    """Returns the teammate family of a cell."""
+    return cell[1].partition(" ")[0]
+
+
+def group_of(cell: Cell) -> str:
+    """Returns the kind of a cell's tasks: "test" for published test tasks, else "training", "held out" or "own"."""
+    return cell[1].partition(" (")[2].removesuffix(")") or "test"
+
+
+def groups_of(cells: Iterable[Cell]) -> list[str]:
+    """Returns the groups of teammates of cells, such as "H4" and "H4 (training)", in the paper's order."""
+    return list(dict.fromkeys(group for _, group in sorted(cells, key=lambda cell: cell_order(cell)[1:])))
 
 
 @cache
@@ -233,3 +358,18 @@ def normalized_return(mean: float, references: Mapping[str, float] | None) -> fl
     if references is None or not has_headroom(references):
         return None
     return (mean - references["stay"]) / (references["oracle"] - references["stay"])
+
+
+def normalised_score(run: EvaluationRun, cell: Cell, headroom: Mapping[Cell, Mapping[str, float]]) -> float | None:
+    """Returns the normalised return of a cell of a run, see `normalized_return`.
+
+    None also if the results are not of the tasks and the episode length that the references were measured with.
+
+    Args:
+        run: results.
+        cell: one of the run's cells.
+        headroom: cell -> reference ego -> its mean return.
+    """
+    if not run.is_complete(cell) or not run.has_usual_steps(cell):
+        return None
+    return normalized_return(float(run.means(cell).mean()), headroom.get(cell))

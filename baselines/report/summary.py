@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,21 @@ from typing import Any
 import numpy as np
 
 from baselines.plotting import plot_return_curves
+from baselines.report.overlap import overlap_legend, overlap_marks
 from baselines.report.results import (
+    GROUP_TEXTS,
     TEST_LAYOUTS,
     EvaluationRun,
-    families_of,
-    normalized_return,
+    family_of,
+    group_of,
+    groups_of,
+    instances_range,
+    instances_text,
+    normalised_score,
     published_cells,
+    published_instances,
 )
-from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, headroom_table, read_headroom
 from icrl4aht_data.utils.templates import markdown_table
 
@@ -40,33 +47,46 @@ def bootstrap_interval(means: np.ndarray, rng: np.random.Generator) -> tuple[flo
 
 
 def rows(run: EvaluationRun) -> list[dict[str, Any]]:
-    """Returns one row per cell of a run: mean return, 95 % interval, published numbers of the agent, gain, ..."""
+    """Returns one row per cell of a run.
+
+    A row has the agent, the conditions of the evaluation, mean return, std and 95 % interval over the instances (None
+    for a single instance), the paper's numbers (None unless the protocol is `published`), the adaptation gain,
+    headroom, the normalised score (None for cells without headroom and incomplete cells), and `overlap`: the ways in
+    which training and test overlap, see `baselines.report.overlap.OVERLAPS`.
+    """
     published: dict[str, Any] = {} if run.variant else published_cells(run.agent)
     headroom = read_headroom(run.protocol)
     rng = np.random.default_rng(0)
     found = []
     for cell in run.cells:
         layout, family = cell
-        means = run.means(cell)
-        low, high = bootstrap_interval(means, rng)
-        published_mean, published_std = published.get(layout, {}).get(family, (None, None))
+        means, settings = run.means(cell), run.source(cell).settings
+        several = len(means) > 1
+        low, high = bootstrap_interval(means, rng) if several else (None, None)
+        published_mean, published_std = (
+            published.get(layout, {}).get(family, (None, None)) if run.is_like_the_papers(cell) else (None, None)
+        )
         found.append(
             {
                 "agent": run.agent,
                 "protocol": run.protocol,
                 "layout": layout,
-                "family": family,
+                "family": family_of(cell),
                 "instances": len(means),
                 "episodes": run.cells[cell].shape[1],
                 "mean": float(means.mean()),
-                "std": float(means.std()),
+                "std": float(means.std()) if several else None,
                 "low": low,
                 "high": high,
                 "published_mean": published_mean,
                 "published_std": published_std,
                 "gain": run.gain(cell),
                 "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
-                "normalised": normalized_return(float(means.mean()), headroom.get(cell)),
+                "normalised": normalised_score(run, cell, headroom),
+                "tasks": group_of(cell),
+                "seeds": len(settings["seeds"]),
+                "steps": settings["protocol"]["steps"],
+                "overlap": " ".join(run.overlaps([cell])),
                 "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
             }
         )
@@ -84,11 +104,12 @@ def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
 
 
 def markdown(runs: list[EvaluationRun]) -> str:
-    """Returns a Markdown report with one table per run and track: returns by layout and teammate family."""
+    """Returns a Markdown report with one table per run and track: returns by layout and group of teammates."""
     lines = [
         "# Returns per layout and teammate family",
         "",
-        "Mean ± std over the instances' means; below it the published number of the same agent, if there is one.",
+        "Mean ± std over the instances' means. The published number of the same agent is below it if the protocol is",
+        "`published`: the paper's 5 instances, 100 episodes of 100 steps.",
     ]
     for run in runs:
         for track, table in track_tables(run):
@@ -97,23 +118,41 @@ def markdown(runs: list[EvaluationRun]) -> str:
 
 
 def track_tables(run: EvaluationRun) -> Iterator[tuple[str, str]]:
-    """Yields each track that was played, and its Markdown table with a column per layout and a row per family."""
-    cells = {(row["layout"], row["family"]): row for row in rows(run)}
+    """Yields each track that was played, and a Markdown table with its caption and the explanation of its marks.
+
+    The table has a column per layout and a row per group of teammates.
+    """
+    cells = {(row["layout"], cell[1]): row for cell, row in zip(run.cells, rows(run), strict=True)}
     for track, splits in TRACKS.items():
         of_track = dict.fromkeys((*splits["test"], *splits["train"]))
-        layouts = [layout for layout in of_track if any((layout, family) in cells for family in FAMILIES)]
+        layouts = [layout for layout in of_track if any(cell[0] == layout for cell in cells)]
         if layouts:
+            shown = [cell for cell in run.cells if cell[0] in layouts]
             body = [
-                [family, *(_cell_text(cells.get((layout, family))) for layout in layouts)]
-                for family in families_of(cells)
+                [group, *(_cell_text((layout, group), cells.get((layout, group))) for layout in layouts)]
+                for group in groups_of(shown)
             ]
-            yield track, markdown_table(["family", *layouts], body)
+            notes = [*table_caption(run, shown), *overlap_legend(run.overlaps(shown))]
+            table = markdown_table(["family", *layouts], body)
+            yield track, "\n".join([table, "", *(f"* {note}" for note in notes)])
 
 
-def _cell_text(row: dict[str, Any] | None) -> str:
+def table_caption(run: EvaluationRun, cells: Sequence[Cell]) -> list[str]:
+    """Returns sentences on the conditions, instances and tasks of some of a run's cells."""
+    conditions = dict.fromkeys(run.source(cell).conditions for cell in cells)
+    instances = instances_range(len(run.cells[cell]) for cell in cells)
+    sentences = [f"{text[0].upper()}{text[1:]}, {instances} in a cell." for text in conditions]
+    groups = {group_of(cell) for cell in cells}
+    return sentences + [text for group, text in GROUP_TEXTS.items() if group in groups]
+
+
+def _cell_text(cell: Cell, row: dict[str, Any] | None) -> str:
     if row is None:
         return ""
-    text = f"{row['mean']:.1f} ± {row['std']:.1f}"
+    text = f"{row['mean']:.1f}" + ("" if row["std"] is None else f" ± {row['std']:.1f}")
+    text += overlap_marks(row["overlap"].split())
+    if row["instances"] != published_instances(cell):
+        text += f"<br>{instances_text(cell, row['instances'])}"
     if row["published_mean"] is not None:
         text += f"<br>published {row['published_mean']:.1f} ± {row['published_std']:.1f}"
     text += f"<br>gain {row['gain']:+.1f}"
@@ -139,9 +178,10 @@ def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
     lines = [
         "# Headroom: what an ego can change",
         "",
-        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the",
-        "published test instances. **bold**: the oracle gets more than staying does; elsewhere no reference ego can",
-        "raise the return, so a method's score there says nothing about adaptation.",
+        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the five",
+        "published test instances of a cell, each played with seed 0 for 100 episodes of 100 steps. **bold**: the",
+        "oracle gets over one point more than staying does; elsewhere no reference ego can raise the return by more,",
+        "so a method's score there says nothing about adaptation.",
     ]
     for protocol, layouts in protocols.items():
         names = [layout for layout in TEST_LAYOUTS if layout in layouts]

@@ -12,7 +12,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from baselines.plotting import SweepPoint
-from baselines.report.results import EvaluationRun, normalized_return, published_cells, read_published
+from baselines.report.overlap import describe_overlap
+from baselines.report.results import (
+    PUBLISHED_PROTOCOL,
+    EvaluationRun,
+    instances_range,
+    instances_text,
+    normalised_score,
+    published_cells,
+    published_instances,
+    read_published,
+)
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, Cell, has_headroom, read_headroom
 
@@ -58,11 +68,14 @@ class TableScore(NamedTuple):
 
     Attributes:
         mean: mean return; None if nothing was played.
-        std: standard deviation over the instances of a single cell, or over cells.
-        published: the paper's mean, and its std if it states one.
-        normalised: (return - stay) / (oracle - stay), mean over the cells with headroom.
+        std: standard deviation over the instances of a single cell, or over cells; None if there is only one.
+        published: the paper's mean, and its std if it states one; None under other protocols than the paper's.
+        normalised: (return - stay) / (oracle - stay), mean over the complete cells with headroom.
         headroom: (number of measured cells with headroom, number of measured cells).
         played: (number of cells played, number of cells).
+        shortfall: instances played, if they are not the published ones, such as "1 of 5 instances"; usually empty.
+        overlaps: the ways in which training and test overlap, see `baselines.report.overlap.OVERLAPS`.
+        details: what the score is of, with the conditions of the evaluation and the training of the agent; sentences.
     """
 
     mean: float | None
@@ -71,6 +84,9 @@ class TableScore(NamedTuple):
     normalised: float | None
     headroom: tuple[int, int]
     played: tuple[int, int]
+    shortfall: str = ""
+    overlaps: tuple[str, ...] = ()
+    details: str = ""
 
 
 class TableRow(NamedTuple):
@@ -90,28 +106,38 @@ class TableRow(NamedTuple):
 def fill_table(table: PaperTable, runs: Sequence[EvaluationRun], protocol: str) -> list[TableRow]:
     """Returns a table's rows: the paper's agents, then other agents that were run, if the table covers a track.
 
+    Under other protocols than the paper's, there are no rows for agents that were not run, since the paper's numbers
+    do not belong there.
+
     Args:
         table: one of `PAPER_TABLES`.
         runs: runs under one protocol, none of a sweep.
         protocol: name of the protocol.
     """
     covers_track = table.columns in (_TEAMMATE, _LAYOUT)
-    others = [
-        run.label
-        for run in runs
-        if covers_track and run.label not in table.agents and any(layout in table.columns for layout, _ in run.cells)
-    ]
-    by_label = {run.label: run for run in runs}
+    present = [run for run in runs if not table_cells(table).isdisjoint(run.cells)]
+    by_label = {run.label: run for run in present}
+    stated = [name for name in table.agents if protocol == PUBLISHED_PROTOCOL or name in by_label]
+    others = [run.label for run in present if covers_track and run.label not in table.agents]
     headroom = read_headroom(protocol)
     labels = (*HEURISTICS, AVERAGE) if table.group == "cell" else ("",)
     filled = []
     for label in labels:
-        for agent in dict.fromkeys((*table.agents, *others)):
+        for agent in dict.fromkeys((*stated, *others)):
             groups = [_cells_and_published(table.group, label, column, agent) for column in table.columns]
             run = by_label.get(agent)
-            scores = [score_cells(cells, run, headroom, published) for cells, published in groups]
+            scores = [
+                score_cells(cells, run, headroom, published if protocol == PUBLISHED_PROTOCOL else None)
+                for cells, published in groups
+            ]
             filled.append(TableRow(label, agent, scores))
     return filled
+
+
+def table_cells(table: PaperTable) -> set[Cell]:
+    """Returns the cells that a table covers."""
+    columns = [TRACKS[column]["test"] if table.group == "track" else (column,) for column in table.columns]
+    return {(layout, family) for layouts in columns for layout in layouts for family in HEURISTICS}
 
 
 def _cells_and_published(
@@ -140,36 +166,86 @@ def score_cells(
         cells: the group.
         run: None if the agent was not run.
         headroom: cell -> reference ego -> mean return.
-        published: the paper's mean and std.
+        published: the paper's mean and std; left out if the run has another protocol or episode length.
     """
     means = {cell: run.means(cell) for cell in cells if cell in run.cells} if run else {}
     measured = [headroom[cell] for cell in cells if cell in headroom]
-    normalised = [normalized_return(float(mean.mean()), headroom.get(cell)) for cell, mean in means.items()]
+    flat = (sum(map(has_headroom, measured)), len(measured))
+    if run is None or not means:
+        return TableScore(None, None, published, None, flat, (0, len(cells)))
+    normalised = [normalised_score(run, cell, headroom) for cell in means]
     with_headroom = [value for value in normalised if value is not None]
-    values = next(iter(means.values())) if len(cells) == 1 and means else np.array([m.mean() for m in means.values()])
+    values = next(iter(means.values())) if len(cells) == 1 else np.array([mean.mean() for mean in means.values()])
     return TableScore(
-        mean=float(values.mean()) if len(values) else None,
-        std=float(values.std()) if len(values) else None,
-        published=published,
+        mean=float(values.mean()),
+        std=float(values.std()) if len(values) > 1 else None,
+        published=published if all(map(run.is_like_the_papers, means)) else None,
         normalised=float(np.mean(with_headroom)) if with_headroom else None,
-        headroom=(sum(map(has_headroom, measured)), len(measured)),
+        headroom=flat,
         played=(len(means), len(cells)),
+        shortfall=_shortfall(run, list(means)),
+        overlaps=run.overlaps(means),
+        details=" ".join(["Mean over cells:"] * (len(cells) > 1) + [_describe_cell(run, cell) for cell in means]),
     )
 
 
-def sweep_points(runs: Sequence[EvaluationRun], quantity: str) -> dict[str, dict[str, list[SweepPoint]]]:
-    """Returns layout -> agent -> points, of the runs in which `quantity` was varied: "K" or "size"."""
-    panels: dict[str, dict[str, list[SweepPoint]]] = {}
+def _shortfall(run: EvaluationRun, cells: Sequence[Cell]) -> str:
+    """Returns the number of instances if it is not that of the published tasks of each cell."""
+    numbers = {cell: len(run.cells[cell]) for cell in cells}
+    if all(number == published_instances(cell) for cell, number in numbers.items()):
+        return ""
+    if len(cells) == 1:
+        return instances_text(*next(iter(numbers.items())))
+    return f"{instances_range(numbers.values())} a cell"
+
+
+def _describe_cell(run: EvaluationRun, cell: Cell) -> str:
+    source = run.source(cell)
+    instances = instances_text(cell, len(run.cells[cell]))
+    return f"{cell[0]}, {cell[1]}: {instances}, {source.conditions}. {describe_overlap(run.tasks(cell), source.seen)}"
+
+
+def sweep_scores(runs: Sequence[EvaluationRun], quantity: str) -> dict[str, dict[str, list[tuple[Any, TableScore]]]]:
+    """Returns layout -> agent -> (value, score) for the runs in which `quantity` was varied: "K" or "size".
+
+    A score is the mean over the cells of a layout that were played, with the paper's mean over the four families if
+    the run has its protocol.
+    """
+    panels: dict[str, dict[str, list[tuple[Any, TableScore]]]] = {}
     for run in runs:
         if run.variant is None or run.variant[0] != quantity:
             continue
-        value = run.variant[1]
+        value, headroom = run.variant[1], read_headroom(run.protocol)
         for layout in dict.fromkeys(layout for layout, _ in run.cells):
-            means = np.array([run.means(cell).mean() for cell in run.cells if cell[0] == layout])
-            published = _published_point(quantity, run.agent, layout, value)
-            points = panels.setdefault(layout, {}).setdefault(run.agent, [])
-            points.append(SweepPoint(value, float(means.mean()), float(means.std()), published))
+            cells = [cell for cell in run.cells if cell[0] == layout]
+            of_test = [(layout, family) for family in HEURISTICS]
+            group = of_test if set(cells) <= set(of_test) else cells
+            mean = _published_point(quantity, run.agent, layout, value) if group is of_test else None
+            score = score_cells(group, run, headroom, None if mean is None else (mean, None))
+            panels.setdefault(layout, {}).setdefault(run.agent, []).append((value, score))
     return panels
+
+
+def sweep_points(runs: Sequence[EvaluationRun], quantity: str) -> dict[str, dict[str, list[SweepPoint]]]:
+    """Returns layout -> agent -> points to plot; see `sweep_scores`.
+
+    The paper's mean is left out if not all families were played.
+    """
+    return {
+        layout: {
+            agent: [
+                SweepPoint(value, score.mean, score.std, _complete_published(score))
+                for value, score in scores
+                if score.mean is not None
+            ]
+            for agent, scores in lines.items()
+        }
+        for layout, lines in sweep_scores(runs, quantity).items()
+    }
+
+
+def _complete_published(score: TableScore) -> float | None:
+    return score.published[0] if score.published and score.played[0] == score.played[1] else None
 
 
 def _published_point(quantity: str, agent: str, layout: str, value: Any) -> float | None:

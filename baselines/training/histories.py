@@ -18,6 +18,7 @@ from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
 from baselines.training.options import FILTERS, HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
+from baselines.training.seen import TRAINED_ON, teammate_ids
 from baselines.training.trainer import TrainingData
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -87,7 +88,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
         },
-        "trained_on": training_cells(split.train),
+        TRAINED_ON: training_cells(split.train),
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
 
@@ -125,19 +126,23 @@ def field_values(dataset: Dataset, field: str) -> np.ndarray:
 def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
     """Returns what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
 
-    An entry has these five names, the numbers of `tasks` and `histories`, and `tasks_hash`, a hash of the task ids.
+    An entry has these five names, the numbers of `tasks` and `histories`, `tasks_hash`, a hash of the task ids, and
+    `teammates`, the ids of the teammates, see `seen.teammate_ids`; None if the release does not describe them.
     Histories that are held out for validation do not belong to `dataset`.
     """
     columns = [field_values(dataset, field) for field in _CELL_FIELDS.values()]
     tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    for *cell, task_id in zip(*columns, field_values(dataset, "task_id"), strict=True):
+    history_of: dict[str, int] = {}
+    for *cell, task_id, history_id in zip(*columns, field_values(dataset, "task_id"), dataset.ids, strict=True):
         tasks[tuple(map(str, cell))].append(str(task_id))
+        history_of[str(task_id)] = int(history_id)
     return [
         {
             **dict(zip(_CELL_FIELDS, cell, strict=True)),
             "tasks": len(set(ids)),
             "histories": len(ids),
             "tasks_hash": json_hash(sorted(set(ids))),
+            "teammates": teammate_ids(dataset, [history_of[task_id] for task_id in set(ids)]),
         }
         for cell, ids in sorted(tasks.items())
     ]

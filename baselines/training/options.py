@@ -35,6 +35,9 @@ class TrainOptions:
         check_fields(self)
 
 
+SAVE_MINUTES = 5.0
+"""Most minutes between checkpoints of a training run; no setting of the run, whose results do not depend on it."""
+
 FILTERS = {"teammate_family": "teammate_family", "algorithm": "teammate_kind", "source": "source"}
 """Field of `HistoryOptions` -> the field of a release's index that it filters by."""
 

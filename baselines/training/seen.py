@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
 
 TRAINED_ON = "trained_on"
@@ -45,11 +46,10 @@ def teammate_id(teammate: Mapping[str, Any]) -> str:
     return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
 
 
-def teammate_ids(dataset: Dataset, history_ids: np.ndarray) -> list[str] | None:
+def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
     """Returns the sorted ids of the teammates of some histories, or None if the release does not describe them all."""
-    _, first = np.unique([dataset.index.entry(int(row)).task_id for row in history_ids], return_index=True)
     try:
-        return sorted({teammate_id(dataset.recover_teammate(int(row))) for row in history_ids[first]})
+        return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
     except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
         return None
 
@@ -64,7 +64,7 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
         where: origin of the record, for the message.
 
     Raises:
-        OptionError: if it is no such list.
+        OptionError: if it is no such list, or for an unknown layout, family or algorithm.
     """
     if not isinstance(entries, list | tuple):
         raise OptionError(f"{where}: {TRAINED_ON}: expected a list of entries, found {str(entries)[:200]!r}")
@@ -91,4 +91,8 @@ def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str]
             f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(FAMILIES)}), perhaps an algorithm of this "
             f"family and a list of teammates' ids; found {str(entry)[:200]!r}"
         )
-    return layout, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)
+    try:
+        name = get_layout(layout).name
+    except UnknownNameError as error:
+        raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
+    return name, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)

@@ -6,6 +6,7 @@ resumes from its last checkpoint to the same parameters and the same log as an u
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -17,13 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from baselines.methods.method import Method
 from baselines.plotting import plot_training_log
-from baselines.training.options import TrainOptions
+from baselines.training.options import SAVE_MINUTES, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
+from baselines.training.stopping import StopSignals, TrainingStopped
 from baselines.training.tensorboard import TensorBoardLog, check_installed
 from generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock
 from icrl4aht_data.errors import OptionError
@@ -186,9 +189,12 @@ def train(
     *,
     devices: Any = None,
     tensorboard: bool = False,
+    save_minutes: float = SAVE_MINUTES,
     done: Callable[[int, float], None] = lambda step, loss: None,
 ) -> TrainState:
     """Train to the end, from the start or from the last checkpoint in the folder.
+
+    SIGTERM and SIGINT end the training after the running step, once its state is saved.
 
     Args:
         method: what to train.
@@ -199,6 +205,7 @@ def train(
         about: further settings for config.json, such as the model's and the data's.
         devices: all by default.
         tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
+        save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
         done: called with a step and its loss whenever they are logged.
 
     Returns:
@@ -207,6 +214,7 @@ def train(
     Raises:
         OptionError: if the folder holds a run of other settings, or tensorboardX is required and not installed.
         BusyError: if another process trains in the folder.
+        TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
     """
     if tensorboard:
         check_installed()
@@ -225,7 +233,9 @@ def train(
         if events:
             stack.callback(events.close)
         batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
-        clock, save = _StepClock(first), SaveInterval(options.steps, updates=options.save_every)
+        stop = stack.enter_context(StopSignals())
+        clock = _StepClock(first)
+        save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
         for step, batch in enumerate(batches, start=first + 1):
             state, numbers = trainer.step(state, batch)
             last, lines = step == options.steps, []
@@ -238,12 +248,33 @@ def train(
                 log.write(*lines, timing=clock.line(step, batches.waited))
                 if events:
                     events.add(lines)
-            if save.due(step):
+            saves, stopped_by = agree_on_stop(save.due(step), stop.received)
+            if saves or stopped_by:
                 log.sync()
                 checkpoints.save(state, step)
+            if stopped_by:
+                name = signal.Signals(stopped_by).name
+                where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
+                raise TrainingStopped(stopped_by, f"{where}, whose state is saved; the same command resumes it")
         if writes:
             plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
     return state
+
+
+def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:
+    """Returns whether all processes save now, and the signal that stops them all, or 0.
+
+    Clocks differ and a signal may reach one process only, but saving needs all of them in the same step: process 0
+    decides when to save, and a signal to any process stops all. With several processes this waits for the step.
+
+    Args:
+        save: whether this process would save; ignored in other processes than 0.
+        received: number of the signal that this process received, or 0.
+    """
+    if jax.process_count() == 1:
+        return save, received
+    every_process = np.asarray(multihost_utils.process_allgather(np.array([save, received], np.int32)))
+    return bool(every_process[0, 0]), int(every_process[:, 1].max())
 
 
 def _as_floats(log: dict[str, Array]) -> dict[str, float]:

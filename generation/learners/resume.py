@@ -118,8 +118,8 @@ class SaveInterval:
     Args:
         last: number of the last update.
         updates: save when the number of updates is a multiple of this.
-        seconds: save when this much time has passed since the last save. Not for several processes, whose clocks
-            disagree: all must call `save` together.
+        seconds: save when this much time has passed since the last save. Clocks of several processes disagree, and all
+            must call `save` together, so that one has to decide for all.
     """
 
     def __init__(self, last: int, *, updates: int | None = None, seconds: float | None = None) -> None:

@@ -17,28 +17,15 @@ from baselines.report import episode_gifs as gifs
 from baselines.report.episode_gifs import EpisodeGif, restore_ego
 from baselines.report.model_card import write_model_cards
 from baselines.report.page import write_page, write_page_with_episodes
-from baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultSource, merge, read_published
+from baselines.report.results import TEST_LAYOUTS, EvaluationRun, merge, read_published
 from baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, score_cells, sweep_points
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
-from icrl4aht_data.benchmark.tasks import make_task, manifest_path, read_tasks, write_tasks
+from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import legend_below
+from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
 GIF = b"GIF89a"  # the page does not look inside
-SETTINGS = {
-    "agent": "AD",
-    "seeds": [0],
-    "protocol": {"name": "seeded", "episodes": 40, "steps": 100},
-    "code_version": "0",
-}
-
-
-def run(agent: str, layouts=("demo_wide",), value=10.0, variant=None, families=HEURISTICS) -> EvaluationRun:
-    """Every instance earns `value`, and 2 more in the second half."""
-    returns = value + np.repeat([[0.0, 2.0]], 20, axis=1) * np.ones((5, 1))
-    cells = {(layout, family): returns for layout in layouts for family in families}
-    source = ResultSource(f"runs/{agent}", tuple(layouts), SETTINGS, None)
-    return EvaluationRun(agent, "seeded", cells, variant, sources=(source,))
 
 
 class Outside(HTMLParser):
@@ -67,11 +54,15 @@ class Outside(HTMLParser):
 
 
 def test_the_page_is_complete_and_fetches_nothing(tmp_path):
-    sweeps = [run("AD", value=k / 100, variant=("K", k)) for k in (250, 500)]
-    sweeps.append(run("DPT", variant=("size", "small")))
+    def published(*arguments, **options):
+        return evaluated_run(*arguments, **options, protocol="published")
+
+    sweeps = [published("AD", value=k / 100, variant=("K", k)) for k in (250, 500)]
+    sweeps.append(published("DPT", variant=("size", "small")))
     (tmp_path / "a.gif").write_bytes(GIF)
     path = tmp_path / "r" / "report.html"
-    runs = [run("AD", TEST_LAYOUTS), run("random", TEST_LAYOUTS, 1.0), *sweeps, run("AD+TA", ("cramped_down",))]
+    runs = [published("AD", TEST_LAYOUTS), published("random", TEST_LAYOUTS, 1.0), *sweeps]
+    runs.append(published("AD+TA", ("cramped_down",)))
     episodes = [
         EpisodeGif("H1", "H1 & an ego", tmp_path / "a.gif"),
         EpisodeGif("rl", "no picture: <its run> is gone", None),
@@ -102,14 +93,17 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
 
 
 def test_tables_hold_our_and_the_papers_numbers():
-    runs = [run("AD", TEST_LAYOUTS), run("oracle", ("demo_wide",), 50.0)]
-    one, two, three, four, five = (fill_table(table, runs, "seeded") for table in PAPER_TABLES)
+    runs = [
+        evaluated_run("AD", TEST_LAYOUTS, protocol="published"),
+        evaluated_run("oracle", value=50.0, protocol="published"),
+    ]
+    one, two, three, four, five = (fill_table(table, runs, "published") for table in PAPER_TABLES)
     assert [row.agent for row in one[:4]] == ["AD", "DPT", "random", "oracle"]
     assert [row.agent for row in two[:4]] == ["AD", "DPT", "random", "AD"], "oracle did not play there"
     column = PAPER_TABLES[0].columns.index("demo_wide")
     cell = one[0].scores[column]
     assert (cell.mean, cell.std, cell.published, cell.headroom) == (11.0, 0.0, (-3.2, 2.6), (1, 1))
-    references = read_headroom("seeded")["demo_wide", "H1"]
+    references = read_headroom("published")["demo_wide", "H1"]
     assert cell.normalised == pytest.approx((11 - references["stay"]) / (references["oracle"] - references["stay"]))
     assert one[1].scores[column].mean is None
     assert one[0].scores[0].headroom == (0, 1), "coord_simple with H1 is flat"
@@ -125,14 +119,16 @@ def test_tables_hold_our_and_the_papers_numbers():
 
 
 def test_scores_count_the_cells_played():
-    partial = score_cells([("demo_wide", family) for family in HEURISTICS], run("AD", families=("H1", "H2")), {})
+    partial = score_cells(
+        [("demo_wide", family) for family in HEURISTICS], evaluated_run("AD", families=("H1", "H2")), {}
+    )
     assert partial.played == (2, 4)
     assert (partial.mean, partial.normalised) == (11.0, None)
 
 
 def test_short_runs_gain_from_half_to_half():
-    assert run("AD").gain(("demo_wide", "H1")) == 2
-    short = dataclasses.replace(run("AD"), cells={("demo_wide", "H1"): np.array([[1.0, 2, 3, 5, 8]])})
+    assert evaluated_run("AD").gain(("demo_wide", "H1")) == 2
+    short = dataclasses.replace(evaluated_run("AD"), cells={("demo_wide", "H1"): np.array([[1.0, 2, 3, 5, 8]])})
     assert short.gain(("demo_wide", "H1")) == 6.5 - 1.5
 
 
@@ -154,7 +150,7 @@ def test_legends_fit_their_figures(labels):
 
 
 def test_sweeps_have_the_papers_points_where_it_states_them():
-    runs = [run("AD", ("test_wide",), variant=("K", k)) for k in (250, 500, 1000)]
+    runs = [evaluated_run("AD", ("test_wide",), variant=("K", k), protocol="published") for k in (250, 500, 1000)]
     assert [(p.value, p.mean, p.published) for p in sweep_points(runs, "K")["test_wide"]["AD"]] == [
         (250, 11.0, None),
         (500, 11.0, -7.9),
@@ -173,29 +169,45 @@ def test_the_papers_averages_are_those_of_its_cells():
 
 
 def test_models_of_different_layouts_are_one_agent():
-    one, two = run("AD", ("demo_wide",)), run("AD", ("coord_simple",))
+    one, two = evaluated_run("AD", ("demo_wide",)), evaluated_run("AD", ("coord_simple",))
     (both,) = merge([one, two])
     assert next(iter(both.cells)) == ("coord_simple", "H1")
     assert len(both.cells) == 8
     assert [source.layouts for source in both.sources] == [("demo_wide",), ("coord_simple",)]
-    assert [found.label for found in merge([one, run("AD", value=3.0)])] == ["AD", "AD [runs/AD]"]
-    assert len(merge([one, run("AD", ("coord_simple",), variant=("K", 250))])) == 2
+    assert [found.label for found in merge([one, evaluated_run("AD", value=3.0)])] == ["AD", "AD [runs/AD]"]
+    assert len(merge([one, evaluated_run("AD", ("coord_simple",), variant=("K", 250))])) == 2
 
 
 def test_trained_models_have_cards(tmp_path):
-    histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": ["demo_wide"], "data_version": "1.0.0"}
-    config = {"model": {"layers": 4}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
-    histories["sizes"] = {"train": 14}
-    trained = run("AD")
-    source = trained.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12"})
-    (path,) = write_model_cards([run("stay"), dataclasses.replace(trained, sources=(source,))], tmp_path)
+    def trained(layout, tested_on, size, **options):
+        histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [layout], "data_version": "1.0.0"}
+        histories["sizes"] = {"train": size}
+        config = {"model": {"layers": 4}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+        found = evaluated_run("AD", (tested_on,), **options)
+        source = found.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12"})
+        return dataclasses.replace(found, sources=(source,))
+
+    greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}
+    first = trained("demo_wide", "demo_wide", 14, trained_on=[greedy])
+    (path,) = write_model_cards([evaluated_run("stay"), first], tmp_path)
     card = path.read_text()
     assert path.name == "AD-seeded.md"
     assert "| data | you/icrl4aht, data version 1.0.0 |" in card
-    assert "| 14 of demo_wide; the release's manifest has SHA-256 `ab12` |" in card
+    assert (
+        "| demo_wide | 14 of demo_wide; the release's manifest has SHA-256 `ab12` | demo_wide; with utility_greedy (1) "
+        "| 3 | protocol seeded, 1 seed (0), 40 episodes of 100 steps, 5 instances in a cell |" in card
+    )
     assert "* layers: 4\n* seed: 3" in card
-    assert "| H4 | 11.0 ± 0.0" in card
+    assert "| H4 | 11.0 ± 0.0 †<br>" in card
+    assert "| H3 | 11.0 ± 0.0<br>" in card
     assert "It is one run, of seed 3" in card
+    assert card.count("* † the agent was trained with teammates of this family") == 2, "at the table, among the limits"
+    both = merge([first, trained("asymm_both", "asymm_right", 8, trained_on=None)])
+    (path,) = write_model_cards(both, tmp_path)
+    card = path.read_text()
+    assert "| asymm_right | 8 of asymm_both; the release's manifest has SHA-256 `ab12` | unknown | 3 |" in card
+    assert "Each model is one run" in card
+    assert "* ? unknown training data" in card
 
 
 def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
@@ -203,21 +215,24 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "episode_gif", lambda path, *a, **k: path.write_bytes(GIF) + 1)
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
-    tasks = read_tasks(manifest_path("teammate", "test"))
-    played = {(task.layout.name, task.teammate_family): task for task in tasks}
 
     def with_tasks(agent: str, **options) -> EvaluationRun:
-        found = run(agent, ("coord_simple", "demo_wide"), families=("H1", "H4"), **options)
-        settings = SETTINGS | {"protocol": dataclasses.asdict(PROTOCOLS["seeded"])}
-        own = {cell: played[cell] for cell in found.cells}
-        return dataclasses.replace(found, sources=(found.sources[0]._replace(settings=settings, tasks=own),))
+        return evaluated_run(
+            agent, ("coord_simple", "demo_wide"), families=("H1", "H4"), folder=f"runs/{agent}{options}", **options
+        )
 
     runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
     runs.insert(3, with_tasks("AD", variant=("K", 250)))
-    text = write_page_with_episodes(runs, tmp_path / "report.html").read_text()
+    drawn: list[tuple[int, int]] = []
+
+    def progress(what: str, done: int, total: int) -> None:
+        drawn.append((done, total))
+
+    text = write_page_with_episodes(runs, tmp_path / "report.html", progress=progress).read_text()
+    assert drawn == [(done, 6) for done in range(7)]
     found = re.findall(r"<figcaption>([^<]+? with \S+ on \S+): team return 7 ", text)
     assert found == [
-        f"{agent} with {mate} on demo_wide" for mate in ("H1/t4", "H4/t4") for agent in ("AD", "DPT", "AD, K = 250")
+        f"{agent} with {mate} on demo_wide" for mate in ("H1/t0", "H4/t0") for agent in ("AD", "DPT", "AD, K = 250")
     ]
     assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
     assert (
@@ -226,7 +241,7 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
 
 
 def test_egos_that_cannot_be_made_again_say_why(tmp_path):
-    source = ResultSource("runs/AD", ("demo_wide",), SETTINGS | {"details": {"step": 3}}, None)
+    source = evaluated_run("AD").sources[0]
     with pytest.raises(OptionError, match="AD is neither a reference ego nor of a run folder"):
         restore_ego(source)
     with pytest.raises(OptionError, match=r"its run folder .*/gone is missing"):
@@ -234,7 +249,7 @@ def test_egos_that_cannot_be_made_again_say_why(tmp_path):
 
 
 def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
-    theta = next(t for t in read_tasks(manifest_path("teammate", "test")) if t.teammate_family == "H4").teammate
+    theta = next(task for task in TEST_TASKS if task.teammate_family == "H4").teammate
     write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 2, 5))
     played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]

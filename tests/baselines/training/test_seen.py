@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from baselines.training.histories import hold_out
+from baselines.training.histories import hold_out, training_cells
 from baselines.training.seen import SeenInTraining, read_trained_on, teammate_id, teammate_ids
 from generation.teammates.instances import published_task
 from icrl4aht_data import load_icrl4aht
@@ -15,12 +15,23 @@ def test_held_out_teammates_are_not_among_those_in_training():
     dataset = load_icrl4aht(split="train", layout="demo_simple")
     split = hold_out(dataset, 0.1)
     assert split.teammates is not None
-    held = teammate_ids(dataset, split.teammates.ids)
-    trained = teammate_ids(dataset, split.train.ids)
+    held = teammate_ids(dataset, split.teammates.ids.tolist())
+    trained = teammate_ids(dataset, split.train.ids.tolist())
     assert held
     assert trained
     assert not set(held) & set(trained)
     assert len(trained) == len({entry.task_id for entry in split.train.entries})
+
+
+def test_training_cells_name_their_teammates():
+    dataset = load_icrl4aht(split="train", layout="demo_simple")
+    found = {}
+    for cell in training_cells(dataset):
+        of_cell = dataset.filter(teammate_kind=cell["algorithm"])
+        assert cell["teammates"] == teammate_ids(dataset, of_cell.ids.tolist())
+        assert len(cell["teammates"]) == cell["tasks"]
+        found[cell["algorithm"]] = tuple(cell["teammates"])
+    assert read_trained_on(training_cells(dataset), "run.json") == SeenInTraining(("demo_simple",), found)
 
 
 def test_teammates_of_one_policy_have_one_id():
@@ -40,7 +51,7 @@ def test_releases_without_tasks_do_not_know_their_teammates(monkeypatch):
         raise NotStoredError("no tasks")
 
     monkeypatch.setattr(dataset, "recover_teammate", recover)
-    assert teammate_ids(dataset, dataset.ids) is None
+    assert teammate_ids(dataset, dataset.ids.tolist()) is None
 
 
 def test_records_join_the_entries_of_a_kind():
@@ -54,6 +65,10 @@ def test_records_join_the_entries_of_a_kind():
     any_algorithm = read_trained_on([{"layout": "demo_wide", "family": "rl"}], "run.json")
     assert any_algorithm.teammates == dict.fromkeys(("fcp", "brdiv", "lbrdiv", "comedi"))
     assert read_trained_on([], "run.json") == SeenInTraining()
+    (alias,) = read_trained_on([{"layout": "demo_cook_wide", "family": "H4"}], "run.json").layouts
+    assert alias == "demo_wide"
+    with pytest.raises(OptionError, match=r"trained_on: unknown layout 'demo_wid'.*mean 'demo_wide'"):
+        read_trained_on([{"layout": "demo_wid", "family": "H4"}], "run.json")
 
 
 @pytest.mark.parametrize(

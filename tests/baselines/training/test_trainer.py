@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
 import socket
 import struct
 import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +19,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import multihost_utils
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
 from baselines.methods.registry import get_method
 from baselines.training.histories import hold_out, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS
+from baselines.training.stopping import TrainingStopped
 from baselines.training.trainer import (
     Trainer,
     TrainingData,
     TrainState,
+    agree_on_stop,
     learning_rate_schedule,
     train,
     training_optimizer,
@@ -58,10 +66,10 @@ class Rows:
         return self.batch(0)
 
 
-def trained(folder: Path, die_at: int | None = None, tensorboard: bool = False) -> TrainState:
+def trained(folder: Path, die_at: int | None = None, **options: Any) -> TrainState:
     method = get_method("amago_offline")(MODEL, FLAT)
     data = TrainingData(Rows(0, die_at), {"held out": Rows(1)})
-    return train(method, data, OPTIONS, folder, {}, tensorboard=tensorboard)
+    return train(method, data, OPTIONS, folder, {}, **options)
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +159,59 @@ class TestResume:
             OptionError, match=r"other settings \(train.seed: the run has 0, expected 3\); give another"
         ):
             train(method, TrainingData(Rows(), {}), other, through[0], {})
+
+
+def send(*numbers: int) -> Callable[[int, float], None]:
+    """Return a progress callback that sends signals to this process at step 4, which is logged but not a checkpoint."""
+
+    def done(step: int, loss: float) -> None:
+        for number in numbers if step == 4 else ():
+            os.kill(os.getpid(), number)
+
+    return done
+
+
+class TestStopping:
+    def test_checkpoints_are_saved_by_time(self, tmp_path):
+        with pytest.raises(KeyboardInterrupt):
+            trained(tmp_path, die_at=5, save_minutes=1e-9)
+        assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without, step 3 alone
+
+    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+    def test_a_signal_saves_and_the_run_resumes_to_the_same_bits(self, through, tmp_path, number, code):
+        with pytest.raises(
+            TrainingStopped, match=f"stopped by {number.name} after step 4 of 7.* resumes it"
+        ) as stopped:
+            trained(tmp_path, done=send(number))
+        assert stopped.value.code == code
+        assert Checkpoints(tmp_path / CHECKPOINTS).latest == 4
+        assert_same(trained(tmp_path), through[1])
+        for name in ("metrics.jsonl", "config.json"):
+            assert (tmp_path / name).read_bytes() == (through[0] / name).read_bytes()
+
+    def test_a_second_signal_does_not_wait(self, tmp_path):
+        before = signal.getsignal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            trained(tmp_path, done=send(signal.SIGINT, signal.SIGINT))
+        assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
+        assert signal.getsignal(signal.SIGINT) is before
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+    def test_signals_cannot_be_noted_in_another_thread(self, through, tmp_path):
+        """There the training runs as ever."""
+        with ThreadPoolExecutor(1) as pool:
+            assert_same(pool.submit(trained, tmp_path).result(), through[1])
+
+    def test_processes_agree(self, monkeypatch):
+        def agreed(*every_process: tuple[int, int]) -> tuple[bool, int]:
+            monkeypatch.setattr(jax, "process_count", lambda: len(every_process))
+            monkeypatch.setattr(multihost_utils, "process_allgather", lambda own: np.array(every_process))
+            return agree_on_stop(bool(every_process[-1][0]), every_process[-1][1])
+
+        assert agreed((1, 0), (0, 0)) == (True, 0)  # process 0 decides when to save
+        assert agreed((0, 0), (1, 0)) == (False, 0)
+        assert agreed((0, 0), (0, 15)) == agreed((0, 15), (0, 0)) == (False, 15)
+        assert agreed((1, 2)) == (True, 2)
 
 
 class TestStep:
@@ -268,7 +329,10 @@ options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation
 model = ModelOptions(layers=1, width=8, heads=2)
 root, out = sys.argv[1].split(",")
 job = prepare("ad", model, options, HistoryOptions(("demo_wide",), root))
-state = train(job.method, job.data, options, Path(out), job.about)
+def done(step, loss):
+    if step == 1 and os.environ.get("STOP"):
+        os.kill(os.getpid(), int(os.environ["STOP"]))
+state = train(job.method, job.data, options, Path(out), job.about, done=done)
 print(json.dumps({"devices": jax.device_count()}))
 """
 
@@ -296,8 +360,10 @@ def on_one_device(lite, tmp_path_factory) -> list[dict[str, Any]]:
     return across(lite[0], folder, [{}])
 
 
-def across(root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str) -> list[dict[str, Any]]:
-    """Train in one process per environment; the log."""
+def across(
+    root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str, code: int = 0
+) -> list[dict[str, Any]]:
+    """Train in one process per environment, which all exit with `code`; the log."""
     quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
     processes = [
         start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **quick, **environment)
@@ -305,8 +371,9 @@ def across(root: Path, folder: Path, environments: list[dict[str, str]], *argume
     ]
     outputs = [process.communicate(timeout=240) for process in processes]
     for process, (out, error) in zip(processes, outputs, strict=True):
-        assert process.returncode == 0, error
-        assert json.loads(out.splitlines()[-1])["devices"] == (2 if environments != [{}] else 1)
+        assert process.returncode == code, error
+        if code == 0:
+            assert json.loads(out.splitlines()[-1])["devices"] == (2 if environments != [{}] else 1)
     return metrics(folder / "run")
 
 
@@ -326,9 +393,31 @@ def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
 
 @pytest.mark.slow
 def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
+    """Also when process 1 alone is told to stop: both save the step, and the same command resumes."""
     with socket.socket() as held:  # keeps the port from other programs; JAX's coordinator may share it
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))
-        port = held.getsockname()[1]
-        two = across(lite[0], tmp_path, [{"PROCESS": "0"}, {"PROCESS": "1"}], f"127.0.0.1:{port}")
+        address = f"127.0.0.1:{held.getsockname()[1]}"
+        both = [{"PROCESS": "0"}, {"PROCESS": "1"}]
+        stopped = across(lite[0], tmp_path, [both[0], both[1] | {"STOP": "15"}], address, code=143)
+        assert [line["step"] for line in stopped] == [1]
+        assert Checkpoints(tmp_path / "run" / CHECKPOINTS).steps == [1]
+        two = across(lite[0], tmp_path, both, address)
     assert_close(two, on_one_device)
+
+
+@pytest.mark.slow
+def test_the_command_that_is_told_to_stop(lite, tmp_path):
+    run = tmp_path / "run"
+    small = ["--batch-size", "2", "--context", "4", "--layers", "1", "--width", "8", "--heads", "2", "--log-every", "1"]
+    command = ["-m", "baselines", "train", "ad", "--layout", "demo_wide", "--root", str(lite[0]), "--out", str(run)]
+    process = start(*command, *small, JAX_DISABLE_MOST_OPTIMIZATIONS="true")
+    end = time.monotonic() + 120
+    while not ((run / "metrics.jsonl").exists() and metrics(run)) and time.monotonic() < end:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 143, error
+    step = Checkpoints(run / CHECKPOINTS).latest
+    said = f"{run}: stopped by SIGTERM after step {step} of 20000, whose state is saved; the same command resumes it"
+    assert error.splitlines()[-1] == said

@@ -249,7 +249,7 @@ def test_cards_are_valid_to_the_hub(hub, published):
     names = "algorithm layout member checkpoint step sha256 agents own_return teammate_return seed widths code_version"
     teammate = fill_template("teammate.md", **dict.fromkeys([*names.split(), "return_of"], "fcp"))
     ModelCard(teammate).validate()
-    names = "method dataset data_version selection code_version settings protocol results limits"
+    names = "method dataset data_version models code_version settings protocol results limits"
     ModelCard(fill_template("baseline.md", **dict.fromkeys(names.split(), "name"))).validate()
     assert [request.path for request in hub.log] == ["/api/validate-yaml"] * 3
 
