@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from icrl4aht_data.format.chunks import chunk_hash
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.download import ORIGIN
@@ -267,6 +268,7 @@ def inflating(root: Path) -> None:
     """Replace the first chunk by one that inflates to a gigabyte."""
     data, path, rows = gigabyte_of_zeros(), root / SHARD, np.load(root / TABLE)
     rows["offset"][0], rows["size"][0], rows["crc32"][0] = path.stat().st_size, len(data), zlib.crc32(data)
+    rows["hash"][0] = np.frombuffer(chunk_hash(data), np.uint8)
     with path.open("ab") as stream:
         stream.write(data)
     np.save(root / TABLE, rows)
@@ -281,7 +283,8 @@ def inflating_within_bounds(root: Path) -> None:
         stream.seek(int(rows["offset"][0]))
         stream.write(data.ljust(int(rows["size"][0]), b"\0"))
         stream.seek(int(rows["offset"][0]))
-        rows["crc32"][0] = zlib.crc32(stream.read(int(rows["size"][0])))
+        data = stream.read(int(rows["size"][0]))
+        rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
     np.save(root / TABLE, rows)
 
 
