@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any, Unpack
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.errors import NotStoredError, unknown
 from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.manifest import check_meta
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, TASKS
+from icrl4aht_data.format.schema import INFO, PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Obs
 from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
@@ -80,6 +82,8 @@ def load_icrl4aht(
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
     """Return all histories of a release; see `load_icrl4aht` for the errors."""
+    if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - never raises; without it `read_index` explains more
+        check_meta(location.folder)
     index = read_index(location.folder)
     return Dataset(location, index, Shards(location, index), options)
 

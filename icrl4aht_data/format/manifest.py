@@ -1,17 +1,24 @@
-"""MANIFEST.sha256: every file of a release with its hash, in sha256sum's format."""
+"""MANIFEST.sha256: every file of a release with its hash, in sha256sum's format.
+
+Nothing of a release is believed because it is there: the manifest has the hashes of `meta/`, and the chunk tables in
+`meta/chunks/` have those of the chunks.
+"""
 
 from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 
-from icrl4aht_data.errors import IndexFormatError, UnsafePathError
-from icrl4aht_data.format.schema import MANIFEST, TEAMMATES
-from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
+from icrl4aht_data.utils.files import atomic_write, plain_size, read_text, wrap_read_errors
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import is_inside, resolve_inside
+from icrl4aht_data.utils.paths import LARGEST, is_inside, resolve_inside
+from icrl4aht_data.utils.remembered import remembered_hash
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -80,6 +87,55 @@ def read_manifest(folder: Path) -> dict[str, str]:
     """The manifest of a release folder, see `parse_manifest`."""
     path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
+
+
+@lru_cache(maxsize=16)
+def _parsed_once(text: str, path: Path) -> Mapping[str, str]:
+    return MappingProxyType(parse_manifest(text, path))
+
+
+def check_against_manifest(root: Path, names: Iterable[str]) -> None:
+    """Check that files of a release folder are those that its manifest lists.
+
+    A large file is hashed once until it changes or the machine restarts; see `utils.remembered`.
+
+    Args:
+        root: the release folder.
+        names: paths in it.
+
+    Raises:
+        IndexFormatError, ChunkTableError: if a file is missing, not listed or another one, or if there is no valid
+            manifest; names the file, the expected and the found hash, and what to do.
+    """
+    manifest = resolve_inside(root, MANIFEST)
+    listed = _parsed_once(read_text(manifest), manifest)
+    for name in names:
+        path = resolve_inside(root, name)
+        kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
+        try:
+            with wrap_read_errors(path):
+                plain_size(path, LARGEST)
+                found = remembered_hash(path) if name in listed else None
+        except IndexFormatError as error:
+            raise kind(str(error)) from error
+        if found is None:
+            raise kind(f"{path}: {manifest} does not list this file; fetch the release again")
+        if found != listed[name]:
+            raise kind(
+                f"{path}: expected sha256 {listed[name]} as {MANIFEST} says, found {found}: the file is damaged or was "
+                f"edited; `icrl4aht-data verify --repair` fetches it again"
+            )
+
+
+def check_meta(root: Path) -> None:
+    """Check the files of meta/ before they are read, except chunk tables; see `check_against_manifest`.
+
+    The card of a release's sources may be missing, since nothing is read from it.
+    """
+    manifest = resolve_inside(root, MANIFEST)
+    listed = [name for name in _parsed_once(read_text(manifest), manifest) if re.fullmatch(r"meta/[^/]+", name)]
+    read = {name for name in (INFO, HISTORIES, TASKS, PROVENANCE) if name in listed or (root / name).exists()}
+    check_against_manifest(root, sorted(read | {name for name in listed if (root / name).exists()}))
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:

@@ -81,7 +81,7 @@ def build_release(
             _copy(source / name, root / name, link)
             advance("copying", number, len(kept))
         _keep_source_card(source, root)
-        _add_figures_and_parquet(load_icrl4aht(root), root)
+        _add_figures_and_parquet(load_icrl4aht(source), root)
         for folder in sorted((root / TEAMMATES).glob("*/")):
             (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
         for name in _COPIED_TEXTS:

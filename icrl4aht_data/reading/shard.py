@@ -17,6 +17,7 @@ from icrl4aht_data.errors import (
     ShardMismatchError,
     ShardMissingError,
     ShardTruncatedError,
+    ShardUnreadableError,
 )
 from icrl4aht_data.format.chunks import (
     DEFLATE_RATIO,
@@ -54,8 +55,8 @@ class Shard:
         format_version: the release's format version.
 
     Raises:
-        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError: if shard and chunk table do not fit
-            the index.
+        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError, ShardUnreadableError: if shard and
+            chunk table do not fit the index, or cannot be read.
     """
 
     def __init__(
@@ -115,10 +116,15 @@ class Shard:
 
     def _check_size(self) -> None:
         """Check that the file is long enough for every chunk."""
-        try:
-            size = self.path.stat().st_size if self._remote is None else self._remote.size(self.name)
-        except FileNotFoundError as error:
-            raise self._missing() from error
+        if self._remote is not None:
+            size = self._remote.size(self.name)
+        else:
+            try:
+                size = self.path.stat().st_size
+            except FileNotFoundError as error:
+                raise self._missing() from error
+            except OSError as error:
+                raise self._unreadable(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
             raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")
@@ -131,6 +137,11 @@ class Shard:
 
     def _missing(self) -> ShardMissingError:
         return ShardMissingError(f"{self.path}: the index names this shard, but there is no such file")
+
+    def _unreadable(self, error: OSError) -> ShardUnreadableError:
+        return ShardUnreadableError(
+            f"{self.path}: cannot be read: {error.strerror or error}; check its permissions and the disk"
+        )
 
     @property
     def is_remote(self) -> bool:
@@ -225,6 +236,8 @@ class Shard:
             if self._remote is None:
                 raise self._missing() from error
             return self._remote.part(self.name).chunk(row)
+        except OSError as error:
+            raise self._unreadable(error) from error
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self.entries[history_id].rows(field))

@@ -31,7 +31,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import parse_manifest, read_manifest
+from icrl4aht_data.format.manifest import check_against_manifest, parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.addresses import without_credentials
 from icrl4aht_data.remote.download_note import read_note
@@ -73,15 +73,18 @@ class ReleaseLocation:
         return str(self.folder) if self.remote is None else self.remote.url
 
     def file(self, name: str) -> Path:
-        """Path of a complete file, fetched first if it is not downloaded.
+        """Path of a complete file, fetched first if it is not downloaded; one of meta/ is checked against the manifest.
 
         Raises:
             UnsafePathError: if it leads out of the release.
             RemoteError, OfflineError: if it cannot be fetched.
+            IndexFormatError, ChunkTableError: if it is not the one that the manifest lists.
         """
         path = resolve_inside(self.folder, name)
         if self.remote is not None:
             self.remote.fetch([name])
+        elif name.startswith("meta/"):
+            check_against_manifest(self.folder, [name])
         return path
 
     def below(self, name: str) -> Path:

@@ -12,6 +12,7 @@ import math
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -36,8 +37,8 @@ def cache_room() -> int:
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            return 0
+        with tempfile.TemporaryFile(dir=folder):  # permissions alone do not say whether it can be written
+            pass
         reusable = sum(size for _, size in _cached_sets(folder))
         return min(cache_limit(), shutil.disk_usage(folder).free + reusable)
     except OSError:
@@ -159,10 +160,11 @@ def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
 
 def _remove(path: Path) -> None:
     """Remove a file, a link or a folder, if it exists."""
-    if path.is_symlink() or path.is_file():
-        path.unlink(missing_ok=True)
-    else:
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def _cached_sets(folder: Path) -> list[tuple[Path, int]]:

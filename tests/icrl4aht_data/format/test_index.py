@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -10,10 +11,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
-import numpy as np
 import pytest
 
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
@@ -21,6 +19,7 @@ from icrl4aht_data.format import columns
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.utils import cache
+from tests.helpers.damages import DAMAGES, contents
 from tests.helpers.random_releases import long_index
 
 
@@ -150,29 +149,23 @@ def test_a_file_is_hashed_once_however_new_it_is(tmp_path, folder, monkeypatch):
     root = tmp_path / "release"
     entries = long_index(root)
     read_index(root)
-    monkeypatch.setattr(cache, "_hash", lambda path: pytest.fail("hashed again"))
+    monkeypatch.setattr(hashlib, "file_digest", lambda *_: pytest.fail("hashed again"))
     monkeypatch.setattr(columns, "_parse", lambda path: pytest.fail("parsed again"))
     assert read_index(root).entry(2999) == entries[2999]
 
 
-@pytest.mark.parametrize(
-    ("age", "fraction", "unsettled"),
-    [(50, 1, True), (150, 1, False), (150, 0, True), (1900, 0, True), (2100, 0, False)],
-)
-def test_when_a_files_times_show_every_change(monkeypatch, age, fraction, unsettled):
-    """Age in milliseconds; a clock that shows no parts of a millisecond is taken to tick every two seconds."""
-    changed = 1_700_000_000 * 10**9 + fraction
-    monkeypatch.setattr(cache.time, "time_ns", lambda: changed + age * 10**6)
-    status = SimpleNamespace(st_mtime_ns=changed, st_ctime_ns=changed - 10**9)
-    assert (cache._unsettled_ns(cast(os.stat_result, status)) > 0) == unsettled
-
-
 def test_a_damaged_cache_is_rebuilt(long, folder):
+    """Files of the cached columns are damaged, each in another way."""
     root, entries = long
     read_index(root)
     (made,) = cached(folder)
-    (folder / made / "T.npy").write_bytes(b"junk")
-    assert read_index(root).entry(2999) == entries[2999]
+    right = contents(folder / made)
+    assert len(right) > 3 * len(DAMAGES)
+    for (name, data), damage in zip(list(right.items())[::3], DAMAGES, strict=False):
+        DAMAGES[damage](folder / made / name)
+        index = read_index(root)
+        assert (index.entry(2999), index.entry(0)) == (entries[2999], entries[0]), (damage, name)
+        assert (folder / made / name).read_bytes() == data, (damage, name)
     shutil.rmtree(folder / made)
     assert read_index(root).entry(2999) == entries[2999]
 
@@ -237,18 +230,3 @@ def test_default_folders_follow_the_environment(monkeypatch):
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", "~/own")
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", "/data")
     assert (cache.cache_folder(), cache.data_folder()) == (Path("/home/someone/own"), Path("/data"))
-
-
-def test_the_least_used_arrays_make_room(folder, monkeypatch):
-    def build(path: Path) -> None:
-        np.save(path / "a.npy", np.zeros(1000, np.uint8))
-
-    monkeypatch.setenv("ICRL4AHT_CACHE_BYTES", "3500")
-    for key in ("one", "two", "three"):
-        cache.cached_arrays(key, 1128, build)
-    held = cache.cached_arrays("one", 1128, build)["a"]
-    cache.cached_arrays("four", 1128, build)
-    assert sorted(cached(folder)) == ["four", "one", "three"]
-    assert held.sum() == 0
-    with pytest.raises(cache.OptionError, match="raise ICRL4AHT_CACHE_BYTES"):
-        cache.cached_arrays("huge", 4000, build)

@@ -14,6 +14,7 @@ from generation.cli import cli as generation
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
+from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS
 from icrl4aht_data.interop import hf_episodes
@@ -267,11 +268,13 @@ class TestWithoutStates:
         for number, line in enumerate(lines):
             line["has_teammate_actions"] = number % 3 > 0
         index.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        write_manifest(tmp_path / "r")
         with pytest.raises(
             IndexFormatError, match=r"histories\.jsonl, line 1: expected has_teammate_actions true in a lite"
         ):
             load_icrl4aht(tmp_path / "r")
         info.write_text(json.dumps(json.loads(info.read_text()) | {"kind": "observations"}))
+        write_manifest(tmp_path / "r")
         dataset = load_icrl4aht(tmp_path / "r")
         assert dataset.column("has_teammate_actions").tolist() == [n % 3 > 0 for n in range(3000)]
 

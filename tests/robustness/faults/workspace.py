@@ -24,6 +24,7 @@ from icrl4aht_data.remote import partial_file
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
 from icrl4aht_data.remote.store import RetryPolicy
+from tests.helpers.damages import contents
 from tests.helpers.random_releases import random_release
 from tests.servers.common import Fault, Faults, Flip, Long, Request, Short
 from tests.servers.process import environment
@@ -220,12 +221,6 @@ class Workspace:
         rule = FaultRule(lambda request: None, times=np.inf, methods=methods)
         self.use_with_fault(target, rule, succeeds=True, stream=stream, default_folder=default_folder)
         return rule.seen
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """Return the content of each file below a folder, by relative path."""
-    paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
 def received(log: Iterable[Request], spoiled: Iterable[Request] = ()) -> set[tuple[str, int, int]]:

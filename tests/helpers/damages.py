@@ -1,0 +1,76 @@
+"""Ways in which a file can be damaged."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the content of each file below a folder, by relative path."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def flip_bit(path: Path, position: int = -1, bit: int = 0) -> None:
+    """Invert one bit of a file."""
+    data = bytearray(path.read_bytes())
+    data[position] ^= 1 << bit
+    path.write_bytes(bytes(data))
+
+
+def _flip_unnoticed(path: Path) -> None:
+    """Invert one bit and set the times back."""
+    before = path.stat()
+    flip_bit(path, before.st_size // 2, 3)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def _replace(path: Path) -> None:
+    """Put a valid file with another array in its place, as another program might."""
+    np.save(path.with_name("other.npy"), np.arange(7))
+    path.with_name("other.npy").replace(path)
+
+
+def _make_folder(path: Path) -> None:
+    path.unlink()
+    (path / "deep").mkdir(parents=True)
+
+
+def _make_link(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.with_name("nowhere"))
+
+
+def _make_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+DAMAGES: dict[str, Callable[[Path], None]] = {
+    "a bit flipped": flip_bit,
+    "a bit flipped, times as before": _flip_unnoticed,
+    "empty": lambda path: path.write_bytes(b""),
+    "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "longer": lambda path: os.truncate(path, path.stat().st_size + 1),
+    "missing": lambda path: path.unlink(),
+    "foreign": _replace,
+    "text": lambda path: path.write_text("hello\n"),
+    "a folder": _make_folder,
+    "a dangling link": _make_link,
+    "a pipe": _make_pipe,
+}
+"""Name -> function that damages a file, which exists."""
+
+
+def restore(path: Path, data: bytes) -> None:
+    """Write a file again, whatever is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+    path.write_bytes(data)

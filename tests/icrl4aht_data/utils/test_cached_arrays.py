@@ -1,0 +1,176 @@
+"""Sets of arrays in the cache folder: rebuilt on any mismatch, limited in size, errors that say what to do."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrl4aht_data.errors import CacheError, OptionError
+from icrl4aht_data.utils import cached_arrays as module
+from icrl4aht_data.utils import remembered
+from icrl4aht_data.utils.cached_arrays import cached_arrays, new_mapped_array
+from tests.helpers.damages import DAMAGES, contents, flip_bit
+from tests.robustness.limits import can_mount, file_size_limit, permissions_count, small_disk
+
+KEY = f"histories-{0:032x}"
+SIZE = 8 * 150_000 + 300
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty cache folder."""
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)  # so that no test has to wait long
+    return tmp_path / "cache"
+
+
+def build(path: Path) -> None:
+    new_mapped_array(path / "a.npy", (150_000,), np.dtype("i8"))[:] = np.arange(150_000)
+    np.save(path / "b.values.npy", np.array([b"x", b"yy"]))
+
+
+def check(arrays: dict[str, np.ndarray]) -> None:
+    assert sorted(arrays) == ["a", "b.values"]
+    assert np.array_equal(arrays["a"], np.arange(150_000))
+    assert arrays["b.values"].tolist() == [b"x", b"yy"]
+
+
+def test_a_set_is_built_once(folder):
+    for _ in range(2):
+        check(cached_arrays(KEY, SIZE, build))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_build", lambda *_: pytest.fail("built again"))
+        patch.setattr(remembered, "block_hash", lambda path: pytest.fail("hashed again"))
+        check(cached_arrays(KEY, SIZE, build))
+    assert [path.name for path in folder.iterdir()] == [KEY]  # no locks, nothing unfinished
+
+
+@pytest.mark.parametrize("small", [True, False], ids=["always hashed", "remembered"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_every_file_of_a_set_is_checked(folder, monkeypatch, damage, small):
+    monkeypatch.setattr(remembered, "_SMALL", 2**30 if small else 0)
+    cached_arrays(KEY, SIZE, build)
+    names = [name for name in contents(folder / KEY) if not name.startswith("checked-")]
+    assert names == ["a.npy", "b.values.npy", "contents.json"]
+    for name in contents(folder / KEY):
+        right = (folder / KEY / "a.npy").read_bytes()
+        DAMAGES[damage](folder / KEY / name)
+        check(cached_arrays(KEY, SIZE, build))
+        assert (folder / KEY / "a.npy").read_bytes() == right
+        assert [path.name for path in folder.iterdir()] == [KEY]
+
+
+@pytest.mark.parametrize("what", ["file", "link", "pipe", "empty folder", "other set", "array of other set"])
+def test_what_has_the_name_of_a_set_is_replaced(folder, what):
+    other = f"histories-{1:032x}"
+    cached_arrays(other, 8, lambda path: np.save(path / "a.npy", np.arange(3)))
+    target = folder / KEY
+    if what == "file":
+        target.write_text("hello")
+    elif what == "link":
+        target.symlink_to(folder / "nowhere")
+    elif what == "pipe":
+        os.mkfifo(target)
+    elif what == "empty folder":
+        target.mkdir()
+    elif what == "other set":
+        shutil.copytree(folder / other, target)
+    else:
+        cached_arrays(KEY, SIZE, build)
+        shutil.copy(folder / other / "a.npy", target / "a.npy")
+    check(cached_arrays(KEY, SIZE, build))
+    assert sorted(path.name for path in folder.iterdir()) == [KEY, other]
+
+
+def test_what_a_killed_process_left_is_in_nobodys_way(folder):
+    folder.mkdir()
+    (folder / f".{KEY}.partial").write_text("a file, not a folder")
+    (folder / f".{KEY}.lock").touch()
+    (folder / f".{KEY}.removed-1").mkdir()
+    check(cached_arrays(KEY, SIZE, build))
+    assert [path.name for path in folder.iterdir()] == [KEY]
+
+
+def test_the_least_used_arrays_make_room(folder, monkeypatch):
+    def build(path: Path) -> None:
+        np.save(path / "a.npy", np.zeros(1000, np.uint8))
+
+    one, two, three, four, huge = (f"{name}-{7:032x}" for name in ("one", "two", "three", "four", "huge"))
+    monkeypatch.setenv("ICRL4AHT_CACHE_BYTES", "3500")
+    (folder / "mine").mkdir(parents=True)  # what the package did not make is neither counted nor removed
+    np.save(folder / "mine" / "a.npy", np.zeros(9000, np.uint8))
+    for key in (one, two, three):
+        cached_arrays(key, 1128, build)
+    held = cached_arrays(one, 1128, build)["a"]
+    cached_arrays(four, 1128, build)
+    assert sorted(path.name for path in folder.iterdir()) == sorted([four, "mine", one, three])
+    assert held.sum() == 0
+    with pytest.raises(OptionError, match="raise ICRL4AHT_CACHE_BYTES"):
+        cached_arrays(huge, 4000, build)
+
+
+@pytest.mark.parametrize("below", [False, True])
+def test_a_cache_folder_that_is_a_file(tmp_path, monkeypatch, below):
+    path = tmp_path / "plain"
+    path.touch()
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(path / "below" if below else path))
+    assert module.cache_room() == 0
+    with pytest.raises(CacheError, match=r'plain.*: the cache folder cannot be used: .*ICRL4AHT_CACHE_DIR.*"stream"'):
+        cached_arrays(KEY, SIZE, build)
+    assert path.read_bytes() == b""
+
+
+def test_a_cache_folder_that_can_only_be_read(folder):
+    check(cached_arrays(KEY, SIZE, build))
+    folder.chmod(0o555)
+    (folder / KEY).chmod(0o555)
+    try:
+        with permissions_count():
+            check(cached_arrays(KEY, SIZE, build))  # what it has can be used
+            assert module.cache_room() == 0
+            with pytest.raises(CacheError, match="the cache folder cannot be used: Permission denied; free some space"):
+                cached_arrays(f"histories-{1:032x}", SIZE, build)
+    finally:
+        folder.chmod(0o755)
+        (folder / KEY).chmod(0o755)
+
+
+def test_a_limit_of_file_size_is_an_error_that_leaves_nothing(folder):
+    with file_size_limit(100_000), pytest.raises(CacheError, match=rf"{folder}: the cache folder has no room for"):
+        cached_arrays(KEY, SIZE, build)
+    assert not list(folder.iterdir())
+    check(cached_arrays(KEY, SIZE, build))
+
+
+@pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")
+@pytest.mark.parametrize("announced", [SIZE, 0], ids=["known before", "noticed while writing"])
+def test_a_full_disk_is_an_error_that_leaves_nothing(folder, announced):
+    with small_disk(folder, 2**20):
+        with pytest.raises(
+            CacheError, match=r"has no room for .*No space left on device, [\d,]+ bytes are free\); free"
+        ):
+            cached_arrays(KEY, announced, build)
+        assert not list(folder.iterdir())
+
+
+@pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")
+def test_unused_arrays_make_room_on_a_full_disk(folder):
+    with small_disk(folder, 2 * 2**20):
+        for number in range(3):
+            check(cached_arrays(f"histories-{number:032x}", SIZE, build))
+        assert [path.name for path in folder.iterdir()] == [f"histories-{2:032x}"]
+
+
+def test_new_arrays_take_their_space_at_once(tmp_path):
+    array = new_mapped_array(tmp_path / "a.npy", (3000, 70), np.dtype("u1"))
+    assert not array.any()
+    assert (tmp_path / "a.npy").stat().st_blocks * 512 >= 3000 * 70
+    array[2999] = 7
+    array.flush()
+    assert np.load(tmp_path / "a.npy")[2999].tolist() == [7] * 70
+    flip_bit(tmp_path / "a.npy", 10**5)
+    assert array.sum() == 70 * 7 + 1
