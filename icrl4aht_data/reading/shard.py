@@ -117,12 +117,15 @@ class Shard:
 
     def _check_size(self) -> None:
         """Check that the file is long enough for every chunk."""
-        try:
-            size = self.path.stat().st_size if self._remote is None else self._remote.size(self.name)
-        except FileNotFoundError as error:
-            raise self._missing() from error
-        except OSError as error:
-            raise self._unreadable(error) from error
+        if self._remote is not None:
+            size = self._remote.size(self.name)
+        else:
+            try:
+                size = self.path.stat().st_size
+            except FileNotFoundError as error:
+                raise self._missing() from error
+            except OSError as error:
+                raise self._unreadable(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
             raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")

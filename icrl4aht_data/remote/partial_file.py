@@ -12,7 +12,6 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
 
@@ -26,6 +25,7 @@ from icrl4aht_data.utils.cache import cache_limit, data_folder
 from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.fork import ForkSafeLock
 from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.locks import in_new_folder
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -105,10 +105,7 @@ class PartialFile:
             OSError: if the disk is full or not writable, or the path is a link.
         """
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
-        while True:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with suppress(FileNotFoundError):  # another process has just removed the folder, which was empty
-                return os.fdopen(os.open(self.path, flags, 0o666), "r+b")
+        return in_new_folder(self.path, lambda: os.fdopen(os.open(self.path, flags, 0o666), "r+b"))
 
     def cache(self, fetched: ByteRange, data: bytes) -> None:
         """Write bytes that can be fetched again at any time; keep their chunks in memory if the disk is full."""

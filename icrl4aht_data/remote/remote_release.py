@@ -83,7 +83,7 @@ class ReleaseLocation:
         path = resolve_inside(self.folder, name)
         if self.remote is not None:
             self.remote.fetch([name])
-        if name.startswith("meta/"):
+        elif name.startswith("meta/"):
             check_against_manifest(self.folder, [name])
         return path
 
