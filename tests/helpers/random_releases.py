@@ -93,7 +93,7 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
-        tasks.append(NewTask(task, Provenance(seed=seed), streams, lambda histories=histories: histories))
+        tasks.append(NewTask(task, Provenance(seed=task.seed), streams, lambda histories=histories: histories))
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)
     return written

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import FormatTooNewError, OptionError
+from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import INFO, Kind
 from icrl4aht_data.writing.combine import combine_releases
 from tests.helpers.random_releases import random_release
@@ -74,10 +75,12 @@ def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
         combine_releases(a, [a, d])
     info = json.loads((d / INFO).read_text())
     (d / INFO).write_text(json.dumps(info | {"data_version": "0.0.2"}))
+    write_manifest(d)
     with pytest.raises(OptionError, match=r"data versions 0\.0\.1, 0\.0\.2: say which one"):
         combine_releases(tmp_path / "out", [a, d])
     combine_releases(tmp_path / "out", [a, d], "0.1.0")
     assert json.loads((tmp_path / "out" / INFO).read_text())["data_version"] == "0.1.0"
     (d / INFO).write_text(json.dumps(info | {"format_version": 99}))
+    write_manifest(d)
     with pytest.raises(FormatTooNewError, match="format version 99"):
         combine_releases(tmp_path / "new", [a, d])
