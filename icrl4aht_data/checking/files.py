@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,11 @@ from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import HISTORIES, MANIFEST, PROVENANCE, TEAMMATES
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.remote.remote_release import ReleaseLocation
+from icrl4aht_data.utils.files import plain_size
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
 
@@ -27,6 +29,8 @@ def check_files(
     origin: ReleaseLocation, listed: Mapping[str, str], chosen: set[str], report: Report, advance: NamedProgress
 ) -> None:
     """Check that the chosen files exist with the manifest's hashes, and that no unlisted files do.
+
+    Sizes come first: a file may have grown to a terabyte with a hole, whose hash would take hours.
 
     Args:
         origin: the release.
@@ -43,12 +47,15 @@ def check_files(
     for name in sorted(present - listed.keys() - {MANIFEST}):
         if not name.startswith(_HUB_FILES):
             report.add(name, "not listed in the manifest")
-    both = sorted(expected & present)
+    both, sizes = sorted(expected & present), {} if quick else _recorded_sizes(root, listed)
     for number, name in enumerate(both, start=1):
         try:
             path = resolve_inside(root, name)
-            if path.stat().st_size > LARGEST and not _is_covered(root, name):
-                report.add(name, f"expected at most {LARGEST:,} bytes, found {path.stat().st_size:,}")
+            size, right = path.stat().st_size, sizes.get(name)
+            if right is None and size > LARGEST:
+                right = _covered_size(root, name)
+            if right is not None and size != right:
+                report.add(name, f"expected {right:,} bytes, found {size:,}")
                 continue
             found = listed[name] if quick else file_hash(path)
         except (Icrl4ahtError, OSError) as error:
@@ -60,13 +67,41 @@ def check_files(
         advance("files", number, len(both))
 
 
-def _is_covered(root: Path, name: str) -> bool:
-    """Return whether a file is a shard whose chunk table covers every byte; other huge files, which may be sparse, are
-    not worth hashing."""
+def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
+    """Return the sizes of shards in meta/info.json, if that file is the one that the manifest lists."""
+    try:
+        path = resolve_inside(root, INFO)
+        plain_size(path, LARGEST)
+        return read_info(root).shards if file_hash(path) == listed.get(INFO) else {}
+    except (Icrl4ahtError, OSError):  # reported elsewhere
+        return {}
+
+
+def _covered_size(root: Path, name: str) -> int:
+    """Return the size of a shard by its chunk table, which covers every byte; no other file is this large."""
     if not name.startswith("data/"):
-        return False
-    table = read_table(resolve_inside(root, chunk_table_name(name)))
-    return int(table["size"].sum(dtype=np.int64)) == (root / name).stat().st_size
+        return LARGEST
+    return int(read_table(resolve_inside(root, chunk_table_name(name)))["size"].sum(dtype=np.int64))
+
+
+def check_references(listed: Iterable[str], index: Index, tasks: Iterable[Task], report: Report) -> None:
+    """Check that shards, chunk tables and policies in the manifest are those of a history or a task.
+
+    Args:
+        listed: the files of the manifest.
+        index: the release's index.
+        tasks: its tasks.
+        report: receives the problems.
+    """
+    shards = index.values("shard")
+    known = {*shards, *map(chunk_table_name, shards)}
+    teammates = {task.teammate["theta"]["sha256"] for task in tasks if task.teammate.get("kind") == "rl"}
+    for name in sorted(listed):
+        top, folder = name.split("/")[0], name.split("/")[1:2]
+        if (top == "data" or name.startswith("meta/chunks/")) and name not in known:
+            report.add(name, "no history of the index is in this shard")
+        if top == TEAMMATES and folder and folder[0] not in teammates:
+            report.add(name, "no task has this teammate")
 
 
 def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:

@@ -20,7 +20,7 @@ _ROUNDING = 1e-3  # of the means that a stream filter records
 
 
 def check_provenance(index: Index, tasks: Sequence[Task], report: Report) -> None:
-    """Check what provenance says of each task: its learner, its streams, the filter, and the source of its labels.
+    """Check what provenance says of each task's learner, its streams and their filter; see also `files.check_experts`.
 
     Args:
         index: the release's index.
@@ -30,7 +30,8 @@ def check_provenance(index: Index, tasks: Sequence[Task], report: Report) -> Non
     try:
         provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
     except Icrl4ahtError as error:
-        report.add(PROVENANCE, str(error))
+        if PROVENANCE not in report.files_at_fault:
+            report.add(PROVENANCE, str(error))
         return
     members: dict[str, list[Entry]] = defaultdict(list)
     for entry in index.entries:
@@ -55,19 +56,11 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
     environments = None if found.ego is None else found.ego["environments"]
     if None not in (environments, found.streams_recorded) and environments != found.streams_recorded:
         yield f"streams_recorded: expected the learner's {environments} environments, found {found.streams_recorded}"
+    names = found.suite and found.suite.algorithms
+    names = names.get(entries[0].layout) if isinstance(names, dict) else names
+    if names is not None and entries[0].teammate_kind not in names:
+        yield f"suite.algorithms: {names}, but the teammate is of {entries[0].teammate_kind}"
     yield from _stream_faults(found, entries)
-    expert = found.expert
-    expected = {
-        "expert_return": expert and expert.return_greedy,
-        "expert_return_sampled": expert and expert.return_sampled,
-        "expert_step": expert and expert.step,
-    }
-    for name, value in expected.items():
-        wrong = [entry for entry in entries if getattr(entry, name) != value]
-        if wrong:
-            yield (
-                f"history {wrong[0].history_id}: {name}: the index says {getattr(wrong[0], name)}, provenance {value}"
-            )
 
 
 def _stream_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:

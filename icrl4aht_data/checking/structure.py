@@ -32,6 +32,11 @@ def check_bytes_between(shard: Shard) -> list[str]:
     return faults
 
 
+def has_grown(shard: Shard) -> bool:
+    """Return whether a shard is far larger than its chunk table says."""
+    return shard.path.stat().st_size > 2 * int(shard.table["size"].sum(dtype=np.int64)) + 2**20
+
+
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
     """Differences between what another HDF5 reader sees and what `Shard` reads.
 

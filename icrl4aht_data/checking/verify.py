@@ -10,16 +10,23 @@ from pathlib import Path
 from typing import get_args
 
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.checking.files import check_checkpoints, check_experts, check_files, check_shard_sizes
+from icrl4aht_data.checking.files import (
+    check_checkpoints,
+    check_experts,
+    check_files,
+    check_references,
+    check_shard_sizes,
+)
 from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
+from icrl4aht_data.checking.provenance import check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
-from icrl4aht_data.checking.structure import check_bytes_between, check_structure
+from icrl4aht_data.checking.structure import check_bytes_between, check_structure, has_grown
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
+from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, KINDS, MANIFEST, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
@@ -100,7 +107,6 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if origin.remote is not None and report.level != "quick":
         _fetch(origin.remote, sorted(chosen), report, advance)
     check_files(origin, listed, chosen, report, advance)
-    check_names(origin.folder, listed, report)
     if unreadable is not None:
         report.add("meta", str(unreadable))
         return
@@ -110,19 +116,21 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
-    if index.info.format_version < STRONG_HASHES:
+    if "hash" not in (CHUNK_DTYPES[index.info.format_version].names or ()):
         report.notes.append(
             f"format version {index.info.format_version}: its chunk tables have no strong hashes, only CRC-32, which "
             f"finds accidents but no forgery; `icrl4aht-data convert` brings it to version {FORMAT_VERSION}"
         )
+    check_references(listed, index, tasks, report)
     check_provenance(index, tasks, report)
-    check_index(index, tasks, chosen, report)
+    check_index(index, tasks, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
-    check_shard_sizes(origin, index, shards, report)
-    if report.level != "quick":
+    if report.level == "quick":
+        check_shard_sizes(origin, index, shards, report)
+    else:
         check_checkpoints(origin.folder, tasks, report)
         check_experts(index, report)
         _check_shards(index, shards, report, advance)
@@ -148,7 +156,10 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue
-        for fault in check_bytes_between(shard) + check_structure(shard, values=report.level == "deep"):
+        faults = check_bytes_between(shard)
+        if not has_grown(shard):  # libhdf5 is not given a file that may have a hole of a terabyte
+            faults += check_structure(shard, values=report.level == "deep")
+        for fault in faults:
             report.add(name, fault)
         damaged = check_chunks(shard, report)
         contents: dict[tuple[str, bytes], int] = {}

@@ -21,13 +21,19 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
+from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.paths import resolve_inside
 
-_SEMVER = re.compile(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?")
+_NUMBER = r"(0|[1-9]\d*)"
+_PRERELEASE = r"(0|[1-9]\d*|\d*[A-Za-z-][0-9A-Za-z-]*)"
+_SEMVER = re.compile(
+    rf"{_NUMBER}\.{_NUMBER}\.{_NUMBER}(-{_PRERELEASE}(\.{_PRERELEASE})*)?(\+[0-9A-Za-z-]+(\.[0-9A-Za-z-]+)*)?", re.ASCII
+)
+
+_VERSION_LENGTH = 100  # characters
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
@@ -153,9 +159,9 @@ class ReleaseInfo:
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
         try:
-            check_name(info.data_version)
-        except IndexFormatError as error:
-            raise IndexFormatError(f"data_version: {error}") from error
+            check_version(info.data_version)  # it names tags and folders
+        except OptionError as error:
+            raise IndexFormatError(str(error)) from error
         if len(content["environment"]) != 2:
             raise IndexFormatError("environment: expected max_steps and kept_steps only")
         return info
@@ -204,8 +210,8 @@ def check_version(version: str) -> str:
     Raises:
         OptionError: if it does not have the form of SemVer.
     """
-    if not _SEMVER.fullmatch(version):
-        raise OptionError(f"data version {version!r}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
+    if len(version) > _VERSION_LENGTH or not _SEMVER.fullmatch(version):
+        raise OptionError(f"data version {version[:100]!r}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
     return version
 
 

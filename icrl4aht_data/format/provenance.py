@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -164,6 +164,8 @@ class Provenance:
         try:
             found = msgspec.convert({name: value for name, value in content.items() if name in known}, cls)
             msgspec.convert(found.ego, _EgoScale | None)
+            if found.teammate is not None:
+                msgspec.convert(found.teammate, _TeammateSetting)
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
         return replace(found, other={name: value for name, value in content.items() if name not in known})
@@ -175,6 +177,13 @@ class _EgoScale:
 
     total_steps: int
     environments: int
+
+
+class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
+    """How a teammate played. What it is, its task says, whose id is a hash of it: nothing here may say otherwise."""
+
+    slot: Literal[1]
+    noise: str | None = None
 
 
 def read_provenance(path: Path) -> dict[str, Provenance]:

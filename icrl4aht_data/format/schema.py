@@ -185,7 +185,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     history_id: _Int
     task_id: _Name
-    env_idx: _Int
+    env_idx: _Row
     T: Annotated[int, Meta(gt=0, lt=LONGEST)]
     obs_shape: tuple[int, int, int]
     action_dim: _Int

@@ -23,6 +23,7 @@ from filelock import Timeout
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
 from icrl4aht_data.utils.cache import CACHE_VARIABLES, cache_folder, cache_limit
 from icrl4aht_data.utils.files import add_filename, allocate, sync
+from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.utils.remembered import read_checked_json, remembered_block_hashes, write_checked_json
 
 _CONTENTS = "contents.json"

@@ -2,10 +2,10 @@
 
 The published code keeps all histories in `histories.h5`, one group each, with observations as float32 in gzip-6 chunks
 of 4096 steps and action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3).
-Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl`, `provenance.json` and a
-manifest, which the published readers ignore; converted back they lose only the checkpoints of learned teammates. Files
-without states, which observations do not determine, become a release of observations; files without tasks one that
-knows its tasks by name.
+Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl`, `provenance.json` and
+`files.sha256`, which the published readers ignore; converted back they lose only the checkpoints of learned teammates.
+Files without states, which observations do not determine, become a release of observations; files without tasks one
+that knows its tasks by name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_tasks
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
-from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.safe_hdf5 import exists, member, read_dataset
 from icrl4aht_data.format.schema import (
@@ -47,7 +46,13 @@ from icrl4aht_data.utils.paths import resolve_inside
 from icrl4aht_data.utils.validation import check_int
 from icrl4aht_data.writing.hdf5_sink import new_hdf5
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, atomic_folder, check_target
+from icrl4aht_data.writing.release_folder import (
+    HISTORIES_H5,
+    HISTORIES_INDEX,
+    atomic_folder,
+    check_target,
+    write_listing,
+)
 from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays
 
 PUBLISHED_CHUNK = 4096
@@ -103,7 +108,7 @@ def to_published(
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
         kept = {task_id: of_task.to_json() for task_id, of_task in provenance.items() if task_id in wanted}
         write_json(folder / "provenance.json", kept)
-        write_manifest(folder)
+        write_listing(folder)
     return target
 
 

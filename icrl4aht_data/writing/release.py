@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import describe, shard_sizes
+from icrl4aht_data.format.info import check_version, describe, shard_sizes
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
@@ -126,6 +126,7 @@ def write_release(
             twice, if only some tasks are known by name only, or if a history's arrays are missing, of unequal length or
             lossy.
     """
+    check_version(data_version)
     new = list(tasks)
     ids = [task.task.task_id for task in new]
     if not new or len(set(ids)) < len(ids):
@@ -236,6 +237,10 @@ class _ShardWriter:
     def _entry(self, new: NewTask, history: NewHistory) -> Entry:
         """Return the index entry of a history, without id and position in a shard."""
         arrays, task = history.arrays, new.task
+        if not 0 <= history.env_idx < 2**63:
+            raise OptionError(
+                f"task {task.task_id}: env_idx: expected a stream's number from 0, found {history.env_idx}"
+            )
         needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():
             raise OptionError(f"task {task.task_id}: a history has no arrays {sorted(needed - arrays.keys())}")

@@ -13,20 +13,24 @@ from pathlib import Path
 
 from filelock import Timeout
 
-from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import explain_full_disk
+from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.locks import lock_beside, process_lock
-from icrl4aht_data.utils.paths import files_below
+from icrl4aht_data.utils.paths import files_below, resolve_inside
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
 """File names of the published code."""
 
-_OWN = ((INFO, HISTORIES), (HISTORIES_H5, HISTORIES_INDEX))
-"""Files of a release, and of converted published files: a manifest of ours lists one of these pairs."""
+PUBLISHED_FILES = (HISTORIES_H5, HISTORIES_INDEX, "tasks.jsonl", "provenance.json")
+"""Files that a conversion to the published format writes."""
+
+LISTING = "files.sha256"
+"""Their hashes, in sha256sum's format."""
 
 Snapshot = dict[str, tuple[int, int, int]]
 """File of a folder -> its inode, size and time of change in nanoseconds."""
@@ -116,6 +120,24 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     return before
 
 
+def write_listing(folder: Path) -> None:
+    """Write the hashes of converted published files next to them."""
+    names = [name for name in PUBLISHED_FILES if (folder / name).is_file()]
+    (folder / LISTING).write_text("".join(f"{file_hash(folder / name)}  {name}\n" for name in names), encoding="utf-8")
+
+
+def _read_listing(folder: Path) -> dict[str, str]:
+    """Return the hashes that `write_listing` wrote.
+
+    Raises:
+        IndexFormatError: if there is no such file, or if it has another form.
+    """
+    lines = [line.split("  ", 1) for line in read_text(resolve_inside(folder, LISTING)).splitlines()]
+    if not all(len(line) == 2 and line[1] in PUBLISHED_FILES for line in lines):
+        raise IndexFormatError(f"{folder / LISTING}: expected hashes of {', '.join(PUBLISHED_FILES)}")
+    return {name: digest for digest, name in lines}
+
+
 def _snapshot(folder: Path) -> Snapshot:
     statuses = {name: (folder / name).lstat() for name in files_below(folder)} if folder.is_dir() else {}
     return {name: (status.st_ino, status.st_size, status.st_mtime_ns) for name, status in statuses.items()}
@@ -126,18 +148,16 @@ def _foreign_content(folder: Path, present: Iterable[str]) -> str | None:
     if not folder.is_dir():
         return "is not a folder"
     try:
-        listed = read_manifest(folder)
+        own, listed = (MANIFEST, read_manifest(folder)) if MANIFEST in present else (LISTING, _read_listing(folder))
     except Icrl4ahtError as error:
         return f"is not a release: {error}"
-    if not any(set(names) <= listed.keys() for names in _OWN):
-        return f"is not a release: its {MANIFEST} does not list {INFO}"
-    for name in sorted(present):
-        if name == MANIFEST:
-            continue
+    if not {INFO, HISTORIES} <= listed.keys() and not {HISTORIES_H5, HISTORIES_INDEX} <= listed.keys():
+        return f"is not a release: its {own} does not list {INFO}"
+    for name in sorted(set(present) - {own}):
         if name not in listed:
-            return f"has {name}, which its manifest does not list"
+            return f"has {name}, which its {own} does not list"
         if (folder / name).is_symlink() or file_hash(folder / name) != listed[name]:
-            return f"{name} is not the file that was written, its hash differs from the manifest"
+            return f"{name} is not the file that was written, its hash differs from {own}"
     return None
 
 
@@ -147,4 +167,9 @@ def _replace(target: Path, new: Path, old: Path, overwrite: bool, before: Snapsh
         if not overwrite or _snapshot(target) != before:
             raise OptionError(f"{target}: was changed while its replacement was written; nothing is replaced")
         target.rename(old)
-    new.rename(target)
+    try:
+        new.rename(target)
+    except OSError:
+        if old.exists():
+            old.rename(target)
+        raise

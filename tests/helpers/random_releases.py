@@ -99,7 +99,7 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays))
-        made = Provenance(seed=seed, expert=experts[number] if experts else None)
+        made = Provenance(seed=task.seed, expert=experts[number] if experts else None)
         source = sources[number] if sources else "ppo"
         tasks.append(NewTask(task, made, streams, lambda histories=histories: histories, source=source))
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}

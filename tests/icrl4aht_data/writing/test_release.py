@@ -22,12 +22,12 @@ from hypothesis import strategies as st
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError, RootNotFoundError
 from icrl4aht_data.format.chunks import decode_chunk, encode_chunk
-from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, episode_returns
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import make_tasks, random_history, random_release
@@ -243,8 +243,10 @@ def test_only_releases_are_replaced(tmp_path):
     (tmp_path / "mine" / "thesis.txt").write_text("years")
     (tmp_path / "listed").mkdir()
     (tmp_path / "listed" / "thesis.txt").write_text("years")
-    write_manifest(tmp_path / "listed")
-    for name, fault in {"file": "is not a folder", "mine": "is not a release", "listed": "does not list"}.items():
+    (tmp_path / "listed" / "MANIFEST.sha256").write_text(
+        f"{file_hash(tmp_path / 'listed' / 'thesis.txt')}  thesis.txt\n"
+    )
+    for name, fault in {"file": "is not a folder", "mine": "is not a release", "listed": "is not a release"}.items():
         with pytest.raises(OptionError, match="exists"):
             random_release(tmp_path / name)
         with pytest.raises(OptionError, match=fault):

@@ -1,0 +1,149 @@
+"""Lies in meta/ under a valid manifest: `verify_release` compares every value with what it can compute."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE, TASKS
+from icrl4aht_data.writing.convert import to_release
+from tests.helpers.random_releases import SHARD, random_release
+from tests.robustness.limits import time_limit
+
+Change = Callable[[Any], Any]
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> Path:
+    """The bundled histories of a task with a learned teammate. Read only."""
+    dataset = load_icrl4aht(layout="cramped_up", teammate_kind="fcp")
+    return to_release(dataset.filter(task_id=dataset.entries[0].task_id), tmp_path_factory.mktemp("meta") / "r", "lite")
+
+
+def problems(root: Path, level: Any = "quick") -> list[str]:
+    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
+
+
+def spoiled(source: Path, target: Path, name: str, change: Change) -> Path:
+    """Copy a release, change one of its JSON files (a list of all lines of a JSONL file), and write its manifest."""
+    shutil.copytree(source, target)
+    path, is_lines = target / name, name.endswith("jsonl")
+    lines = path.read_text().splitlines()
+    content = [json.loads(line) for line in lines] if is_lines else json.loads("\n".join(lines))
+    change(content)
+    path.write_text("".join(json.dumps(line) + "\n" for line in content) if is_lines else json.dumps(content))
+    write_manifest(target)
+    return target
+
+
+def first(content: dict[str, Any]) -> dict[str, Any]:
+    return next(iter(content.values()))
+
+
+def test_the_unspoiled_release_is_valid(learned):
+    assert problems(learned) == problems(learned, "deep") == []
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (PROVENANCE, lambda c: first(c)["teammate"].update(kind="heuristic"), "Object contains unknown field `kind`"),
+        (PROVENANCE, lambda c: first(c)["teammate"].update(theta={}), "Object contains unknown field `theta`"),
+        (PROVENANCE, lambda c: first(c)["teammate"].update(slot=0), "Invalid enum value 0"),
+        (PROVENANCE, lambda c: c.update(more=first(c)), "task 'more': has no history"),
+        (PROVENANCE, lambda c: c.pop(next(iter(c))), "': missing"),
+        (PROVENANCE, lambda c: first(c).update(seed=77), "seed: expected the task's"),
+        (PROVENANCE, lambda c: first(c)["ego"].update(clip=0.3), "ego_hash: expected"),
+        (PROVENANCE, lambda c: first(c).update(ego_hash="0" * 16), "ego_hash: expected"),
+        (PROVENANCE, lambda c: first(c).update(streams_recorded=17), "expected the learner's 16 environments"),
+        (PROVENANCE, lambda c: first(c).update(streams_kept=1), "streams_kept: expected at least the 8 histories"),
+        (PROVENANCE, lambda c: first(c).update(streams_kept=17), "streams_kept: expected at most the 16 recorded"),
+        (PROVENANCE, lambda c: first(c)["filter"]["before"].update(streams=9), "filter.before.streams: expected 16"),
+        (PROVENANCE, lambda c: first(c)["filter"]["after"].update(return_end=9.0), "filter.after.return_end: the"),
+        (PROVENANCE, lambda c: first(c)["suite"].update(algorithms=["brdiv"]), "but the teammate is of fcp"),
+        (HISTORIES, lambda c: c[3].update(env_idx=-1), "Expected `int` >= 0"),
+        (HISTORIES, lambda c: c[3].update(env_idx=16), "env_idx 16, but 16 streams were recorded"),
+        (HISTORIES, lambda c: c[3].update(source="human"), "of one task: unlike ['source']"),
+        (HISTORIES, lambda c: c[3].update(expert_return=7.0), "of one task: unlike ['expert_return']"),
+        (HISTORIES, lambda c: [line.update(teammate_kind="territory") for line in c], "'territory' is of another fam"),
+        (INFO, lambda c: c.update(data_version="../.."), "data version '../..': expected one such as 1.0.0"),
+        (INFO, lambda c: c.update(data_version="1.0"), "data version '1.0': expected one such as 1.0.0"),
+        (INFO, lambda c: c.update(data_version="01.0.0"), "data version '01.0.0': expected one such as 1.0.0"),
+        (INFO, lambda c: c.update(data_version="1.0.0-.."), "data version '1.0.0-..': expected one such as 1.0.0"),
+        (INFO, lambda c: c.update(homepage="https://example.org"), "homepage: an unknown field"),
+        (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
+    ],
+)
+def test_lies(learned, tmp_path, name, change, message):
+    found = problems(spoiled(learned, tmp_path / "release", name, change))
+    assert any(message in problem for problem in found), found
+
+
+def test_a_teammate_in_provenance_is_not_used(learned, tmp_path):
+    """This once replaced the teammate of the task, whose id is a hash of it."""
+    root = spoiled(learned, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
+    with pytest.raises(IndexFormatError, match="unknown field `family`"):
+        load_icrl4aht(root).recover_teammate(0)
+    with pytest.raises(IndexFormatError, match="unknown field `family`"):
+        read_provenance(root / PROVENANCE)
+
+
+def test_unsafe_versions_are_not_written(learned, tmp_path):
+    with pytest.raises(ReleaseError, match=r"data version '\.\./\.\.'"):
+        load_icrl4aht(spoiled(learned, tmp_path / "bad", INFO, lambda c: c.update(data_version="../..")))
+    from icrl4aht_data.writing.release import write_release
+
+    with pytest.raises(OptionError, match="data version '1': expected"):
+        write_release(tmp_path / "out", "lite", [], data_version="1")
+
+
+def test_lies_in_a_release_without_tasks(converted_release, tmp_path):
+    for number, (change, message) in enumerate(
+        (
+            (lambda c: [line.update(seed=3) for line in c], "seed: expected -1 without tasks, found 3"),
+            (lambda c: c[0].update(task_id=c[-1]["task_id"]), "of one task: unlike"),
+        )
+    ):
+        found = problems(spoiled(converted_release, tmp_path / str(number), HISTORIES, change))
+        assert any(message in problem for problem in found), found
+
+
+def test_files_that_nothing_refers_to(learned, tmp_path):
+    root = tmp_path / "release"
+    shutil.copytree(learned, root)
+    policy = next(root.glob("teammates/*"))
+    shutil.copytree(policy, policy.with_name("0" * 64))
+    shard = next(root.rglob("*.h5"))
+    shutil.copy(shard, shard.with_name("train-00001-of-00002.h5"))
+    write_manifest(root)
+    found = "\n".join(problems(root))
+    assert "train-00001-of-00002.h5: no history of the index is in this shard" in found
+    assert f"teammates/{'0' * 64}/policy.json: no task has this teammate" in found
+
+
+@pytest.mark.parametrize("with_info", [True, False])
+def test_a_shard_with_a_hole_of_a_terabyte(damaged, with_info):
+    os.truncate(damaged / SHARD, 10**12)
+    if not with_info:
+        (damaged / INFO).unlink()
+    for level in ("quick", "full", "deep"):
+        with time_limit(20):
+            assert any("bytes, found 1,000,000,000,000" in problem for problem in problems(damaged, level))
+
+
+def test_version_2_has_no_strong_hashes(learned, tmp_path):
+    random_release(tmp_path / "new", layouts=("demo_wide",), streams=1)
+    assert not verify_release(tmp_path / "new").notes
+    old = spoiled(tmp_path / "new", tmp_path / "old", INFO, lambda c: c.update(format_version=2))
+    assert any("no strong hashes" in note for note in verify_release(old).notes)
+    assert (old / TASKS).is_file()
