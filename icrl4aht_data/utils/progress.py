@@ -30,8 +30,7 @@ class LineProgress(Progress):
         edges: also print a line when a bar first moves, and one when the progress is stopped.
         of_bytes: the numbers are bytes.
         clock: returns the time in seconds.
-        interval: seconds between two lines, by default `LINE_SECONDS`; None for no thread, the caller then calls
-            `print_lines`.
+        interval: seconds between two lines; None for no thread, the caller then calls `print_lines`.
         options: of Rich's `Progress`.
     """
 
@@ -43,12 +42,11 @@ class LineProgress(Progress):
         edges: bool = False,
         of_bytes: bool = False,
         clock: Callable[[], float] = time.monotonic,
-        interval: float | None = 0.0,
+        interval: float | None = LINE_SECONDS,
         **options: Any,
     ) -> None:
         self._has_lines = not quiet and not console.is_terminal
-        self._edges, self._of_bytes = edges, of_bytes
-        self._interval = LINE_SECONDS if interval == 0 else interval
+        self._edges, self._of_bytes, self._interval = edges, of_bytes, interval
         self._moved: set[TaskID] = set()
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from generation.progress import ProgressBoard, progress_bars
 from icrl4aht_data.commands import options
-from icrl4aht_data.utils import progress
 from icrl4aht_data.utils.progress import LineProgress
 
 
@@ -133,7 +132,7 @@ def test_terminals_get_bars_and_quiet_commands_nothing(terminal, quiet):
 
 
 def test_bars_of_commands_have_lines_on_stderr(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "LINE_SECONDS", 0.02)
+    monkeypatch.setitem(LineProgress.__init__.__kwdefaults__, "interval", 0.02)
     with options.bars(of_bytes=True) as show:
         show("download", 3_000_000, 10_000_000)
         for _ in range(500):
