@@ -150,7 +150,7 @@ class History:
 
     @property
     def expert_actions(self) -> LazyArray:
-        """(T,) int32: greedy actions of the final ego at the same steps, 0..5 (paper, App. D.1)."""
+        """(T,) int32: greedy actions of a checkpoint of the ego at the same steps, 0..5 (paper, App. D.1)."""
         return self._lazy("expert_actions")
 
     @property
