@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
+import pytest
 from click.testing import CliRunner
 
 from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.commands.options import run as run_command
+from tests.helpers.paths import ROOT
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
@@ -56,6 +60,31 @@ def test_errors_become_one_line_and_exit_code_1(tmp_path):
     assert result.stderr.startswith("error: ")
     assert "no release here" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
+def test_output_that_was_closed_from_the_start_is_dropped(lite, monkeypatch, arguments, code):
+    """`list >&-` was an AttributeError with a traceback."""
+    monkeypatch.setattr(sys, "argv", ["icrl4aht-data", *arguments, str(lite[0])])
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    with pytest.raises(SystemExit) as stopped:
+        run_command(cli)
+    assert stopped.value.code == code
+    for stream in (sys.stdout, sys.stderr):
+        assert stream.name == os.devnull
+        stream.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "generation --help"])
+def test_a_reader_that_has_gone_stops_a_command_quietly(program):
+    reader, writer = os.pipe()
+    os.close(reader)
+    arguments = [sys.executable, "-m", *program.split()]
+    result = subprocess.run(arguments, stdout=writer, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    os.close(writer)
+    assert (result.returncode, result.stderr) == (1, "")
 
 
 def test_version():
