@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from icrl4aht_data.errors import OfflineError, RemoteError
 from icrl4aht_data.remote.store import RetryPolicy, Store, WrongLengthError, http_status, offline, wrap_remote_errors
-from icrl4aht_data.utils.locks import cached_property
+from icrl4aht_data.utils.forks import cached_property
 
 
 class HubStore(Store):

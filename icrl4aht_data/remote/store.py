@@ -14,7 +14,7 @@ from email.utils import parsedate_to_datetime
 from typing import Any, TypeVar
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
-from icrl4aht_data.utils.locks import ForkSafeLock
+from icrl4aht_data.utils.forks import ForkSafeLock
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
