@@ -24,7 +24,6 @@ from generation.collection.task_folder import (
     resumable_settings,
 )
 from generation.env import Environment
-from generation.learners.checkpoint import write_policy
 from generation.learners.ego import Learner, compiled_update
 from generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock
 from generation.policy import Noise
@@ -106,6 +105,7 @@ def _learn(
             if pending is not None:
                 write(*pending)
             pending = number, rollout, metrics
+            writer.write_checkpoint(number + 1, learner.network, state.params, {"task_id": task.task_id})
             if interval.due(number + 1):
                 write(*pending)
                 pending = None
@@ -115,8 +115,6 @@ def _learn(
                 writer.add_recording_time(time.perf_counter() - began)
     finally:
         writer.close()
-    steps = profile.ego.updates * profile.ego.steps_per_update
-    write_policy(partial, learner.network, state.params, {"task_id": task.task_id, "steps": steps})
 
 
 def _resume(learner: Learner, task: Task, saved: StateFile) -> tuple[Any, int]:

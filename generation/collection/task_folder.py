@@ -4,7 +4,7 @@
   metadata.json       task, settings, versions, SHA-256 of the files below
   state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
   metrics.jsonl       one line per update
-  policy.safetensors policy.json   the final ego
+  checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
   timing.jsonl        wall-clock figures, not hashed
 <task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
 .<task_id>.lock       held by the collector that works on it
@@ -25,9 +25,10 @@ import jax
 import numpy as np
 
 from generation.collection.record import HistoryArrays, array_shapes, record_rollout
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
 from generation.learners.config import PPOConfig
-from generation.learners.resume import METRICS, TIMING, RunLog, software_versions
+from generation.learners.network import ActorCritic
+from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
@@ -37,7 +38,8 @@ from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
 FILTER_CURVES = "filter.png"
 
-_HASHED = {f"{name}.npy" for name in HistoryArrays._fields} | {METRICS, POLICY_WEIGHTS, POLICY_CARD}
+EGO_CHECKPOINTS = 5
+"""Checkpoints of each ego, evenly spaced over its training, as those of learned teammates are."""
 
 
 def partial_folder(folder: Path) -> Path:
@@ -45,9 +47,34 @@ def partial_folder(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.partial")
 
 
+def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
+    """Numbers of updates after which a checkpoint of the ego is kept, ascending; the last one is the end of training.
+
+    Fewer than `EGO_CHECKPOINTS` if there are fewer updates.
+    """
+    moments = (-(-config.updates * (number + 1) // EGO_CHECKPOINTS) for number in range(EGO_CHECKPOINTS))
+    return tuple(dict.fromkeys(moments))
+
+
+def checkpoint_path(folder: Path, number: int) -> Path:
+    """Folder of the ego's checkpoint of this number in an artefact."""
+    return folder / "checkpoints" / f"c{number}"
+
+
+def _hashed_files(config: PPOConfig) -> list[str]:
+    checkpoints = (checkpoint_path(Path(), number) for number in range(len(checkpoint_updates(config))))
+    policies = {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)}
+    return sorted({f"{name}.npy" for name in HistoryArrays._fields} | {METRICS} | policies)
+
+
 def artefact_settings(task: Task, profile: Profile) -> dict[str, Any]:
     """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
-    return {"task": asdict(task), "ego_hash": profile.ego_hash, "code_version": version("icrl4aht-data")}
+    return {
+        "task": asdict(task),
+        "ego_hash": profile.ego_hash,
+        "checkpoint_updates": list(checkpoint_updates(profile.ego)),
+        "code_version": version("icrl4aht-data"),
+    }
 
 
 def resumable_settings(task: Task, profile: Profile) -> dict[str, Any]:
@@ -60,8 +87,9 @@ def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
     try:
         metadata = parse_json(read_text(folder / METADATA))
         wanted = artefact_settings(task, profile)
-        same = {name: metadata[name] for name in wanted} == wanted and set(metadata["files"]) == _HASHED
-        return same and hashes_hold(folder, metadata["files"])
+        same = {name: metadata[name] for name in wanted} == wanted
+        complete = sorted(metadata["files"]) == _hashed_files(profile.ego)
+        return same and complete and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
@@ -73,7 +101,8 @@ def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
         "ego": asdict(profile.ego),
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),
-        "files": {name: file_hash(partial / name) for name in sorted(_HASHED)},
+        "xla_threads": xla_threads(),
+        "files": {name: file_hash(partial / name) for name in _hashed_files(profile.ego)},
     }
     with atomic_write(partial / METADATA) as unnamed:
         write_json(unnamed, metadata)
@@ -140,6 +169,20 @@ class ArtefactWriter:
         }
         self._log.write(line, timing={"update": number} | timing)
         return line | timing
+
+    def write_checkpoint(self, updates: int, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
+        """Keep the ego after so many updates, if it is one of `checkpoint_updates`; on the disk when this returns.
+
+        Call before the state after these updates is saved, so that a resumed task never lacks a checkpoint.
+        """
+        moments = checkpoint_updates(self._config)
+        if updates in moments:
+            began = time.perf_counter()
+            steps = updates * self._config.steps_per_update
+            save_policy(
+                checkpoint_path(self._partial, moments.index(updates)), network, params, card | {"steps": steps}
+            )
+            self._recording += time.perf_counter() - began
 
     def sync(self) -> None:
         """Force everything written so far to the disk, and out of memory."""

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from filelock import FileLock, Timeout
+from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initialising
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
@@ -32,6 +33,7 @@ from icrl4aht_data.utils.files import atomic_write
 METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
 
 _FORMAT = "1"
+_XLA_THREADS = ("PJRT_NPROC", "NPROC")  # environment variables, in the order in which XLA looks for them
 _SUFFIX = ".safetensors"
 
 
@@ -43,11 +45,41 @@ class OtherSettingsError(OptionError):
     """A saved state belongs to a training of other settings."""
 
 
-def software_versions() -> dict[str, str]:
-    """Versions that must agree for a resumed training to reach the bits of an uninterrupted one."""
+def xla_threads() -> int | None:
+    """Number of threads that XLA splits one operation over on this CPU; None on other platforms.
+
+    It decides the order of floating-point sums, and so the bits of everything that is trained. XLA reads it once, when
+    JAX is first used: from `PJRT_NPROC` or `NPROC`, otherwise from the CPU cores that this process may use.
+    """
+    if jax.default_backend() != "cpu":
+        return None
+    for name in _XLA_THREADS:
+        if os.environ.get(name, "").isdecimal():
+            return max(1, int(os.environ[name]))
+    return len(os.sched_getaffinity(0))
+
+
+def limit_xla_threads(threads: int) -> None:
+    """Make XLA split operations over this many threads on a CPU; call before JAX is first used.
+
+    Raises:
+        OptionError: if JAX has been used with another number, which can no longer change.
+    """
+    if not backends_are_initialized():
+        os.environ[_XLA_THREADS[0]] = str(threads)
+    elif xla_threads() not in (None, threads):
+        raise OptionError(
+            f"XLA runs with {xla_threads()} threads in this process, expected {threads}: set "
+            f"{_XLA_THREADS[0]}={threads} before it starts"
+        )
+
+
+def software_versions() -> dict[str, str | int | None]:
+    """What must agree for a resumed training to reach the bits of an uninterrupted one, apart from its settings."""
     return {
         "jax": jax.__version__,
         "platform": jax.default_backend(),
+        "xla_threads": xla_threads(),
         "code_version": version("icrl4aht-data"),
     }
 
@@ -148,9 +180,10 @@ class StateFile:
             raise self._unreadable(repr(error)) from error
         different = {} if self.settings is None else differing_settings(settings, self.settings)
         for name, (found, expected) in different.items():
+            resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
             raise OtherSettingsError(
                 f"{self.path}: saved by a training of other settings: {name} was {found!r}, now it is {expected!r}; "
-                f"remove the file to start again, or choose another folder"
+                f"{resume}remove the file to start again, or choose another folder"
             )
         return progress
 

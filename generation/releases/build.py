@@ -35,6 +35,7 @@ def build_releases(
     options: CollectOptions | None = None,
     suite: Path | None = None,
     seed: int = 0,
+    tasks: Sequence[Task] | None = None,
 ) -> list[Path]:
     """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
 
@@ -44,8 +45,10 @@ def build_releases(
         kinds: kinds of releases.
         console: where progress is printed.
         options: how tasks are collected.
-        suite: folder of the learned teammates; by default out/suite.
+        suite: folder of the learned teammates: a suite, by default out/suite, or with `tasks` also the folder
+            TEAMMATES of a release.
         seed: seed of the suite.
+        tasks: tasks to collect instead of the profile's, which trains no teammates.
 
     Returns:
         The release folders.
@@ -56,7 +59,7 @@ def build_releases(
     for kind in kinds:
         check_replaceable(out / kind)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
-    tasks = train_teammates(profile, suite, seed, console)
+    tasks = train_teammates(profile, suite, seed, console) if tasks is None else list(tasks)
     collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)
     releases = []
     with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same releases

@@ -12,8 +12,8 @@ import numpy as np
 from generation.collection.curate import best_streams, filter_report, plot_filter, relabel
 from generation.collection.record import HistoryArrays
 from generation.collection.task import TEAMMATE_NOISE
-from generation.collection.task_folder import FILTER_CURVES, METADATA
-from generation.learners.checkpoint import load_policy
+from generation.collection.task_folder import FILTER_CURVES, METADATA, checkpoint_path, checkpoint_updates
+from generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
 from generation.populations.select import THRESHOLD
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -23,6 +23,7 @@ from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder
 
@@ -63,6 +64,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")
     streams = best_streams(rewards, profile.keep)
     plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
+    labeller = checkpoint_path(folder, len(checkpoint_updates(profile.ego)) - 1)
     populations = TeammateSuite(
         algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
         members=profile.teammates.members,
@@ -78,21 +80,22 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         code_version=metadata["code_version"],
         jax_version=metadata["jax_version"],
         platform=metadata["platform"],
+        xla_threads=metadata["xla_threads"],
         seed=task.seed,
         teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
         streams_recorded=metadata["ego"]["environments"],
         streams_kept=profile.keep,
         filter=filter_report(rewards, streams),
-        expert=ExpertLabels(metadata["files"]["policy.safetensors"], "greedy, recurrent"),
+        expert=ExpertLabels(file_hash(labeller / POLICY_WEIGHTS), "greedy, recurrent"),
         suite=populations if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
-    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams), files)
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams, labeller), files)
 
 
-def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHistory]:
+def _histories(folder: Path, task: Task, streams: np.ndarray, labeller: Path) -> Iterator[NewHistory]:
     arrays = HistoryArrays(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields})
-    network, params, _ = load_policy(folder)
+    network, params, _ = load_policy(labeller)
     labels = relabel(task.layout, network, params, (arrays.state[stream] for stream in streams))
     dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)
     for stream, expert in zip(streams, labels, strict=True):

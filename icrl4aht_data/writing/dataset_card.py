@@ -328,7 +328,13 @@ def _provenance(release: CardContent) -> list[str]:
         ]
     if release.distinct("expert"):
         lines.append(sentence("expert_source"))
-    labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
+    labels = {
+        "profile": "profile",
+        "code_version": "icrl4aht-data",
+        "jax_version": "JAX",
+        "platform": "platform",
+        "xla_threads": "XLA threads",
+    }
     found = {label: ", ".join(map(str, release.distinct(name))) for name, label in labels.items()}
     if versions := [f"{label} {values}" for label, values in found.items() if values]:
         lines.append(sentence("versions", versions="; ".join(versions)))

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
+from generation.learners.resume import xla_threads
 from generation.releases.check import compare_rebuilds
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import artefact
@@ -19,6 +20,17 @@ def test_equal_folders(built):
     result = CliRunner().invoke(cli, ["check", str(built / "a"), str(built / "a")])
     assert result.exit_code == 0
     assert "bit-equal" in result.output
+    assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in result.output
+
+
+def test_other_numbers_of_threads_are_said(tmp_path):
+    for name, records in (("a", {"t0": {"xla_threads": 1}, "t1": {"xla_threads": 2}}), ("b", {"t0": {}})):
+        (tmp_path / name / "meta").mkdir(parents=True)
+        (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))
+    assert compare_rebuilds(tmp_path / "a", tmp_path / "b").xla_threads == ([1, 2], [])
+    output = CliRunner().invoke(cli, ["check", str(tmp_path / "a"), str(tmp_path / "b")]).output
+    assert f"{tmp_path / 'a'}: made with 1 and 2 XLA threads" in output
+    assert f"{tmp_path / 'b'}: made with an unknown number of XLA threads" in output
 
 
 def test_what_differs_is_said(built, tmp_path):
