@@ -34,6 +34,12 @@ def test_list(lite):
     assert "coord_simple" not in text
 
 
+def test_filters_of_algorithms_and_sources(lite):
+    assert len(json.loads(CliRunner().invoke(cli, ["list", "--json", str(lite[0]), "--source", "ppo"]).output)) == 4
+    result = CliRunner().invoke(cli, ["list", str(lite[0]), "--algorithm", "utility"])
+    assert "unknown algorithm 'utility'; valid: utility_greedy" in str(result.exception)
+
+
 def test_show_release_and_history(lite):
     release = json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)
     assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, 3)
