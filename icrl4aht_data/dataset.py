@@ -22,7 +22,7 @@ from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
 from icrl4aht_data.sampling.ad import ADSampler
 from icrl4aht_data.sampling.base import SamplerOptions
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
-from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.threads import usable_cores
 
 MINI = Path(__file__).parent / "mini"

@@ -105,8 +105,9 @@ def cli() -> None:
 def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
     """List the tasks of a release.
 
-    Prints one line per task: layout, teammate, histories, transitions, and the mean return of an episode at the start
-    and at the end of learning.
+    Prints one line per task: layout, teammate, histories, transitions, the mean return of an episode at the start and
+    at the end of learning, and what the policy earns that the expert actions come from, acting greedily ("-" where
+    nobody measured it).
     """
     by_task: dict[str, list[Entry]] = {}
     for entry in _load(root, filters).entries:
@@ -122,17 +123,21 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
             "transitions": sum(entry.T for entry in entries),
             "return_start": fmean(entry.return_start for entry in entries),
             "return_end": fmean(entry.return_end for entry in entries),
+            "source": entries[0].source,
+            "expert_return": entries[0].expert_return,
+            "expert_return_sampled": entries[0].expert_return_sampled,
         }
         for task_id, entries in by_task.items()
     ]
     if as_json:
         click.echo(json.dumps(tasks, indent=2))
         return
-    table = Table("layout", "track", "split", "teammate", "histories", "transitions", "return", "task")
+    table = Table("layout", "track", "split", "teammate", "histories", "transitions", "return", "labels", "task")
     for task in tasks:
         names = (task[name] for name in ("layout", "track", "split", "teammate"))
         returns = f"{task['return_start']:.1f} -> {task['return_end']:.1f}"
-        table.add_row(*names, str(task["histories"]), f"{task['transitions']:,}", returns, task["task_id"])
+        labels = "-" if task["expert_return"] is None else f"{task['expert_return']:.1f}"
+        table.add_row(*names, str(task["histories"]), f"{task['transitions']:,}", returns, labels, task["task_id"])
     Console(width=None if sys.stdout.isatty() else 200, markup=False).print(table)
 
 

@@ -1,6 +1,7 @@
 """Shared parts of the command lines `icrl4aht-data`, `python -m generation` and `python -m baselines`.
 
-Exit codes: 0 success; 1 an error, or a release in which `verify` found a problem; 2 a misused command.
+Exit codes: 0 success; 1 an error, or a release in which `verify` found a problem, or the reader of the output has gone;
+2 a misused command.
 """
 
 from __future__ import annotations
@@ -196,6 +197,8 @@ def filter_options(command: Any) -> Any:
         click.option(
             "--teammate-kind", multiple=True, metavar="KIND", help="Only this kind, such as utility_greedy or fcp."
         ),
+        click.option("--algorithm", multiple=True, metavar="KIND", help="The same as --teammate-kind."),
+        click.option("--source", multiple=True, metavar="NAME", help="Only histories made this way, such as ppo."),
     ]
     for option in reversed(options):
         command = option(command)
@@ -245,7 +248,12 @@ def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int],
 
 
 def run(command: click.Command) -> None:
-    """Run a command line; errors about its input become one line and an exit code."""
+    """Run a command line; errors about its input become one line and an exit code.
+
+    Output that nobody reads is no error message: where the reader of a pipe has gone (`| head`) the command stops
+    quietly with exit code 1, and output that was closed from the start (`>&-`) is dropped.
+    """
+    _open_outputs()
     try:
         command()
     except BrokenPipeError:
@@ -261,6 +269,13 @@ def run(command: click.Command) -> None:
         if extra is None:
             raise
         _stop(f"this needs {error.name}, which is not installed: pip install '{PACKAGE}[{extra}]'", 1)
+
+
+def _open_outputs() -> None:
+    """Open closed output streams on the null device, also so that no file gets their descriptors."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
 
 
 def _stop(message: str, code: int) -> None:

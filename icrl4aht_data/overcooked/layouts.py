@@ -15,7 +15,7 @@ import numpy as np
 
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.forks import cached_property
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
 """Kinds of cells. A wall is a counter that holds one item; PLATES and PILE are endless supplies."""

@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import numpy as np
 
-from icrl4aht_data.utils.fork import ForkSafeLock
+from icrl4aht_data.utils.forks import ForkSafeLock
 
 _CACHE_BYTES = 256 * 2**20
 

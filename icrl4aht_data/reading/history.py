@@ -49,7 +49,9 @@ class History:
         e = self.entry
         return (
             f"History({e.history_id}: {e.layout} with {e.teammate_kind}, T={e.T}, {e.episodes} episodes, "
-            f"return {e.return_start:.1f} -> {e.return_end:.1f})"
+            f"return {e.return_start:.1f} -> {e.return_end:.1f}"
+            + ("" if e.expert_return is None else f", labels {e.expert_return:.1f}")
+            + (")" if e.source == "ppo" else f", source {e.source})")
         )
 
     @property
@@ -150,7 +152,11 @@ class History:
 
     @property
     def expert_actions(self) -> LazyArray:
-        """(T,) int32: greedy actions of a checkpoint of the ego at the same steps, 0..5 (paper, App. D.1)."""
+        """(T,) int32: greedy actions of one policy at the same steps, 0..5; what it earns is `entry.expert_return`.
+
+        The policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier one that earns more: see
+        `entry.expert_step`.
+        """
         return self._lazy("expert_actions")
 
     @property

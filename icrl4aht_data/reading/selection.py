@@ -28,7 +28,7 @@ from icrl4aht_data.reading.sources import (
 )
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.remote.store import Traffic
-from icrl4aht_data.utils.fork import ForkSafeLock, cached_property
+from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 

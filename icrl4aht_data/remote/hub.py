@@ -13,7 +13,7 @@ from icrl4aht_data.errors import OfflineError, RemoteError
 from icrl4aht_data.remote.addresses import check_redirect
 from icrl4aht_data.remote.store import RetryPolicy, Store, WrongLengthError, http_status, offline, wrap_remote_errors
 from icrl4aht_data.utils.files import TEXT_BYTES
-from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.forks import cached_property
 
 
 class HubStore(Store):

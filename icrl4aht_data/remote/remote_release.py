@@ -39,7 +39,7 @@ from icrl4aht_data.remote.partial_file import PartialFile, complete_file, map_pa
 from icrl4aht_data.remote.store import RetryPolicy, Store, offline
 from icrl4aht_data.utils.cache import data_folder
 from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size, read_text
-from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.hashes import file_hash, git_hash
 from icrl4aht_data.utils.locks import lock_beside, process_lock, remove_empty_folders
 from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside

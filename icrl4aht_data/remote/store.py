@@ -17,7 +17,7 @@ from urllib.parse import urljoin
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
 from icrl4aht_data.remote.addresses import address_of, check_redirect, without_credentials
-from icrl4aht_data.utils.fork import ForkSafeLock
+from icrl4aht_data.utils.forks import ForkSafeLock
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)

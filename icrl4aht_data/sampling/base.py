@@ -13,7 +13,7 @@ from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, Episodes, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
-from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.memory import array_bytes, fits, free_memory, gigabytes
 from icrl4aht_data.utils.validation import check_int
 

@@ -13,7 +13,7 @@ from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.observer import ArraySpec
-from icrl4aht_data.utils.fork import cached_property
+from icrl4aht_data.utils.forks import cached_property
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 
+import pytest
 from click.testing import CliRunner
 
 from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.commands.options import run as run_command
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
+from tests.helpers.paths import ROOT
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
@@ -31,6 +35,12 @@ def test_list(lite):
     text = CliRunner().invoke(cli, ["list", str(lite[0]), "--layout", "demo_wide"]).output
     assert "demo_wide" in text
     assert "coord_simple" not in text
+
+
+def test_filters_of_algorithms_and_sources(lite):
+    assert len(json.loads(CliRunner().invoke(cli, ["list", "--json", str(lite[0]), "--source", "ppo"]).output)) == 4
+    result = CliRunner().invoke(cli, ["list", str(lite[0]), "--algorithm", "utility"])
+    assert "unknown algorithm 'utility'; valid: utility_greedy" in str(result.exception)
 
 
 def test_show_release_and_history(lite):
@@ -90,6 +100,31 @@ def test_errors_become_one_line_and_exit_code_1(tmp_path):
     assert result.stderr.startswith("error: ")
     assert "no release here" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
+def test_output_that_was_closed_from_the_start_is_dropped(lite, monkeypatch, arguments, code):
+    """`list >&-` was an AttributeError with a traceback."""
+    monkeypatch.setattr(sys, "argv", ["icrl4aht-data", *arguments, str(lite[0])])
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    with pytest.raises(SystemExit) as stopped:
+        run_command(cli)
+    assert stopped.value.code == code
+    for stream in (sys.stdout, sys.stderr):
+        assert stream.name == os.devnull
+        stream.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "generation --help"])
+def test_a_reader_that_has_gone_stops_a_command_quietly(program):
+    reader, writer = os.pipe()
+    os.close(reader)
+    arguments = [sys.executable, "-m", *program.split()]
+    result = subprocess.run(arguments, stdout=writer, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    os.close(writer)
+    assert (result.returncode, result.stderr) == (1, "")
 
 
 def test_version():

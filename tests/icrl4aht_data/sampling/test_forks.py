@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from icrl4aht_data.utils.fork import ForkSafeLock, cached_property
+from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
 from tests.helpers.paths import ROOT
 
 FORK = """
