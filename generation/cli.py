@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -26,6 +26,7 @@ from icrl4aht_data.commands.options import (
     Folder,
     Names,
     Sections,
+    bars,
     examples,
     json_option,
     run,
@@ -34,6 +35,9 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
+
+if TYPE_CHECKING:
+    from generation.profiles import Profile  # loads JAX
 
 console = Console(soft_wrap=True)
 
@@ -47,6 +51,13 @@ _ego_options = dataclass_options(
     default_text={field.name: "the profile's" for kind in (PPOConfig, Widths) for field in fields(kind)},
 )
 """One option for every hyper-parameter of the egos; those given replace the profile's."""
+
+_threads_option = click.option(
+    "--xla-threads",
+    type=COUNT,
+    help="Threads of one XLA operation on a CPU; other numbers give other bits.",
+    show_default="the profile's, else all cores",
+)
 
 _SECTIONS = {
     "Rebuild": ("plan", "generate", "check"),
@@ -94,7 +105,17 @@ def cli() -> None:
     "--suite", type=Folder(), metavar="FOLDER", help="Folder of the learned teammates.", show_default="OUT/suite"
 )
 @click.option("--seed", type=SEED, default=0, help="Seed of the learned teammates.")
+@click.option(
+    "--tasks",
+    "task_file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, and train no teammates: --suite is a "
+    "suite that has them, or the release's folder teammates.",
+    show_default="the profile's tasks",
+)
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
+@_threads_option
 @dataclass_options(CollectOptions, "collect")
 @_ego_options
 def generate(
@@ -103,7 +124,9 @@ def generate(
     kind: tuple[Kind, ...],
     suite: Path | None,
     seed: int,
+    task_file: Path | None,
     bundle: bool,
+    xla_threads: int | None,
     collect: dict[str, Any],
     ego: dict[str, Any],
 ) -> None:
@@ -114,7 +137,6 @@ def generate(
     teammates, the executor collects the tasks. Tasks that fail are listed in OUT/failed.jsonl; the others are finished,
     nothing is packed, and the exit code is 1. Hyper-parameters of the egos replace those of the profile.
     """
-    from generation.profiles import load_profile
     from generation.releases.build import build_releases
     from generation.releases.package import bundle_release
 
@@ -126,12 +148,27 @@ def generate(
     request_determinism()
     if options.executor == "ray":
         allocate_gpu_memory_on_demand()
-    profile = load_profile(profile_name).with_ego(ego)
-    releases = dict(zip(kind, build_releases(profile, out, kind, console, options, suite, seed), strict=True))
+    profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
+    tasks = read_tasks(task_file) if task_file else None
+    built = build_releases(profile, out, kind, console, options, suite, seed, tasks)
+    releases = dict(zip(kind, built, strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
     if bundle:
         console.print(f"bundled: {bundle_release(releases['lite'])}")
+
+
+def _profile_with_threads(name: str, threads: int | None) -> Profile:
+    """A profile by name, with XLA limited to its threads or to the given number."""
+    from generation.learners.resume import limit_xla_threads
+    from generation.profiles import load_profile
+
+    profile = load_profile(name)
+    if threads:
+        profile = replace(profile, xla_threads=threads)
+    if profile.xla_threads:
+        limit_xla_threads(profile.xla_threads)
+    return profile
 
 
 @cli.command()
@@ -147,7 +184,9 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
     from generation.planning.plan import estimate_cost
     from generation.profiles import load_profile
 
-    cost = estimate_cost(load_profile(profile_name).with_ego(ego), devices)
+    with bars(edges=True) as show:
+        profile = load_profile(profile_name).with_ego(ego)
+        cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, f": {what}"))
     if as_json:
         click.echo(json.dumps(cost.to_json(), indent=2))
     else:
@@ -174,6 +213,9 @@ def check(a: Path, b: Path, as_json: bool) -> None:
         for name, difference in compared.differences.items():
             click.echo(f"{name}: {difference}")
         verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+        for folder, threads in zip((a, b), compared.xla_threads, strict=True):
+            numbers = " and ".join(map(str, threads)) or "an unknown number of"
+            click.echo(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
         click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
     sys.exit(1 if compared.differences else 0)
 
@@ -236,7 +278,15 @@ _algorithms_option = click.option(
 @_algorithms_option
 @click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write the populations here.")
 @click.option("--seed", type=SEED, default=0, help="Seed of their training.")
-def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, seed: int) -> None:
+@_threads_option
+def teammates(
+    profile_name: str,
+    layouts: tuple[str, ...],
+    algorithms: tuple[str, ...],
+    suite: Path,
+    seed: int,
+    xla_threads: int | None,
+) -> None:
     """Train populations of teammates.
 
     Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by their returns, and writes
@@ -244,10 +294,9 @@ def teammates(profile_name: str, layouts: tuple[str, ...], algorithms: tuple[str
     populations of the profile, or all algorithms on its layouts if it names none.
     """
     from generation.populations.build import build_suite
-    from generation.profiles import load_profile
 
     request_determinism()
-    profile = load_profile(profile_name)
+    profile = _profile_with_threads(profile_name, xla_threads)
     if layouts:
         wanted = dict.fromkeys((get_layout(name).name for name in layouts), algorithms)
     else:

@@ -1,45 +1,60 @@
-"""Progress bars on a terminal; silent where the output is not one."""
+"""Progress bars on a terminal, a plain line a minute elsewhere; a board for the tasks of a collection."""
 
 from __future__ import annotations
 
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+
+from icrl4aht_data.utils.progress import LineProgress
 
 _PERIOD = 300.0
 """Seconds over which the speed is averaged for the remaining time."""
 
 
-def progress_bars(console: Console) -> Progress:
-    """Bars with description, count and remaining time, and a field `note` for each."""
-    return Progress(
+def progress_bars(console: Console, **options: Any) -> LineProgress:
+    """Bars with description, count and remaining time, and a field `note` for each.
+
+    Where the console is not a terminal, plain lines are printed: one at the start, one a minute, one at the end.
+
+    Args:
+        console: where to print.
+        options: of `LineProgress`.
+    """
+    return LineProgress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
         console=console,
+        edges=True,
         speed_estimate_period=_PERIOD,
-        disable=not console.is_terminal,
+        **options,
     )
 
 
 class ProgressBoard:
     """Progress of a collection: a bar for all tasks with steps/s and remaining time, and one for each running task.
 
+    Where the console is not a terminal, plain lines show all tasks together.
+
     Args:
         console: where to show it.
         tasks: number of tasks.
         updates: number of updates of each task.
+        options: of `LineProgress`.
     """
 
-    def __init__(self, console: Console, tasks: int, updates: int) -> None:
-        self._bars = progress_bars(console)
+    def __init__(self, console: Console, tasks: int, updates: int, **options: Any) -> None:
+        self._bars = progress_bars(console, **options)
         self._tasks, self._updates = tasks, updates
         self._done = 0
         self._running: dict[str, tuple[TaskID, int, float]] = {}
-        self._all = self._bars.add_task("all", total=tasks * updates, note="")
+        self._all = self._bars.add_task("all tasks", total=tasks * updates, note="", unit="updates")
+        self._shows_single = console.is_terminal
         self._show()
 
     def __enter__(self) -> ProgressBoard:
@@ -53,7 +68,10 @@ class ProgressBoard:
 
     def show_running(self, task_id: str, updates: int, steps_per_second: float) -> None:
         """Show that a task has done so many updates."""
-        bar, _, _ = self._running.get(task_id) or (self._bars.add_task(task_id, total=self._updates, note=""), 0, 0.0)
+        if task_id in self._running:
+            bar = self._running[task_id][0]
+        else:
+            bar = self._bars.add_task(task_id, total=self._updates, note="", visible=self._shows_single)
         self._running[task_id] = bar, updates, steps_per_second
         self._bars.update(bar, completed=updates, note=f"{steps_per_second:,.0f} steps/s")
         self._show()
@@ -69,5 +87,5 @@ class ProgressBoard:
     def _show(self) -> None:
         speed = sum(speed for _, _, speed in self._running.values())
         completed = self._done * self._updates + sum(updates for _, updates, _ in self._running.values())
-        note = f"{self._done}/{self._tasks} tasks, {speed:,.0f} steps/s"
+        note = f"{self._done}/{self._tasks} tasks" + (f", {speed:,.0f} steps/s" if speed else "")
         self._bars.update(self._all, completed=completed, note=note)

@@ -53,6 +53,10 @@ class ShardMissingError(ReleaseError, FileNotFoundError):
     """A shard named by the index does not exist."""
 
 
+class ShardUnreadableError(ReleaseError, OSError):
+    """A shard exists, but this user may not read it, or the disk fails."""
+
+
 class ShardCorruptError(ReleaseError):
     """A shard is not HDF5, or a chunk's checksum is wrong."""
 
@@ -96,6 +100,10 @@ class OfflineError(ReleaseError):
 
 class UnsafePathError(ReleaseError):
     """A path in a release points outside its folder."""
+
+
+class CacheError(Icrl4ahtError):
+    """The cache folder has no room, cannot be written, or is not a folder."""
 
 
 class UploadError(Icrl4ahtError):

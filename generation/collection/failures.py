@@ -6,20 +6,28 @@ import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from filelock import FileLock
-
 from generation.collection.job import TaskOutcome
+from generation.collection.task_folder import FULL_DISK
 from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.utils.locks import process_lock
 
 FAILED = "failed.jsonl"
 
 
 class FailureLog:
-    """One line per failed task that still has no artefact. Collectors may share the file."""
+    """One line per failed task that still has no artefact. Collectors may share the file.
+
+    On a full disk, changes wait until one of the next can be written.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock = FileLock(path.with_name(f".{path.name}.lock"))
+        self._waiting: list[Callable[[list[dict]], list[dict]]] = []
+
+    @property
+    def is_written(self) -> bool:
+        """Whether no change waits for room on the disk."""
+        return not self._waiting
 
     def add(self, outcome: TaskOutcome) -> None:
         """Add a task's line, or replace the one of an earlier attempt."""
@@ -37,12 +45,22 @@ class FailureLog:
         self._change(lambda lines: [line for line in lines if line["task_id"] not in finished])
 
     def _change(self, change: Callable[[list[dict]], list[dict]]) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self._lock:
+        self._waiting.append(change)
+        try:
+            self._write()
+        except OSError as error:
+            if error.errno not in FULL_DISK:
+                raise
+
+    def _write(self) -> None:
+        with process_lock(self.path.with_name(f".{self.path.name}.lock")):
             before = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
-            after = change(before)
+            after = before
+            for change in self._waiting:
+                after = change(after)
             if not after:
                 self.path.unlink(missing_ok=True)
             elif after != before:
                 with atomic_write(self.path) as partial:
                     partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")
+        self._waiting.clear()

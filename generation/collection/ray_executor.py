@@ -16,6 +16,7 @@ from rich.text import Text
 from generation.collection.job import CollectionJob, TaskOutcome
 from generation.collection.options import CollectOptions, request_determinism
 from generation.collection.task_folder import last_timing
+from generation.learners.resume import limit_xla_threads
 from generation.progress import ProgressBoard
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
@@ -65,6 +66,8 @@ def _show_progress(job: CollectionJob, tasks: Iterable[Task], board: ProgressBoa
 
 def _work(job: CollectionJob, task: Task) -> str:
     request_determinism()
+    if job.profile.xla_threads:
+        limit_xla_threads(job.profile.xla_threads)
     return job(task)
 
 

@@ -81,7 +81,7 @@ def collect_tasks(
         else:
             todo.append(task)
     missing = {task.task_id for task in todo}
-    failures = FailureLog(out / FAILED)
+    failures, last_error = FailureLog(out / FAILED), ""
     with (
         ProgressBoard(console, len(todo), profile.ego.updates) as board,
         closing(_run_all(job, todo, board, options)) as outcomes,
@@ -98,13 +98,17 @@ def collect_tasks(
                 failures.forget([outcome.task.task_id])
                 continue
             failures.add(outcome)
+            last_error = outcome.error
             if options.fail_fast:
                 raise CollectionError(f"{failures.path}: the first failure: {outcome.error}")
     failures.forget({task.task_id for task in tasks} - missing)
     if missing:
+        reasons = f"{failures.path} has the reasons"
+        if not failures.is_written:
+            reasons = f"{failures.path} cannot be written, the disk is full; the last failure: {last_error}"
         raise CollectionError(
-            f"{len(missing)} of {len(tasks)} tasks have no artefact: {', '.join(sorted(missing))}; "
-            f"{failures.path} has the reasons, and the same command tries them again"
+            f"{len(missing)} of {len(tasks)} tasks have no artefact: {', '.join(sorted(missing))}; {reasons}, and the "
+            f"same command tries them again"
         )
 
 

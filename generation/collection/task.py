@@ -8,23 +8,28 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from generation.collection.task_folder import (
+    FULL_DISK,
     LEARNER,
     ArtefactWriter,
+    DiskFullError,
+    check_room,
+    disk_full,
     finish_artefact,
     is_task_finished,
+    needed_bytes,
     partial_folder,
     publish_artefact,
     resumable_settings,
 )
 from generation.env import Environment
-from generation.learners.checkpoint import write_policy
 from generation.learners.ego import Learner, compiled_update
 from generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock
 from generation.policy import Noise
@@ -75,6 +80,7 @@ def run_task(
 
     Raises:
         BusyError: if another process works on this task.
+        DiskFullError: if the disk has no room.
     """
     with run_lock(folder, wait=wait):
         if is_task_finished(folder, task, profile):
@@ -82,7 +88,6 @@ def run_task(
         partial = partial_folder(folder)
         if not is_task_finished(partial, task, profile):  # else it was killed just before it was renamed
             _learn(task, profile, partial, on_update, suite, save_seconds)
-            finish_artefact(partial, task, profile)
         publish_artefact(partial, folder)
         return True
 
@@ -92,31 +97,68 @@ def _learn(
 ) -> None:
     learner, saved = make_learner(task, profile, suite), StateFile(partial / LEARNER, resumable_settings(task, profile))
     state, first = _resume(learner, task, saved)
-    update = compiled_update(learner)
-    writer = ArtefactWriter(partial, task, profile.ego, first)
-    interval = SaveInterval(profile.ego.updates, seconds=save_seconds)
+    needed = needed_bytes(task, profile.ego, state)
+    with _readable_disk_errors(partial, needed):
+        if not first:
+            check_room(partial, needed)
+        writer = ArtefactWriter(partial, task, profile.ego, first)
+        try:
+            _update(learner, state, first, writer, saved, on_update, save_seconds)
+        finally:
+            writer.close()
+        finish_artefact(partial, task, profile)
+
+
+def _update(
+    learner: Learner,
+    state: Any,
+    first: int,
+    writer: ArtefactWriter,
+    saved: StateFile,
+    on_update: UpdateCallback,
+    save_seconds: float,
+) -> None:
+    """Apply the updates from number `first`, write what they give, and save the state at intervals."""
+    update, updates = compiled_update(learner), learner.config.updates
+    interval = SaveInterval(updates, seconds=save_seconds)
     pending: Any = None  # the last roll-out: it is written while the device computes the next one
 
     def write(number: int, rollout: Any, metrics: Any) -> None:
         on_update(number, writer.write(number, rollout, metrics))
 
+    for number in range(first, updates):
+        state, rollout, metrics = update(state)
+        if pending is not None:
+            write(*pending)
+        pending = number, rollout, metrics
+        writer.write_checkpoint(number + 1, learner.network, state.params)
+        if interval.due(number + 1):
+            write(*pending)
+            pending = None
+            writer.sync()
+            began = time.perf_counter()
+            saved.save(state, number + 1)
+            writer.add_recording_time(time.perf_counter() - began)
+
+
+@contextmanager
+def _readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
+    """Turn the errors of a full disk into one that names the folder and what it needs.
+
+    An artefact that has no saved state to resume from is removed then.
+
+    Raises:
+        DiskFullError: if the disk is full.
+    """
     try:
-        for number in range(first, profile.ego.updates):
-            state, rollout, metrics = update(state)
-            if pending is not None:
-                write(*pending)
-            pending = number, rollout, metrics
-            if interval.due(number + 1):
-                write(*pending)
-                pending = None
-                writer.sync()
-                began = time.perf_counter()
-                saved.save(state, number + 1)
-                writer.add_recording_time(time.perf_counter() - began)
-    finally:
-        writer.close()
-    steps = profile.ego.updates * profile.ego.steps_per_update
-    write_policy(partial, learner.network, state.params, {"task_id": task.task_id, "steps": steps})
+        yield
+    except (OSError, DiskFullError) as error:
+        if isinstance(error, OSError) and error.errno not in FULL_DISK:
+            raise
+        shown = disk_full(partial, needed)
+        if not (partial / LEARNER).exists():
+            shutil.rmtree(partial, ignore_errors=True)
+        raise shown from error
 
 
 def _resume(learner: Learner, task: Task, saved: StateFile) -> tuple[Any, int]:

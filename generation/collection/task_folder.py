@@ -4,15 +4,18 @@
   metadata.json       task, settings, versions, SHA-256 of the files below
   state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
   metrics.jsonl       one line per update
-  policy.safetensors policy.json   the final ego
+  checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
   timing.jsonl        wall-clock figures, not hashed
+  filter.png labeller_returns.json   added by packing, not hashed
 <task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
 .<task_id>.lock       held by the collector that works on it
 """
 
 from __future__ import annotations
 
+import errno
 import json
+import math
 import os
 import shutil
 import time
@@ -25,19 +28,28 @@ import jax
 import numpy as np
 
 from generation.collection.record import HistoryArrays, array_shapes, record_rollout
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
 from generation.learners.config import PPOConfig
-from generation.learners.resume import METRICS, TIMING, RunLog, software_versions
+from generation.learners.network import ActorCritic
+from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
+from icrl4aht_data.utils.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
-FILTER_CURVES = "filter.png"
+FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
+"""Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
 
-_HASHED = {f"{name}.npy" for name in HistoryArrays._fields} | {METRICS, POLICY_WEIGHTS, POLICY_CARD}
+_LINE_BYTES = 600  # of an update, in the metrics and in the timing
+
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the errors of a full disk, a full quota and a limited file."""
+
+EGO_CHECKPOINTS = 5
+"""Checkpoints of each ego, evenly spaced over its training, as those of learned teammates are."""
 
 
 def partial_folder(folder: Path) -> Path:
@@ -45,9 +57,34 @@ def partial_folder(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.partial")
 
 
+def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
+    """Numbers of updates after which a checkpoint of the ego is kept, ascending; the last one is the end of training.
+
+    Fewer than `EGO_CHECKPOINTS` if there are fewer updates.
+    """
+    moments = (-(-config.updates * (number + 1) // EGO_CHECKPOINTS) for number in range(EGO_CHECKPOINTS))
+    return tuple(dict.fromkeys(moments))
+
+
+def checkpoint_path(folder: Path, number: int) -> Path:
+    """Folder of the ego's checkpoint of this number in an artefact."""
+    return folder / "checkpoints" / f"c{number}"
+
+
+def _hashed_files(config: PPOConfig) -> list[str]:
+    checkpoints = (checkpoint_path(Path(), number) for number in range(len(checkpoint_updates(config))))
+    policies = {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)}
+    return sorted({f"{name}.npy" for name in HistoryArrays._fields} | {METRICS} | policies)
+
+
 def artefact_settings(task: Task, profile: Profile) -> dict[str, Any]:
     """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
-    return {"task": asdict(task), "ego_hash": profile.ego_hash, "code_version": version("icrl4aht-data")}
+    return {
+        "task": asdict(task),
+        "ego_hash": profile.ego_hash,
+        "checkpoint_updates": list(checkpoint_updates(profile.ego)),
+        "code_version": version("icrl4aht-data"),
+    }
 
 
 def resumable_settings(task: Task, profile: Profile) -> dict[str, Any]:
@@ -60,10 +97,50 @@ def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
     try:
         metadata = parse_json(read_text(folder / METADATA))
         wanted = artefact_settings(task, profile)
-        same = {name: metadata[name] for name in wanted} == wanted and set(metadata["files"]) == _HASHED
-        return same and hashes_hold(folder, metadata["files"])
+        same = {name: metadata[name] for name in wanted} == wanted
+        complete = sorted(metadata["files"]) == _hashed_files(profile.ego)
+        return same and complete and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
+
+
+class DiskFullError(Icrl4ahtError):
+    """The disk of an artefact has no room for it."""
+
+
+def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
+    """Disk space of an unfinished artefact: histories, checkpoints, log, and two copies of the learner's state.
+
+    Args:
+        task: the task.
+        config: the ego's hyper-parameters.
+        state: the learner's state.
+    """
+    histories = sum(
+        math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in array_shapes(task.layout, config).values()
+    )
+    saved, params = (sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) for tree in (state, state.params))
+    return histories + 2 * saved + len(checkpoint_updates(config)) * params + config.updates * _LINE_BYTES
+
+
+def check_room(partial: Path, needed: int) -> None:
+    """Check that a disk has room for an artefact.
+
+    Raises:
+        DiskFullError: if it has not.
+    """
+    if needed > shutil.disk_usage(partial).free:
+        raise disk_full(partial, needed)
+
+
+def disk_full(partial: Path, needed: int) -> DiskFullError:
+    """Returns the error for an unfinished artefact whose disk has not the space it needs."""
+    free = shutil.disk_usage(partial if partial.exists() else partial.parent).free
+    folder = partial.with_name(partial.name.removesuffix(".partial"))
+    return DiskFullError(
+        f"{folder}: the disk is full: this task needs {needed:,} bytes, {free:,} are free; free some space, or give "
+        f"another --out"
+    )
 
 
 def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
@@ -73,7 +150,8 @@ def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
         "ego": asdict(profile.ego),
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),
-        "files": {name: file_hash(partial / name) for name in sorted(_HASHED)},
+        "xla_threads": xla_threads(),
+        "files": {name: file_hash(partial / name) for name in _hashed_files(profile.ego)},
     }
     with atomic_write(partial / METADATA) as unnamed:
         write_json(unnamed, metadata)
@@ -89,23 +167,26 @@ def publish_artefact(partial: Path, folder: Path) -> None:
 class ArtefactWriter:
     """Fills an artefact's histories, metrics and timing, update by update.
 
-    The arrays are memory maps of files that have their full size from the start. `sync` writes them out and maps them
-    again, so that memory holds only what came since the last `sync`.
+    The arrays are memory maps of files whose space on the disk is allocated at the start. `sync` writes them out and
+    maps them again, so that memory holds only what came since the last `sync`.
 
     Args:
         partial: an existing folder.
         task: the task.
         config: the ego's hyper-parameters.
         first: the first update to write; 0 creates the files, otherwise the log is cut at that update.
+
+    Raises:
+        OSError: if the disk is full.
     """
 
     def __init__(self, partial: Path, task: Task, config: PPOConfig, first: int) -> None:
-        self._partial, self._config, self._first = partial, config, first
+        self._partial, self._task, self._config, self._first = partial, task, config, first
         self._started = time.perf_counter()
         self._recording = 0.0
         if not first:
             for name, (shape, dtype) in array_shapes(task.layout, config).items():
-                np.lib.format.open_memmap(self._array(name), "w+", dtype, shape)
+                new_mapped_array(self._array(name), shape, np.dtype(dtype))
         self._log = RunLog(partial, keep=lambda line: line["update"] < first)
         self._histories = self._mapped()
 
@@ -140,6 +221,18 @@ class ArtefactWriter:
         }
         self._log.write(line, timing={"update": number} | timing)
         return line | timing
+
+    def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
+        """Keep the ego after so many updates, if it is one of `checkpoint_updates`; on the disk when this returns.
+
+        Call before the state after these updates is saved, so that a resumed task never lacks a checkpoint.
+        """
+        moments = checkpoint_updates(self._config)
+        if updates in moments:
+            began = time.perf_counter()
+            card = {"task_id": self._task.task_id, "steps": updates * self._config.steps_per_update}
+            save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
+            self._recording += time.perf_counter() - began
 
     def sync(self) -> None:
         """Force everything written so far to the disk, and out of memory."""

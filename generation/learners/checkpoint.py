@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any
 
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
+from safetensors.numpy import save as to_bytes
 
 from generation.learners.config import Widths
 from generation.learners.network import ActorCritic
@@ -32,12 +34,15 @@ def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str,
 
 
 def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
-    """Write policy.safetensors and policy.json into an existing folder."""
+    """Write policy.safetensors and policy.json into an existing folder, and sync them to the disk."""
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
-    save_file(weights, folder / POLICY_WEIGHTS)
+    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(weights))  # `save_file` has errors of its own for a full disk
     shapes = {name: list(w.shape) for name, w in weights.items()}
     content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
     (folder / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    for name in (POLICY_WEIGHTS, POLICY_CARD):
+        with (folder / name).open("rb+") as stream:
+            os.fsync(stream.fileno())
 
 
 def load_card(folder: Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -21,17 +21,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
+from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initialising
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.locks import lock_beside, process_lock
 
 METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
 
 _FORMAT = "1"
+_XLA_THREADS = ("PJRT_NPROC", "NPROC")  # environment variables, in the order in which XLA looks for them
 _SUFFIX = ".safetensors"
 
 
@@ -43,11 +46,41 @@ class OtherSettingsError(OptionError):
     """A saved state belongs to a training of other settings."""
 
 
-def software_versions() -> dict[str, str]:
-    """Versions that must agree for a resumed training to reach the bits of an uninterrupted one."""
+def xla_threads() -> int | None:
+    """Number of threads that XLA splits one operation over on this CPU; None on other platforms.
+
+    It decides the order of floating-point sums, and so the bits of everything that is trained. XLA reads it once, when
+    JAX is first used: from `PJRT_NPROC` or `NPROC`, otherwise from the CPU cores that this process may use.
+    """
+    if jax.default_backend() != "cpu":
+        return None
+    for name in _XLA_THREADS:
+        if os.environ.get(name, "").isdecimal():
+            return max(1, int(os.environ[name]))
+    return len(os.sched_getaffinity(0))
+
+
+def limit_xla_threads(threads: int) -> None:
+    """Make XLA split operations over this many threads on a CPU; call before JAX is first used.
+
+    Raises:
+        OptionError: if JAX has been used with another number, which can no longer change.
+    """
+    if not backends_are_initialized():
+        os.environ[_XLA_THREADS[0]] = str(threads)
+    elif xla_threads() not in (None, threads):
+        raise OptionError(
+            f"XLA runs with {xla_threads()} threads in this process, expected {threads}: set "
+            f"{_XLA_THREADS[0]}={threads} before it starts"
+        )
+
+
+def software_versions() -> dict[str, str | int | None]:
+    """What must agree for a resumed training to reach the bits of an uninterrupted one, apart from its settings."""
     return {
         "jax": jax.__version__,
         "platform": jax.default_backend(),
+        "xla_threads": xla_threads(),
         "code_version": version("icrl4aht-data"),
     }
 
@@ -57,11 +90,6 @@ def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) ->
     one, other = _flat(json.loads(json.dumps(found))), _flat(json.loads(json.dumps(expected)))
     names = sorted(one.keys() | other.keys())
     return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
-
-
-def lock_file(folder: Path) -> Path:
-    """Path of a folder's lock: next to the folder, so that the folder can be renamed while the lock is held."""
-    return folder.with_name(f".{folder.name}.lock")
 
 
 @contextmanager
@@ -75,16 +103,13 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
     Raises:
         BusyError: if another process holds the lock.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(lock_file(folder), timeout=-1 if wait else 0)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise BusyError(f"{folder}: another process works in this folder; wait for it, or choose another") from error
-    try:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(process_lock(lock_beside(folder), wait=wait))
+        except Timeout as error:
+            message = f"{folder}: another process works in this folder; wait for it, or choose another"
+            raise BusyError(message) from error
         yield
-    finally:
-        lock.release()
 
 
 class SaveInterval:
@@ -148,9 +173,10 @@ class StateFile:
             raise self._unreadable(repr(error)) from error
         different = {} if self.settings is None else differing_settings(settings, self.settings)
         for name, (found, expected) in different.items():
+            resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
             raise OtherSettingsError(
                 f"{self.path}: saved by a training of other settings: {name} was {found!r}, now it is {expected!r}; "
-                f"remove the file to start again, or choose another folder"
+                f"{resume}remove the file to start again, or choose another folder"
             )
         return progress
 
@@ -165,7 +191,7 @@ class StateFile:
             }
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.path) as partial:
-                save_file(arrays, partial, metadata=metadata)
+                partial.write_bytes(to_bytes(arrays, metadata))  # `save_file` has errors of its own for a full disk
         if jax.process_count() > 1:
             multihost_utils.sync_global_devices(f"saved {self.path.name}")
 
@@ -292,8 +318,10 @@ class RunLog:
             os.fsync(self._metrics.fileno())
 
     def close(self) -> None:
-        self._metrics.close()
-        self._timing.close()
+        """Close both files."""
+        for file in (self._metrics, self._timing):
+            with suppress(OSError):  # `write` leaves nothing to be written, unless it has raised the same error
+                file.close()
 
 
 def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:

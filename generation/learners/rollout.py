@@ -161,7 +161,12 @@ def _reset_memory(player: Player, memory: Any, state: EnvState, done: Bool[Array
 
 
 def network_player(
-    env: Environment, network: ActorCritic, params: Any, agent_slots: np.ndarray, partner: Any, greedy: bool = False
+    env: Environment,
+    network: ActorCritic,
+    params: Any,
+    agent_slots: np.ndarray,
+    partner: Any,
+    greedy: bool | Array = False,
 ) -> Player:
     """A player that acts by one policy of the network, or by several at once.
 
@@ -171,7 +176,7 @@ def network_player(
         params: parameters of one policy for slots (M,); stacked on a leading axis of G policies for slots (G, M).
         agent_slots: int (M,) or (G, M).
         partner: int of the shape of `agent_slots`, number of the policy of the other agent, for the critic.
-        greedy: take the most probable action instead of drawing one.
+        greedy: take the most probable action instead of drawing one; bool (), if compiled code decides it.
     """
     flat, shape = agent_slots.reshape(-1), agent_slots.shape
 
@@ -188,7 +193,10 @@ def network_player(
         apply: Any = jax.vmap(forward) if agent_slots.ndim == 2 else forward
         results = apply(params, hidden, obs, partner)
         hidden, logits, value = (x.reshape(flat.size, *x.shape[agent_slots.ndim :]) for x in results)
-        action = jnp.argmax(logits, axis=-1) if greedy else jax.random.categorical(key, logits)
+        if isinstance(greedy, bool):
+            action = jnp.argmax(logits, axis=-1) if greedy else jax.random.categorical(key, logits)
+        else:
+            action = jnp.where(greedy, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits))
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), action[:, None], axis=-1)[:, 0]
         return Choice(action, log_prob, value), hidden
 

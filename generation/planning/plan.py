@@ -26,12 +26,16 @@ from generation.teammates.learned import build_untrained
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.checking.report import NamedProgress
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS, TASKS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+
+_MEASUREMENTS = 3
+"""Measurements of an estimate: of egos, of teammates, of releases."""
 
 _WORTH_MEASURING = 20.0
 """Seconds: a complete update that should take less is measured itself, not only a share of it."""
@@ -125,18 +129,26 @@ class RebuildCost:
         yield f"hours on {self.devices} of them", f"{self.hours_on_devices:,.1f}"
 
 
-def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
+def estimate_cost(
+    profile: Profile, devices: int, advance: NamedProgress = lambda what, done, total: None
+) -> RebuildCost:
     """Estimate a rebuild's cost from the profile, short calibration runs, and histories of the bundled release.
 
     Args:
         profile: the profile.
         devices: number of devices that share the tasks.
+        advance: called before each of the measurements with its name, the number of those done, and their number.
     """
     ego, tasks = profile.ego, len(profile.task_layouts)
+    advance("measuring how fast egos learn", 0, _MEASUREMENTS)
     learning = calibrate(ego, partial(task_learner, profile))
     task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
+    advance("measuring how fast teammates learn", 1, _MEASUREMENTS)
     populations = [run.steps for run in population_runs(profile, profile.algorithms, 0)]
     playing = calibrate(profile.teammates.ppo, partial(calibration_population, profile)) if populations else None
+    advance("measuring the size of releases", 2, _MEASUREMENTS)
+    sizes = {kind: bytes_per_transition(kind) for kind in KINDS}
+    advance("measured", _MEASUREMENTS, _MEASUREMENTS)
     population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
     in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
     kept = tasks * profile.keep * ego.episodes * KEPT_STEPS
@@ -150,7 +162,7 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
         recorded_transitions=tasks * ego.environments * ego.episodes * KEPT_STEPS,
         kept_transitions=kept,
         artefact_bytes=artefact_bytes(profile.task_layouts, ego),
-        **{f"{kind}_bytes": round(kept * bytes_per_transition(kind)) for kind in KINDS},
+        **{f"{kind}_bytes": round(kept * size) for kind, size in sizes.items()},
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
         teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
         steps_per_second=round(learning.steps_per_second, 1),

@@ -56,7 +56,10 @@ POPULATION_SAVE_SECONDS = 60.0
 """Interval of saves: the work that a kill can cost."""
 
 _SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
-_POPULATION, _RESUME = "population.json", "resume.safetensors"
+POPULATION = "population.json"
+"""The record of a finished population."""
+
+_RESUME = "resume.safetensors"
 
 PopulationCallback = Callable[[int, int, dict[str, float]], None]
 """Called after each update with its number, the number of all updates, and the metrics."""
@@ -69,7 +72,8 @@ class PopulationRun:
     Attributes:
         layout: the layout.
         algorithm: one of `ALGORITHMS`.
-        members: policies for the suite.
+        members: policies for the suite. CoMeDi trains one more, the first, by self-play alone: the others are compared
+            with it, and it is no teammate itself.
         config: hyper-parameters of each policy.
         seed: seed of everything.
 
@@ -116,11 +120,11 @@ class PopulationRun:
 
     @cached_property
     def stages(self) -> list[Population]:
-        """The stages of training, one after the other; CoMeDi adds one member in each."""
+        """The stages of training, one after the other; CoMeDi trains one policy in each, the first by self-play."""
         env = Environment(self.layout)
         if self.algorithm == "comedi":
             first = Population(env, FCP(1), self.config, partners=2)
-            return [first, *[Population(env, CoMeDi(), self.config)] * (self.members - 1)]
+            return [first, *[Population(env, CoMeDi(), self.config)] * self.members]
         kinds = {"fcp": FCP, "brdiv": BRDiv, "lbrdiv": LBRDiv}
         return [Population(env, kinds[self.algorithm](self.members), self.config)]
 
@@ -143,7 +147,7 @@ class PopulationRun:
 def is_population_finished(folder: Path, run: PopulationRun) -> bool:
     """Returns whether a folder has this population under these settings, with all its files unchanged."""
     try:
-        content = json.loads((folder / _POPULATION).read_text(encoding="utf-8"))
+        content = json.loads((folder / POPULATION).read_text(encoding="utf-8"))
         same = content["settings_hash"] == run.settings_hash
         return same and hashes_hold(folder, content["files"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -191,7 +195,7 @@ class _PopulationTraining:
         self.interval = SaveInterval(run.updates, seconds=save_seconds)
 
     def train(self) -> None:
-        if (self.folder / _POPULATION).exists():
+        if (self.folder / POPULATION).exists():
             raise OptionError(
                 f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
             )
@@ -216,7 +220,7 @@ class _PopulationTraining:
     def _difference(self) -> str:
         """Returns a text that names the settings in which a finished population differs from this run."""
         try:
-            found = json.loads((self.folder / _POPULATION).read_text(encoding="utf-8"))["settings"]
+            found = json.loads((self.folder / POPULATION).read_text(encoding="utf-8"))["settings"]
             other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
         except (OSError, ValueError, KeyError, AttributeError):
             other = {}
@@ -312,8 +316,13 @@ class _PopulationTraining:
             for name in (POLICY_WEIGHTS, POLICY_CARD)
             for path in sorted(self.folder.rglob(name))
         }
-        content = {"settings_hash": self.run.settings_hash, "settings": self.run.settings, "files": files}
-        with atomic_write(self.folder / _POPULATION) as partial:
+        content = {
+            "settings_hash": self.run.settings_hash,
+            "settings": self.run.settings,
+            "software": software_versions(),
+            "files": files,
+        }
+        with atomic_write(self.folder / POPULATION) as partial:
             write_json(partial, content)
         (self.folder / _RESUME).unlink(missing_ok=True)
 
@@ -330,14 +339,21 @@ class SuiteCheckpoint:
     path: str
     card: dict[str, Any]
 
+    @property
+    def is_member(self) -> bool:
+        """Whether the population's objective shaped the policy: all but CoMeDi's first one, plain self-play."""
+        return self.card["algorithm"] != "comedi" or self.card["member"] > 0
+
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
     """Returns whether a suite has this population and it is finished."""
-    return (suite / layout / algorithm / _POPULATION).is_file()
+    return (suite / layout / algorithm / POPULATION).is_file()
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
-    """Yields a population's checkpoints, by member and checkpoint.
+    """Yields the checkpoints of a population's members, by member and checkpoint.
+
+    Without those of CoMeDi's first policy, which is trained as FCP's are (see `SuiteCheckpoint.is_member`).
 
     Raises:
         OptionError: if the population is not finished.
@@ -347,7 +363,9 @@ def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Suit
         raise OptionError(f"{folder}: no finished population; run `python -m generation teammates --layout {layout}`")
     found = [path.parent for path in folder.glob(f"m*/c*/{POLICY_WEIGHTS}")]
     for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
-        yield SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
+        point = SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
+        if point.is_member:
+            yield point
 
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:

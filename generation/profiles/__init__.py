@@ -62,6 +62,8 @@ class Profile:
         layouts: names of the layouts.
         presets: teammates by the heuristic H4 `utility_greedy`, on every layout.
         algorithms: layout -> algorithms of its learned teammates.
+        policies: whether the release has the policies that label its histories.
+        xla_threads: threads of XLA on a CPU, so that every machine computes the same bits; None for all cores.
 
     Raises:
         OptionError: if there is no task, or the ego's sizes do not fit.
@@ -75,8 +77,12 @@ class Profile:
     layouts: tuple[str, ...]
     presets: tuple[str, ...] = ()
     algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    policies: bool = False
+    xla_threads: int | None = None
 
     def __post_init__(self) -> None:
+        if self.xla_threads is not None and self.xla_threads < 1:
+            raise OptionError(f"xla_threads = {self.xla_threads}: expected at least 1")
         if not self.task_layouts:
             raise OptionError("expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms")
         if not 0 < self.keep <= self.ego.environments:
@@ -152,8 +158,8 @@ def load_profile(name: str) -> Profile:
 
 
 def _profile(name: str, content: dict[str, Any]) -> Profile:
-    _check_keys(content, "", {"ego", "teammates", "release", "tasks"})
-    _check_keys(content["release"], "release.", {"keep", "data_version"})
+    _check_keys(content, "", {"xla_threads", "ego", "teammates", "release", "tasks"})
+    _check_keys(content["release"], "release.", {"keep", "data_version", "policies"})
     _check_keys(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
     tasks = content["tasks"]
     layouts = _layouts("tasks.layouts", tasks["layouts"])
@@ -166,6 +172,8 @@ def _profile(name: str, content: dict[str, Any]) -> Profile:
         layouts=layouts,
         presets=_names("tasks.presets", tasks.get("presets", [])),
         algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
+        policies=_switch("release.policies", content["release"].get("policies", False)),
+        xla_threads=_typed("xla_threads", content["xla_threads"], int) if "xla_threads" in content else None,
     )
 
 
@@ -226,6 +234,12 @@ def _layouts(key: str, value: Any) -> tuple[str, ...]:
 def _typed(key: str, value: Any, kind: type) -> Any:
     if isinstance(value, bool) or not isinstance(value, kind):
         raise OptionError(f"{key} = {value!r}: expected {kind.__name__}")
+    return value
+
+
+def _switch(key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise OptionError(f"{key} = {value!r}: expected true or false")
     return value
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-from filelock import FileLock
 from rich.console import Console
 
 from generation.collection.job import CollectionError
@@ -20,6 +19,7 @@ from generation.releases.package import package_release
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.writing.release_folder import check_replaceable
 from icrl4aht_data.writing.statistics import print_statistics
 
@@ -35,6 +35,7 @@ def build_releases(
     options: CollectOptions | None = None,
     suite: Path | None = None,
     seed: int = 0,
+    tasks: Sequence[Task] | None = None,
 ) -> list[Path]:
     """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
 
@@ -44,8 +45,10 @@ def build_releases(
         kinds: kinds of releases.
         console: where progress is printed.
         options: how tasks are collected.
-        suite: folder of the learned teammates; by default out/suite.
+        suite: folder of the learned teammates: a suite, by default out/suite, or with `tasks` also the folder
+            TEAMMATES of a release.
         seed: seed of the suite.
+        tasks: tasks to collect instead of the profile's, which trains no teammates.
 
     Returns:
         The release folders.
@@ -56,16 +59,17 @@ def build_releases(
     for kind in kinds:
         check_replaceable(out / kind)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
-    tasks = train_teammates(profile, suite, seed, console)
+    tasks = train_teammates(profile, suite, seed, console) if tasks is None else list(tasks)
     collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)
     releases = []
-    with FileLock(out / ".packing.lock"):  # another collector on this folder packs the same releases
+    with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
         for kind in kinds:
             with progress_bars(console) as bars:
-                bar = bars.add_task(f"packing {kind}", total=len(tasks), note="")
+                steps = [f"choosing labellers for {kind}", f"packing {kind}"]
+                rows = [bars.add_task(step, total=len(tasks), note="", unit="tasks") for step in steps]
 
-                def advance(task: Task, bars=bars, bar=bar) -> None:
-                    bars.advance(bar)
+                def advance(step: int, bars=bars, rows=rows) -> None:
+                    bars.advance(rows[step])
 
                 releases.append(package_release(out / "artefacts", out / kind, tasks, profile, suite, kind, advance))
         for release in releases:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,13 +11,15 @@ from typing import Any
 import numpy as np
 
 from generation.collection.failures import FAILED
-from generation.collection.task_folder import FILTER_CURVES
+from generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS, METADATA
 from generation.learners.resume import TIMING
+from generation.populations.train import POPULATION
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.utils.hashes import file_hash
 
-_IGNORED = {TIMING, FAILED, FILTER_CURVES}
-"""Files about the course of a rebuild, and pictures of its results."""
+_IGNORED = {TIMING, FAILED, FILTER_CURVES, LABELLER_RETURNS}
+"""Files about the course of a rebuild, and those that packing adds to artefacts."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
@@ -27,10 +31,13 @@ class Comparison:
     Attributes:
         files: number of files in either folder.
         differences: file -> how it differs.
+        xla_threads: the numbers of XLA threads that made each folder, as far as they were recorded; results of
+            different numbers differ in their bits.
     """
 
     files: int = 0
     differences: dict[str, str] = field(default_factory=dict)
+    xla_threads: tuple[list[int], list[int]] = ([], [])
 
     def to_json(self) -> dict[str, Any]:
         """The fields, and whether the folders are equal."""
@@ -38,7 +45,9 @@ class Comparison:
 
 
 def compare_rebuilds(a: Path, b: Path) -> Comparison:
-    """Compare two folders by the hashes of their files, except wall-clock figures, failures, pictures and hidden files.
+    """Compare two folders by the hashes of their files.
+
+    Wall-clock figures, failures, hidden files and what packing adds to artefacts are left out.
 
     Raises:
         OptionError: if one is not a folder, or there is nothing to compare.
@@ -47,7 +56,7 @@ def compare_rebuilds(a: Path, b: Path) -> Comparison:
         if not folder.is_dir():
             raise OptionError(f"{folder}: no such folder")
     ours, theirs = _files(a), _files(b)
-    result = Comparison(len(ours | theirs))
+    result = Comparison(len(ours | theirs), xla_threads=(_xla_threads(a, ours), _xla_threads(b, theirs)))
     if not result.files:
         raise OptionError(f"{a} and {b}: no files to compare")
     for name in sorted(ours | theirs):
@@ -63,6 +72,27 @@ def compare_rebuilds(a: Path, b: Path) -> Comparison:
 def _files(root: Path) -> set[str]:
     paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file() and path.name not in _IGNORED]
     return {path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)}
+
+
+def _xla_threads(root: Path, names: set[str]) -> list[int]:
+    """The numbers of XLA threads in records of tasks, populations and releases; nothing of unreadable files."""
+    found = set()
+    for name in names:
+        if name.endswith((METADATA, POPULATION, PROVENANCE)):
+            try:
+                found |= set(_values(json.loads((root / name).read_text(encoding="utf-8")), "xla_threads"))
+            except (OSError, ValueError):
+                continue  # the comparison of files reports it
+    return sorted(value for value in found if isinstance(value, int))
+
+
+def _values(content: Any, name: str) -> Iterator[Any]:
+    """Yields the values of a key at any depth of a JSON value."""
+    if isinstance(content, dict):
+        if name in content:
+            yield content[name]
+        for value in content.values():
+            yield from _values(value, name)
 
 
 def _describe_difference(a: Path, b: Path) -> str:

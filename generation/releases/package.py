@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -16,10 +17,11 @@ from generation.collection.task_folder import FILTER_CURVES, METADATA
 from generation.learners.checkpoint import load_policy
 from generation.populations.select import THRESHOLD
 from generation.profiles import Profile
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from generation.releases.labeller import choose_labeller
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
@@ -34,9 +36,11 @@ def package_release(
     profile: Profile,
     suite: Path,
     kind: Kind,
-    done: Callable[[Task], None] = lambda task: None,
+    advance: Callable[[Literal[0, 1]], None] = lambda step: None,
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
+
+    The histories of a task are labelled by the checkpoint of its ego that `choose_labeller` returns.
 
     Args:
         artefacts: folder of the tasks' finished artefacts.
@@ -45,10 +49,13 @@ def package_release(
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
-        done: called after each task.
+        advance: called after each task with 0, when its labeller is chosen, and with 1, when it is written.
     """
-    new = [_new_task(artefacts / task.task_id, task, profile, suite) for task in tasks]
-    return write_release(target, kind, new, data_version=profile.data_version, done=done)
+    new = []
+    for task in tasks:
+        new.append(_new_task(artefacts / task.task_id, task, profile, suite))
+        advance(0)
+    return write_release(target, kind, new, data_version=profile.data_version, done=lambda task: advance(1))
 
 
 def bundle_release(release: Path) -> Path:
@@ -63,6 +70,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")
     streams = best_streams(rewards, profile.keep)
     plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
+    labeller = choose_labeller(folder, task, suite)
     populations = TeammateSuite(
         algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
         members=profile.teammates.members,
@@ -78,21 +86,32 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         code_version=metadata["code_version"],
         jax_version=metadata["jax_version"],
         platform=metadata["platform"],
+        xla_threads=metadata["xla_threads"],
         seed=task.seed,
         teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
         streams_recorded=metadata["ego"]["environments"],
         streams_kept=profile.keep,
         filter=filter_report(rewards, streams),
-        expert=ExpertLabels(metadata["files"]["policy.safetensors"], "greedy, recurrent"),
+        expert=ExpertLabels(
+            policy_sha256=labeller.sha256,
+            action="greedy, recurrent",
+            step=labeller.step,
+            return_greedy=labeller.return_greedy,
+            return_sampled=labeller.return_sampled,
+            episodes=LABEL_EPISODES,
+            last_return_greedy=labeller.last_return_greedy,
+        ),
         suite=populations if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
-    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams), files)
+    if profile.policies:
+        files |= expert_files(labeller.folder, labeller.sha256)
+    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams, labeller.folder), files)
 
 
-def _histories(folder: Path, task: Task, streams: np.ndarray) -> Iterator[NewHistory]:
+def _histories(folder: Path, task: Task, streams: np.ndarray, labeller: Path) -> Iterator[NewHistory]:
     arrays = HistoryArrays(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields})
-    network, params, _ = load_policy(folder)
+    network, params, _ = load_policy(labeller)
     labels = relabel(task.layout, network, params, (arrays.state[stream] for stream in streams))
     dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)
     for stream, expert in zip(streams, labels, strict=True):

@@ -40,6 +40,9 @@ EPISODE_STEPS = 400
 KEPT_STEPS = 100
 """Steps kept of each training episode, and steps of an evaluation episode (paper, App. C and Sec. 4.3)."""
 
+LABEL_EPISODES = 200
+"""Episodes of `KEPT_STEPS` steps over which the returns of the policy behind expert actions are measured."""
+
 PAPER_EGO_STEPS = 60_000_000
 """Environment steps for which an ego learns (paper, App. C.2.2)."""
 

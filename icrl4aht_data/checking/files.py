@@ -10,10 +10,11 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import NamedProgress, Report
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
-from icrl4aht_data.format.schema import MANIFEST, TEAMMATES
+from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.schema import HISTORIES, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.remote.download import ORIGIN
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.hashes import file_hash
@@ -102,3 +103,39 @@ def check_checkpoints(root: Path, tasks: list[Task], report: Report) -> None:
                 report.add(name, f"sha256 {found}, expected {expected} as task {task.task_id!r} says")
     if without:
         report.notes.append(f"{without} tasks have learned teammates whose checkpoints this release does not have")
+
+
+def check_experts(index: Index, report: Report) -> None:
+    """Check what index and folder EXPERTS say of the policies behind the expert actions against meta/provenance.json.
+
+    A release may omit the policies.
+    """
+    try:
+        provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
+    except Icrl4ahtError as error:
+        if report.ok:  # else the problem is among those reported
+            report.add(PROVENANCE, str(error))
+        return
+    for task_id, of_task in provenance.items():
+        if of_task.expert is None:
+            continue
+        name = expert_folder(of_task.expert.policy_sha256)
+        try:
+            files = expert_files(resolve_inside(index.root, name), of_task.expert.policy_sha256, index.root)
+        except Icrl4ahtError as error:
+            report.add(name, str(error))
+            continue
+        for name, path in files.items():
+            found, expected = file_hash(path), of_task.expert.policy_sha256
+            if path.suffix == ".safetensors" and found != expected:
+                report.add(name, f"sha256 {found}, expected {expected} as {PROVENANCE} says of task {task_id!r}")
+    for entry in index.entries:
+        expert = provenance.get(entry.task_id, Provenance()).expert
+        found = (entry.expert_return, entry.expert_return_sampled, entry.expert_step)
+        expected = (None,) * 3 if expert is None else (expert.return_greedy, expert.return_sampled, expert.step)
+        if found != expected:
+            report.add(
+                HISTORIES,
+                f"history {entry.history_id}: expert_return, expert_return_sampled and expert_step are {found}, "
+                f"expected {expected} as in {PROVENANCE}",
+            )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.checking.files import check_checkpoints, check_files, check_shard_sizes
+from icrl4aht_data.checking.files import check_checkpoints, check_experts, check_files, check_shard_sizes
 from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
@@ -110,6 +110,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         check_shard_sizes(origin, index, shards, report)
     else:
         check_checkpoints(origin.folder, tasks, report)
+        check_experts(index, report)
         _check_shards(index, shards, report, advance)
 
 

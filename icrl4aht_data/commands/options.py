@@ -24,6 +24,7 @@ from icrl4aht_data.commands.requirements import PACKAGE, extra_with
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.progress import LineProgress
 
 SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
 
@@ -202,16 +203,19 @@ def examples(*lines: str) -> str:
 
 
 @contextmanager
-def bars(quiet: bool = False, of_bytes: bool = False) -> Iterator[Callable[..., None]]:
+def bars(quiet: bool = False, of_bytes: bool = False, edges: bool = False) -> Iterator[Callable[..., None]]:
     """Show progress bars on a terminal; yields a function `show(name, done, total, note="")`, one bar for each name.
+
+    Where stderr is not a terminal, a plain line a minute is printed instead, see `LineProgress`.
 
     Args:
         quiet: show nothing.
         of_bytes: the numbers are bytes: show sizes and speed.
+        edges: print plain lines also at the start and at the end.
     """
     console, running = Console(stderr=True), {}
     columns = (*Progress.get_default_columns(), *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()))
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as shown:
+    with LineProgress(*columns, console=console, quiet=quiet, of_bytes=of_bytes, edges=edges, transient=True) as shown:
 
         def show(name: str, done: int, total: int | None, note: str = "") -> None:
             if name not in running:

@@ -12,13 +12,14 @@ import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import FAMILIES, check_membership
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, unknown
+from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError, unknown
 from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from icrl4aht_data.utils.cache import cached_arrays, content_hash
+from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import LINE_BYTES, plain_size, wrap_read_errors
 from icrl4aht_data.utils.paths import LARGEST
+from icrl4aht_data.utils.remembered import remembered_hash
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")
 """The entry fields that can be filtered by."""
@@ -125,7 +126,7 @@ def read_columns(path: Path) -> Columns:
         size = plain_size(path, LARGEST)
         if size < _UNCACHED:
             return Columns(_parse(path))
-        key = f"index-{_VERSION}-{content_hash(path)}"
+        key = f"index-{_VERSION}-{remembered_hash(path)}"
     parsed: dict[str, np.ndarray] = {}
 
     def build(folder: Path) -> None:
@@ -135,10 +136,8 @@ def read_columns(path: Path) -> Columns:
 
     try:
         return Columns(cached_arrays(key, size, build))
-    except (OSError, Icrl4ahtError) as error:
-        if isinstance(error, IndexFormatError):
-            raise
-        return Columns(parsed or _parse(path))  # there is no cache folder, or it is too small
+    except (CacheError, OptionError):  # there is no cache folder, or it is too small
+        return Columns(parsed or _parse(path))
 
 
 def _parse(path: Path) -> dict[str, np.ndarray]:

@@ -85,6 +85,8 @@ class LayoutStatistics:
         actions: number of actions.
         mean_final_return: mean of `Entry.return_end` over the histories.
         disk_bytes: size of the shards.
+        independent_teammates: number of teammates that were not trained together: several checkpoints of one member of
+            a population count once. None where it was not counted.
     """
 
     original_transitions: int | None
@@ -96,6 +98,7 @@ class LayoutStatistics:
     actions: int
     mean_final_return: float
     disk_bytes: int
+    independent_teammates: int | None = None
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,34 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from icrl4aht_data.errors import IndexFormatError, UnsafePathError
-from icrl4aht_data.format.schema import MANIFEST
+from icrl4aht_data.format.schema import MANIFEST, TEAMMATES
 from icrl4aht_data.utils.files import atomic_write, read_text
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import is_inside, resolve_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
+
+_NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
+_KNOWN = re.compile(
+    "|".join(
+        (
+            r"README\.md|LICENSE|CITATION\.cff|croissant\.json",
+            r"meta/(info\.json|histories\.jsonl|tasks\.jsonl|provenance\.json|source_card\.md)",
+            rf"data/{_NAME}/{_NAME}/{_NAME}\.h5",
+            rf"meta/chunks/{_NAME}/{_NAME}/{_NAME}\.npy",
+            rf"({TEAMMATES}|experts)/[0-9a-f]{{64}}/(policy\.json|policy\.safetensors|README\.md)",
+            rf"figures/{_NAME}\.(png|svg)",
+            rf"index/{_NAME}/{_NAME}\.parquet",
+        )
+    )
+)
+"""Paths of all files that a release may have. A release is unpacked into folders in which other programs look for
+files of their own (.git/config, sitecustomize.py, x.pth), so everything else is refused, whatever its name."""
+
+
+def is_known_file(name: str) -> bool:
+    """Whether a path in a release is that of a file which releases have, except the manifest itself."""
+    return _KNOWN.fullmatch(name) is not None
 
 
 def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
@@ -25,7 +47,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
 
     Raises:
         IndexFormatError: names the line.
-        UnsafePathError: for a path that leads out of the release.
+        UnsafePathError: for a path that leads out of the release, or is not that of a file which releases have.
     """
     if text and not text.endswith("\n"):
         raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
@@ -40,16 +62,17 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
             raise UnsafePathError(
                 f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn its publisher"
             )
+        if not is_known_file(name):
+            raise UnsafePathError(
+                f"{path}, line {number}: {name[:200]!r} is not a file that a release has: do not use it, and warn its "
+                f"publisher; if a later version of this package wrote it, update the package"
+            )
         if name in listed:
             raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice")
         twin = folded.setdefault(unicodedata.normalize("NFC", name).casefold(), name)
         if twin != name:
             raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
         listed[name] = digest
-    for key, name in folded.items():
-        slashes = (position for position, character in enumerate(key) if character == "/")
-        if any(key[:end] in folded for end in slashes):
-            raise IndexFormatError(f"{path}: {name!r} is in a folder that is a file by another line")
     return listed
 
 
@@ -65,9 +88,15 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     Args:
         root: the folder.
         known: file -> SHA-256 of files that need not be read.
+
+    Raises:
+        UnsafePathError: if the folder has a file that releases do not have.
     """
     known = known or {}
     names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    foreign = [name for name in names if name != MANIFEST and not is_known_file(name)]
+    if foreign:
+        raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release has; remove it")
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
     with atomic_write(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")

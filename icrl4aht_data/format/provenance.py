@@ -59,7 +59,7 @@ class ExpertLabels:
         last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
     """
 
-    policy_sha256: str
+    policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     action: str
     step: _Count | None = None
     return_greedy: _Return | None = None
@@ -105,7 +105,7 @@ class Provenance:
         code_version: version of this package.
         jax_version: version of JAX.
         platform: JAX backend, such as "cpu".
-        xla_threads: threads that XLA computed with; results differ in the last bits between numbers of threads.
+        xla_threads: threads of one operation on a CPU, which decide the bits; None on other platforms.
         seed: the learner's seed.
         teammate: how the teammate played: its `slot` and the source of its `noise`.
         streams_recorded: environment streams of the learner.
@@ -123,7 +123,7 @@ class Provenance:
     code_version: str | None = None
     jax_version: str | None = None
     platform: str | None = None
-    xla_threads: _Count | None = None
+    xla_threads: Annotated[int, Meta(ge=1)] | None = None
     seed: int | None = None
     teammate: dict[str, Any] | None = None
     streams_recorded: _Streams | None = None

@@ -299,6 +299,16 @@ def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return returns[..., :window].mean(axis=-1), returns[..., -window:].mean(axis=-1)
 
 
+def are_labels_weak(expert_return: float | None, return_end: float) -> bool:
+    """Whether expert actions come from a policy that earns less than half of what the ego earned at a history's end.
+
+    Args:
+        expert_return: the policy's greedy return; None, which is not weak, where it was not measured.
+        return_end: mean return of the history's last episodes.
+    """
+    return expert_return is not None and expert_return < return_end - abs(return_end) / 2
+
+
 def stream_score(returns: np.ndarray) -> np.ndarray:
     """float64 (B,): end + (end - start) of learning curves (B, N) (paper, App. F.1)."""
     start, end = curve_ends(returns)

@@ -21,7 +21,7 @@ from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
-from icrl4aht_data.utils.cache import cache_room, cached_arrays
+from icrl4aht_data.utils.cached_arrays import cache_room, cached_arrays, new_mapped_array
 from icrl4aht_data.utils.memory import free_memory
 from icrl4aht_data.utils.threads import in_slices
 
@@ -137,7 +137,7 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
 
     def build(folder: Path) -> None:
         def make(shape: tuple[int, ...], dtype: np.dtype, name: str) -> np.memmap:
-            return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape)
+            return new_mapped_array(folder / f"{name}.npy", shape, dtype)
 
         for array in _decode(entries, shards, threads, make).values():
             array.flush()  # type: ignore[attr-defined]

@@ -5,6 +5,7 @@ Sizes are checked before a file is read: it may be a pipe, which never ends, or 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -12,7 +13,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from icrl4aht_data.errors import IndexFormatError
 
@@ -127,6 +128,41 @@ def add_filename(path: Path) -> Iterator[None]:
         if error.errno is not None and error.filename is None:
             error.filename = str(path)
         raise
+
+
+def allocate(stream: BinaryIO, size: int) -> None:
+    """Extend a new file to `size` bytes, for which the disk really has room.
+
+    A sparse file would kill a process by a signal when it writes to a map of the file and the disk is full.
+
+    Raises:
+        OSError: if there is no room.
+    """
+    stream.flush()
+    try:
+        os.posix_fallocate(stream.fileno(), 0, size)
+    except (AttributeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL):
+            raise
+        for start in range(stream.tell(), size, LINE_BYTES):  # neither the system nor its C library can allocate
+            stream.write(bytes(min(LINE_BYTES, size - start)))
+        stream.flush()
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's names, are on the disk.
+
+    Raises:
+        OSError: if they cannot be written.
+    """
+    if path.is_dir() and os.name == "nt":  # folders cannot be opened there
+        return
+    number = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        with add_filename(path):
+            os.fsync(number)
+    finally:
+        os.close(number)
 
 
 @contextmanager

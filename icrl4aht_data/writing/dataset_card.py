@@ -14,6 +14,8 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
     FAMILIES,
+    KEPT_STEPS,
+    LABEL_EPISODES,
     PAPER_EGO_STEPS,
     PAPER_TEAMMATE_STEPS,
     PAPER_TEAMMATES,
@@ -25,7 +27,7 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.provenance import Provenance, TeammateSuite, read_provenance
-from icrl4aht_data.format.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry
+from icrl4aht_data.format.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry, are_labels_weak
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.paths import files_below
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
@@ -125,6 +127,7 @@ def render_card(release: CardContent) -> str:
         viewer=" The dataset viewer shows the index, one row per history." if parquet else "",
         limits=_bullets(_limits(release)),
         statistics=markdown_table(["property", *statistics], statistics_rows(statistics), right=len(statistics)),
+        labels=_labels(release),
         curves=_figure(release, CURVES_FIGURE, "Learning curves") + _curves_table(release),
         layouts=_figure(release, LAYOUTS_FIGURE, layouts_caption) + _layouts_table(release),
         protocol=HEADROOM_PROTOCOL,
@@ -209,6 +212,8 @@ def _limits(release: CardContent) -> list[str]:
     limits.append(sentence("dependent_streams"))
     if release.distinct("filter"):
         limits.append(sentence("filtered"))
+    if weak := sum(_labels_are_weak(members) for members in release.groups("task_id").values()):
+        limits.append(sentence("weak_limit", weak=_tasks_in_words(weak)))
     return limits
 
 
@@ -273,6 +278,52 @@ def _curves_table(release: CardContent) -> str:
     return markdown_table(header, rows, right=len(header) - 3)
 
 
+def _labels(release: CardContent) -> str:
+    """Return a table of what the policy behind each task's expert actions earns, with an explanation."""
+    header = ["layout", "split", "teammate", "step", "greedy", "sampled", "last"]
+    teammates = {task.task_id: f"{task.teammate_kind}/t{task.teammate.get('theta_id', 0)}" for task in release.tasks}
+    rows, weak = [], 0
+    for (task_id,), members in release.groups("task_id").items():
+        first = members[0]
+        if first.expert_return is None:
+            continue
+        sampled = "unknown" if first.expert_return_sampled is None else f"{first.expert_return_sampled:z.1f}"
+        row = [first.layout, first.split, teammates.get(task_id, first.teammate_kind)]
+        row += ["unknown" if first.expert_step is None else f"{first.expert_step:,}"]
+        row += [f"{first.expert_return:z.1f}", sampled, f"{_mean_end(members):z.1f}"]
+        is_weak = _labels_are_weak(members)
+        rows.append([f"**{cell}**" for cell in row] if is_weak else row)
+        weak += is_weak
+    if not rows:
+        return sentence("unmeasured_labels")
+    explained = sentence("labels", episodes=LABEL_EPISODES, steps=KEPT_STEPS)
+    verdict = sentence("weak_labels", weak=_tasks_in_words(weak)) if weak else sentence("no_weak_labels")
+    return f"{explained} {verdict}\n\n{markdown_table(header, rows, right=4)}"
+
+
+def _labels_are_weak(histories: Sequence[Entry]) -> bool:
+    """Whether the labels of a task's histories earn less than half of the histories' end."""
+    return are_labels_weak(histories[0].expert_return, _mean_end(histories))
+
+
+def _mean_end(histories: Sequence[Entry]) -> float:
+    return float(np.mean([entry.return_end for entry in histories]))
+
+
+def _labellers(release: CardContent) -> str:
+    """Return a sentence on which checkpoints label; empty if they were not measured."""
+    experts = [of_task.expert for of_task in release.provenance.values() if of_task.expert is not None]
+    measured = [expert for expert in experts if expert.return_greedy is not None]
+    earlier = sum(expert.return_greedy != expert.last_return_greedy for expert in measured)
+    if earlier:
+        return sentence("earlier_labels", earlier=earlier, tasks=len(measured))
+    return sentence("last_labels") if measured else ""
+
+
+def _tasks_in_words(number: int) -> str:
+    return "1 task" if number == 1 else f"{number:,} tasks"
+
+
 def _layouts_table(release: CardContent) -> str:
     rows = []
     for layout in map(get_layout, release.info.layouts):
@@ -327,8 +378,14 @@ def _provenance(release: CardContent) -> list[str]:
             for names, members in layouts.items()
         ]
     if release.distinct("expert"):
-        lines.append(sentence("expert_source"))
-    labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
+        lines.append(sentence("expert_source", labellers=_labellers(release)).rstrip())
+    labels = {
+        "profile": "profile",
+        "code_version": "icrl4aht-data",
+        "jax_version": "JAX",
+        "platform": "platform",
+        "xla_threads": "XLA threads",
+    }
     found = {label: ", ".join(map(str, release.distinct(name))) for name, label in labels.items()}
     if versions := [f"{label} {values}" for label, values in found.items() if values]:
         lines.append(sentence("versions", versions="; ".join(versions)))

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import INFO
+from icrl4aht_data.utils.locks import lock_beside, process_lock
 
 
 @contextmanager
@@ -25,7 +26,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
     try:
-        with FileLock(target.with_name(f".{target.name}.lock"), timeout=0):
+        with process_lock(lock_beside(target), wait=False):
             if old.exists() and not target.exists():  # a writer was killed between the two renames below
                 old.rename(target)
             for leftover in (new, old):

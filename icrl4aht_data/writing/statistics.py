@@ -24,6 +24,7 @@ _ROWS = {
     "filtered_transitions": "Filtered transitions",
     "history_length": "History length",
     "teammates": "Num. teammates",
+    "independent_teammates": "of these, not checkpoints of one policy",
     "steps_per_episode": "Steps per episode",
     "obs_shape": "Obs. shape",
     "actions": "Num. actions",
@@ -55,7 +56,8 @@ def layout_statistics(
         recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
         streams = [number for number in recorded if number is not None]
         original = sum(map(mul, streams, lengths.values())) if len(streams) == len(recorded) else None
-        teammates = {json.dumps(task.teammate, sort_keys=True) for task in tasks if task.task_id in lengths}
+        own = [task for task in tasks if task.task_id in lengths]
+        teammates = {json.dumps(task.teammate, sort_keys=True) for task in own}
         steps = [entry.T for entry in members]
         statistics[layout] = LayoutStatistics(
             original_transitions=original,
@@ -66,9 +68,18 @@ def layout_statistics(
             obs_shape=members[0].obs_shape,
             actions=len(ACTIONS),
             mean_final_return=round(float(np.mean([entry.return_end for entry in members])), 3),
+            independent_teammates=len(set(map(_policy, own))) or None,
             disk_bytes=sum(sizes[shard] for shard in {entry.shard for entry in members}),
         )
     return statistics
+
+
+def _policy(task: Task) -> str:
+    """A text that is equal for checkpoints of one policy's training, and for nothing else."""
+    checkpoint = task.teammate.get("theta", {}).get("checkpoint")
+    if task.teammate_family != "rl" or checkpoint is None:
+        return json.dumps(task.teammate, sort_keys=True)
+    return f"{checkpoint.rpartition('/')[0]} {task.teammate.get('base_seed')}"
 
 
 def statistics_rows(statistics: Mapping[str, LayoutStatistics]) -> list[list[str]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import TASKS, TEAMMATES, Kind, held_fields
 from icrl4aht_data.writing.release import NewHistory, NewTask
@@ -53,7 +53,7 @@ def release_tasks(dataset: Dataset) -> list[Task]:
 def stored_task(
     dataset: Dataset, task: Task, provenance: Provenance, kind: Kind, done: Callable[[], None] = lambda: None
 ) -> NewTask:
-    """Return a task to write, with all histories of a selection in order, and the checkpoint of its teammate.
+    """Return a task to write, with all histories of a selection in order, and the checkpoints of teammate and expert.
 
     Args:
         dataset: histories of the task.
@@ -70,4 +70,7 @@ def stored_task(
             done()
 
     files = checkpoint_files(dataset.origin.below(TEAMMATES), task, dataset.root)
+    if provenance.expert is not None:
+        sha256 = provenance.expert.policy_sha256
+        files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
     return NewTask(task, provenance, len(dataset), load, files, dataset.entries[0].source)

@@ -19,9 +19,11 @@ from safetensors.numpy import save_file
 
 from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
 from icrl4aht_data.checking.report import Report
+from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import parse_manifest
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, UnsafePathError
+from icrl4aht_data.format.manifest import parse_manifest, write_manifest
+from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.remote.download import ORIGIN, repair
 from icrl4aht_data.utils.files import atomic_write, parse_json
 from tests.helpers.paths import ROOT
@@ -144,7 +146,39 @@ def test_reserved_names_of_windows(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
             parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")
-    assert list(parse_manifest(f"{'0' * 64}  console/null.json\n", "MANIFEST")) == ["console/null.json"]
+
+
+FOREIGN = (
+    *(".git/config", ".gitattributes", ".ssh/authorized_keys", ".env", "meta/.hidden.json", "data/.git/config/x.h5"),
+    *("sitecustomize.py", "conftest.py", "evil.pth", "meta/__pycache__/info.pyc", "Makefile", "setup.cfg", "a.so"),
+    *("meta/new.json", "meta/info.json/x", "data/teammate/x.py", "figures/x.html", "MANIFEST.sha256"),
+    *(f"teammates/{'0' * 64}/policy.pt", "teammates/m0/policy.json", "index/x/../../x/a.parquet"),
+)
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_files_that_no_release_has_are_refused(damaged, name):
+    line = f"{'0' * 64}  {name}\n"
+    with pytest.raises(UnsafePathError, match=r"not a file that a release has|leads out"):
+        parse_manifest(line, "MANIFEST")
+    with (damaged / MANIFEST).open("a") as stream:
+        stream.write(line)
+    assert MANIFEST in verify_release(damaged).files_at_fault
+    (damaged / "sitecustomize.py").write_text("")
+    with pytest.raises(UnsafePathError, match=r"'sitecustomize\.py' is not a file that a release has; remove it"):
+        write_manifest(damaged)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("README.md", "LICENSE", "CITATION.cff", "croissant.json", "meta/source_card.md", "figures/headroom.png"),
+        *("index/demo_wide/train.parquet", f"experts/{'a' * 64}/policy.safetensors", f"teammates/{'a' * 64}/README.md"),
+        *("data/layout/coord_ring/train-00000-of-00010.h5", "meta/chunks/layout/coord_ring/train-00000-of-00010.npy"),
+    ],
+)
+def test_files_that_releases_have_are_known(name):
+    assert list(parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")) == [name]
 
 
 def test_findings_are_bounded_and_fit_for_a_terminal():

@@ -1,5 +1,5 @@
 """CoMeDi: members trained in turn, each good with itself and bad with the member it resembles most (Sarkar et al.
-2023; paper, App. B.1).
+2023; paper, App. B.1). The first member has nobody to differ from: it is trained by self-play, as FCP's are.
 
 Policy 0 is the new member; its best response is itself, as in the original. Policy 1 is a frozen member. A quarter of
 the environments each:

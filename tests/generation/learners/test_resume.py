@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from typing import NamedTuple
 
 import jax
@@ -20,7 +23,10 @@ from generation.learners.resume import (
     SaveInterval,
     StateFile,
     differing_settings,
+    limit_xla_threads,
     run_lock,
+    software_versions,
+    xla_threads,
 )
 from icrl4aht_data.errors import OptionError
 
@@ -55,7 +61,57 @@ def file(tmp_path) -> StateFile:
     return StateFile(tmp_path / "s.safetensors", SETTINGS)
 
 
+@pytest.mark.parametrize(
+    ("variables", "threads"),
+    [
+        ({}, len(os.sched_getaffinity(0))),
+        ({"NPROC": "3"}, 3),
+        ({"NPROC": "3", "PJRT_NPROC": "5"}, 5),
+        ({"PJRT_NPROC": "many"}, len(os.sched_getaffinity(0))),
+    ],
+)
+def test_xlas_threads(monkeypatch, variables, threads):
+    for name in ("NPROC", "PJRT_NPROC"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert xla_threads() == threads
+    assert software_versions()["xla_threads"] == threads
+
+
+def test_threads_cannot_change_after_jax_was_used(monkeypatch):
+    jax.devices()
+    monkeypatch.setenv("PJRT_NPROC", "3")
+    limit_xla_threads(3)
+    with pytest.raises(OptionError, match=r"3 threads in this process, expected 1: set PJRT_NPROC=1 before"):
+        limit_xla_threads(1)
+    assert xla_threads() == 3
+
+
+@pytest.mark.slow
+def test_threads_are_limited_before_jax_is_used():
+    """The number of XLA's threads among those of the process grows with the limit."""
+    script = (
+        "import os, jax; from generation.learners.resume import limit_xla_threads, xla_threads\n"
+        "limit_xla_threads({0}); jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))\n"
+        "names = [open(f'/proc/self/task/{{task}}/comm').read() for task in os.listdir('/proc/self/task')]\n"
+        "print(xla_threads(), sum('XLAEigen' in name for name in names))"
+    )
+    for threads in (1, 3):
+        process = subprocess.run(
+            [sys.executable, "-c", script.format(threads)], capture_output=True, text=True, check=True
+        )
+        assert process.stdout.split() == [str(threads)] * 2
+
+
 class TestStateFile:
+    def test_another_number_of_threads_is_refused(self, file, monkeypatch):
+        StateFile(file.path, SETTINGS | software_versions()).save({}, 1)
+        monkeypatch.setenv("PJRT_NPROC", "17")
+        again = StateFile(file.path, SETTINGS | software_versions())
+        with pytest.raises(OtherSettingsError, match=r"xla_threads was (\d+), now it is \d+; set PJRT_NPROC=\1 "):
+            again.load({})
+
     def test_round_trip(self, file):
         assert file.progress is None
         saved = state()
@@ -170,6 +226,7 @@ def test_a_folder_has_one_owner(tmp_path):
         assert not (tmp_path / "run").exists()
     with run_lock(tmp_path / "run"):
         pass
+    assert not list(tmp_path.iterdir()), "the lock's file is removed"
 
 
 def test_settings_that_differ():

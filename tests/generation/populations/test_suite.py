@@ -196,7 +196,7 @@ def test_a_members_return_is_with_itself_without_best_responses(trained):
 def test_the_log_has_a_line_for_each_update(trained, algorithm):
     folder = population(trained(algorithm), algorithm)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    stages = 2 if algorithm == "comedi" else 1
+    stages = 3 if algorithm == "comedi" else 1
     assert [(line["stage"], line["update"]) for line in lines] == [(s, u) for s in range(stages) for u in range(6)]
     for line in lines:
         assert line["step"] == 2048 * (line["update"] + 1)
@@ -383,7 +383,7 @@ def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = 
     folder = population(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}
-        card = {"algorithm": algorithm, "seed": 7, "teammate_return": greedy, "return": -greedy}
+        card = {"algorithm": algorithm, "member": member, "seed": 7, "teammate_return": greedy, "return": -greedy}
         path = folder / f"m{member}" / f"c{checkpoint}"
         save_policy(path, ActorCritic(WIDTHS), params, card)
     (folder / "population.json").write_text("{}")
@@ -409,6 +409,15 @@ def test_candidates_are_sorted_by_number(candidates):
     """Not by name, where m10 comes before m2."""
     found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "fcp")))
     assert found == [f"{LAYOUT.name}/fcp/m{m}/c{c}" for m in range(10) for c in range(5)]
+
+
+def test_comedis_first_policy_is_no_candidate(candidates):
+    """CoMeDi trains it by self-play alone, as FCP trains its members."""
+    found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "comedi")))
+    assert found == [f"{LAYOUT.name}/comedi/m{m}/c{c}" for m in range(1, 10) for c in range(5)]
+    chosen = select_teammates(candidates, LAYOUT.name, "comedi", train=1000, heldout=0)
+    assert (chosen.candidates, chosen.good) == (45, 37)
+    assert not [path for path in paths(chosen.train) if "/m0/" in path]
 
 
 def test_sorted_by_number_with_more_than_ten_members(tmp_path):

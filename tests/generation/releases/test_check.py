@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
+from generation.learners.resume import xla_threads
 from generation.releases.check import compare_rebuilds
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import artefact
@@ -19,6 +20,17 @@ def test_equal_folders(built):
     result = CliRunner().invoke(cli, ["check", str(built / "a"), str(built / "a")])
     assert result.exit_code == 0
     assert "bit-equal" in result.output
+    assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in result.output
+
+
+def test_other_numbers_of_threads_are_said(tmp_path):
+    for name, records in (("a", {"t0": {"xla_threads": 1}, "t1": {"xla_threads": 2}}), ("b", {"t0": {}})):
+        (tmp_path / name / "meta").mkdir(parents=True)
+        (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))
+    assert compare_rebuilds(tmp_path / "a", tmp_path / "b").xla_threads == ([1, 2], [])
+    output = CliRunner().invoke(cli, ["check", str(tmp_path / "a"), str(tmp_path / "b")]).output
+    assert f"{tmp_path / 'a'}: made with 1 and 2 XLA threads" in output
+    assert f"{tmp_path / 'b'}: made with an unknown number of XLA threads" in output
 
 
 def test_what_differs_is_said(built, tmp_path):
@@ -31,21 +43,21 @@ def test_what_differs_is_said(built, tmp_path):
     np.save(theirs / "rewards.npy", np.zeros((2, 3), np.int8))
     lines = (theirs / "metrics.jsonl").read_text().splitlines()
     (theirs / "metrics.jsonl").write_text("\n".join([*lines[:2], "{}", *lines[3:]]) + "\n")
-    (theirs / "policy.json").unlink()
+    (theirs / "checkpoints/c2/policy.json").unlink()
     (theirs / "notes.txt").touch()
-    for name in ("timing.jsonl", "filter.png"):
+    for name in ("timing.jsonl", "filter.png", "labeller_returns.json"):
         (theirs / name).write_bytes(b"another clock")
     result = CliRunner().invoke(cli, ["check", "--json", str(ours), str(theirs)])
     assert result.exit_code == 1
     compared = json.loads(result.output)
     found = compared["differences"]
     assert not compared["equal"]
-    assert set(found) == {"actions.npy", "rewards.npy", "metrics.jsonl", "policy.json", "notes.txt"}
+    assert set(found) == {"actions.npy", "rewards.npy", "metrics.jsonl", "checkpoints/c2/policy.json", "notes.txt"}
     was = int(np.load(ours / "actions.npy")[2, 7])
     assert found["actions.npy"] == f"1 of 4000 values, the first at (2, 7): {was} and {was + 1}"
     assert found["rewards.npy"] == "int8 (8, 500) and int8 (2, 3)"
     assert found["metrics.jsonl"].endswith(", line 3")
-    assert found["policy.json"] == f"only in {ours}"
+    assert found["checkpoints/c2/policy.json"] == f"only in {ours}"
     assert found["notes.txt"] == f"only in {theirs}"
     text = CliRunner().invoke(cli, ["check", str(ours), str(theirs)])
     assert text.exit_code == 1

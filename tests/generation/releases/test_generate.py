@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -24,11 +25,13 @@ from generation.collection import task_folder as artefacts
 from generation.collection.job import CollectionError
 from generation.collection.task_folder import METADATA
 from generation.learners.checkpoint import load_policy
+from generation.learners.config import PPOConfig
 from generation.populations import select
 from generation.populations import train as suite
 from generation.populations.build import build_suite
 from generation.profiles import FOLDER, load_profile
 from generation.releases import build, package
+from generation.releases.check import compare_rebuilds
 from generation.teammates.registry import build_teammate, recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
@@ -37,6 +40,7 @@ from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.tiny import LEARNED, TINY, artefact
@@ -77,10 +81,52 @@ def test_entries_say_where_they_come_from(built):
 
 
 def test_the_final_ego_is_kept(built):
-    network, params, card = load_policy(artefact(built / "a"))
+    network, params, card = load_policy(artefact(built / "a") / "checkpoints/c4")
     assert network.widths.gru == 8
     assert card["steps"] == 16_000
     assert params["params"]["actor"]["kernel"].shape == (8, 6)
+
+
+def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
+    folder = artefact(built / "a")
+    metadata = json.loads((folder / METADATA).read_text())
+    assert metadata["checkpoint_updates"] == [5, 10, 15, 20, 25]
+    kernels = []
+    for number in range(5):
+        _, params, card = load_policy(folder / f"checkpoints/c{number}")
+        assert card["steps"] == metadata["checkpoint_updates"][number] * 640
+        kernels.append(params["params"]["actor"]["kernel"])
+    for one, other in pairwise(kernels):
+        assert (one != other).any()
+    shutil.copytree(folder, tmp_path / "copy")
+    shutil.copy(tmp_path / "copy/checkpoints/c1/policy.json", tmp_path / "copy/checkpoints/c0/policy.json")
+    profile = load_profile(str(built / "tiny.toml"))
+    assert not artefacts.is_task_finished(tmp_path / "copy", profile.heuristic_tasks()[0], profile)
+
+
+def test_few_updates_have_as_many_checkpoints():
+    def updates(number: int) -> tuple[int, ...]:
+        return artefacts.checkpoint_updates(PPOConfig(total_steps=number, environments=1, rollout=1, minibatches=1))
+
+    assert updates(1) == (1,)
+    assert updates(3) == (1, 2, 3)
+    assert updates(57) == (12, 23, 35, 46, 57)
+
+
+def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
+    """Artefacts had no checkpoints, and the final ego in the folder itself."""
+    profile = load_profile(str(built / "tiny.toml"))
+    folder = tmp_path / "copy"
+    shutil.copytree(artefact(built / "a"), folder)
+    for name in ("policy.safetensors", "policy.json"):
+        (folder / "checkpoints/c4" / name).rename(folder / name)
+    shutil.rmtree(folder / "checkpoints")
+    metadata = json.loads((folder / METADATA).read_text())
+    del metadata["checkpoint_updates"]
+    names = [path.name for path in folder.glob("*.npy")] + ["metrics.jsonl", "policy.safetensors", "policy.json"]
+    metadata["files"] = {name: file_hash(folder / name) for name in names}
+    (folder / METADATA).write_text(json.dumps(metadata))
+    assert not artefacts.is_task_finished(folder, profile.heuristic_tasks()[0], profile)
 
 
 def test_a_finished_task_is_not_done_again(built, monkeypatch):
@@ -126,7 +172,7 @@ def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equa
     collect.run_task(task, profile, folder)
     for name in ("state", "actions", "teammate_actions", "rewards", "episode_end_state"):
         assert (folder / f"{name}.npy").read_bytes() == (artefact(built / "a") / f"{name}.npy").read_bytes(), name
-    weights = "policy.safetensors"
+    weights = "checkpoints/c4/policy.safetensors"
     assert (folder / weights).read_bytes() == (artefact(built / "a") / weights).read_bytes()
 
 
@@ -200,6 +246,21 @@ def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned
             action, memory = act(mate.params, memory, view, jax.random.key(0))
             played.append(int(action))
         assert played == history.teammate_actions[:100].tolist()
+
+
+@pytest.mark.slow
+def test_a_release_is_rebuilt_from_its_own_tasks_and_teammates(learned, tmp_path):
+    """Without its suite, to the same bits; the profile of the populations that trained the teammates is not needed."""
+    profile = tmp_path / "learned.toml"
+    profile.write_text(LEARNED)
+    given = ("--tasks", learned / "lite/meta/tasks.jsonl", "--suite", learned / "lite/teammates")
+    arguments = ["generate", "--profile", profile, "--out", tmp_path / "again", *given]
+    result = CliRunner().invoke(cli, [str(part) for part in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert not (tmp_path / "again/suite").exists()
+    compared = compare_rebuilds(learned / "lite", tmp_path / "again/lite")
+    assert not compared.differences
+    assert compared.files > 10
 
 
 @pytest.mark.slow

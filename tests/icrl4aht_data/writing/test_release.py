@@ -139,8 +139,8 @@ def test_returns_of_episodes():
 
 
 def visible(folder):
-    """Return the names in a folder, without lock files."""
-    return sorted(path.name for path in folder.iterdir() if path.suffix != ".lock")
+    """Return the names in a folder."""
+    return sorted(path.name for path in folder.iterdir())
 
 
 def write_cramped(root: Path, load: Callable[[], list[NewHistory]], streams: int = 1, **options: Any) -> None:

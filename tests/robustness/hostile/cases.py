@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from icrl4aht_data.format.chunks import chunk_hash
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.download import ORIGIN
@@ -103,9 +104,11 @@ _NAMES = {
     "ends in a dot": "meta/info.json.",
 }
 add("release", "leads out of the release", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
-add("release", "are one file on some systems", {"manifest: upper case": listed("meta/INFO.json")})
-add("release", "is a file by another line", {"manifest: file as folder": listed("meta/info.json/x")})
-_many = "".join(f"d/{number}\n{number:064}  " for number in range(50_000)) + "d/last"
+_upper = SHARD.replace("teammate", "TEAMMATE")
+add("release", "are one file on some systems", {"manifest: upper case": listed(_upper)})
+_foreign = {"file as folder": "meta/info.json/x", "settings of git": ".git/config", "code": "sitecustomize.py"}
+add("release", "not a file that a release has", {f"manifest: {name}": listed(path) for name, path in _foreign.items()})
+_many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
 add("release", "listed in the manifest, but missing", {"manifest: many lines": listed(_many)})
 
 for _file in (INFO, HISTORIES, TASKS, PROVENANCE, TABLE, SHARD, "README.md", teammate, MANIFEST, ORIGIN):
@@ -266,7 +269,8 @@ def gigabyte_of_zeros() -> bytes:
 def inflating(root: Path) -> None:
     """Replace the first chunk by one that inflates to a gigabyte."""
     data, path, rows = gigabyte_of_zeros(), root / SHARD, np.load(root / TABLE)
-    rows["offset"][0], rows["size"][0], rows["crc32"][0] = path.stat().st_size, len(data), zlib.crc32(data)
+    rows["offset"][0], rows["size"][0] = path.stat().st_size, len(data)
+    rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
     with path.open("ab") as stream:
         stream.write(data)
     np.save(root / TABLE, rows)
@@ -281,7 +285,8 @@ def inflating_within_bounds(root: Path) -> None:
         stream.seek(int(rows["offset"][0]))
         stream.write(data.ljust(int(rows["size"][0]), b"\0"))
         stream.seek(int(rows["offset"][0]))
-        rows["crc32"][0] = zlib.crc32(stream.read(int(rows["size"][0])))
+        data = stream.read(int(rows["size"][0]))
+    rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
     np.save(root / TABLE, rows)
 
 
@@ -428,8 +433,8 @@ add("published", "an object of objects", {"provenance: a list": replaced("proven
 add("served", "expected at most", {f"a terabyte: {name}": replaced(name, sparse) for name in (MANIFEST, TASKS, TABLE)})
 add("served", "sha256|cover|crc32", {"a terabyte: shard": replaced(SHARD, sparse)})
 add("served", "leads out of the release", {"names above": listed("../../new")})
-add("served", "one file on some systems", {"names that collide": listed("readme.md")})
-add("served", "is a file by another line", {"a file that is a folder": listed("README.md/x")})
+add("served", "one file on some systems", {"names that collide": listed(_upper)})
+add("served", "not a file that a release has", {f"names: {name}": listed(path) for name, path in _foreign.items()})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
     ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),

@@ -1,0 +1,276 @@
+"""The checkpoint that labels a task's histories: how it is measured and chosen, and where it is written down."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.collection.curate import relabel
+from generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
+from generation.env import Environment
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
+from generation.profiles import load_profile
+from generation.releases import labeller
+from generation.releases.labeller import choose_checkpoint, choose_labeller
+from generation.releases.package import package_release
+from generation.teammates.registry import build_teammate
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.facts import LABEL_EPISODES
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.manifest import read_manifest, write_manifest
+from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.remote.download import fetch_planned, plan_download
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from tests.helpers.tiny import artefact
+from tests.servers.http import http_server
+
+# The choice.
+
+
+def in_episodes(*means: float, spread: float = 0.0) -> np.ndarray:
+    """Returns (C, E) with these means, and differences between checkpoints of this standard deviation."""
+    noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
+    return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
+
+
+def test_the_last_checkpoint_labels_unless_an_earlier_one_earns_clearly_more():
+    assert choose_checkpoint(in_episodes(0, 5, 10, 20, 20)) == 4
+    assert choose_checkpoint(in_episodes(0, 0, 0, 0, 0)) == 4
+    assert choose_checkpoint(in_episodes(7)) == 0
+    assert choose_checkpoint(in_episodes(0, 5, 16.9, 3, 0)) == 2
+    assert choose_checkpoint(in_episodes(9, 5, 9, 3, 0)) == 2  # of equal ones the latest
+
+
+def test_clearly_means_two_more_and_two_standard_errors():
+    assert choose_checkpoint(in_episodes(1.9, 0)) == 1
+    assert choose_checkpoint(in_episodes(2.1, 0)) == 0
+    error = 5 / 2.1  # 5 is 2.1 standard errors
+    assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES))) == 0
+    assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES) * 1.2)) == 1
+
+
+# The measurement.
+
+
+@pytest.fixture
+def task(built, tmp_path):
+    """The task of `built`, its profile, and a copy of its artefact, packed before."""
+    profile = load_profile(str(built / "tiny.toml"))
+    folder = tmp_path / "artefacts" / artefact(built / "a").name
+    shutil.copytree(artefact(built / "a"), folder)
+    return profile.heuristic_tasks()[0], profile, folder
+
+
+def with_returns(folder: Path, greedy: list[float]) -> None:
+    """Replace the measurements in an artefact: every episode of a checkpoint has the same return."""
+    content = json.loads((folder / LABELLER_RETURNS).read_text())
+    content["greedy"] = [[value] * LABEL_EPISODES for value in greedy]
+    (folder / LABELLER_RETURNS).write_text(json.dumps(content))
+
+
+def measured(folder: Path) -> dict:
+    return json.loads((folder / LABELLER_RETURNS).read_text())
+
+
+def never(*arguments):
+    raise AssertionError("measured again")
+
+
+def test_packing_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
+    chosen, profile, folder = task
+    found = measured(folder)
+    for way in ("greedy", "sampled"):
+        assert np.shape(found[way]) == (5, 200)
+        assert (np.array(found[way]) % 5 == 0).all()  # rewards are multiples of 5
+    assert len(np.unique(found["sampled"])) > 1
+    monkeypatch.setattr(labeller, "_measure", never)
+    package_release(folder.parent, tmp_path / "full", [chosen], profile, tmp_path, "full")
+    assert is_task_finished(folder, chosen, profile)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: "",
+        lambda content: content[:-9],
+        lambda content: content.replace('"checkpoints": ["', '"checkpoints": ["0'),
+        lambda content: content.replace('"greedy"', '"gredy"'),
+        lambda content: content.replace("0.0,", "NaN,", 1),
+        lambda content: content.replace("0.0, ", "", 1),
+        lambda content: "[]",
+    ],
+)
+def test_measurements_that_are_damaged_or_of_other_checkpoints_are_made_again(task, tmp_path, monkeypatch, damage):
+    chosen, _, folder = task
+    before = (folder / LABELLER_RETURNS).read_text()
+    assert damage(before) != before
+    (folder / LABELLER_RETURNS).write_text(damage(before))
+    again = {way: np.array(values) for way, values in json.loads(before).items() if way != "settings"}
+    monkeypatch.setattr(labeller, "_measure", lambda *arguments: again)
+    choose_labeller(folder, chosen, tmp_path)
+    assert (folder / LABELLER_RETURNS).read_text() == before
+
+
+@pytest.mark.slow
+def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
+    """Greedy returns of the last checkpoint, by the environment and the policies alone."""
+    chosen, _, folder = task
+    (folder / LABELLER_RETURNS).unlink()
+    choose_labeller(folder, chosen, tmp_path)
+    network, params, _ = load_policy(folder / "checkpoints/c4")
+    mate = build_teammate(chosen.layout, chosen.teammate, TEAMMATE, "seeded")
+    env = Environment(chosen.layout, 400)
+    key = jax.random.key(int(hashlib.sha256(chosen.task_id.encode()).hexdigest()[:8], 16))
+    state = env.init(jax.random.split(jax.random.split(key)[0], LABEL_EPISODES))
+
+    @jax.jit
+    def step(state, hidden, memory, key):
+        obs = observe(chosen.layout, state.record, EGO)[None]
+        hidden, logits, _ = network.apply(params, hidden, obs, np.zeros((1, LABEL_EPISODES), bool))
+        keys = jax.random.split(key, LABEL_EPISODES)
+        action, memory = jax.vmap(mate.act, (None, 0, 0, 0))(mate.params, memory, state.record, keys)
+        result = env.step(state, jnp.stack([logits[0].argmax(-1), action], axis=-1))
+        return result.state, hidden, memory, result.reward
+
+    keys = jax.vmap(jax.random.fold_in, (0, None))(env.episode_key(state), TEAMMATE)
+    memory, hidden = jax.vmap(mate.init, (None, 0))(mate.params, keys), network.initial_hidden(LABEL_EPISODES)
+    returns = np.zeros(LABEL_EPISODES)
+    for key in jax.random.split(jax.random.key(0), 100):
+        state, hidden, memory, reward = step(state, hidden, memory, key)
+        returns += np.asarray(reward)
+    assert measured(folder)["greedy"][4] == returns.tolist()
+
+
+# Where it is written down.
+
+
+def test_index_provenance_and_card_state_the_labeller(built):
+    root = built / "a" / "lite"
+    found = measured(artefact(built / "a"))
+    greedy, sampled = np.mean(found["greedy"], axis=1), np.mean(found["sampled"], axis=1)
+    number = choose_checkpoint(np.array(found["greedy"]))
+    for entry in load_icrl4aht(root).entries:
+        assert (entry.expert_return, entry.expert_return_sampled) == (greedy[number], sampled[number])
+        assert entry.expert_step == 3_200 * (number + 1)
+    (of_task,) = read_provenance(root / "meta/provenance.json").values()
+    expert = of_task.expert
+    assert expert is not None
+    assert (expert.return_greedy, expert.return_sampled) == (greedy[number], sampled[number])
+    assert (expert.last_return_greedy, expert.episodes) == (greedy[-1], 200)
+    assert expert.policy_sha256 == file_hash(artefact(built / "a") / f"checkpoints/c{number}/policy.safetensors")
+    card = (root / "README.md").read_text()
+    assert "## Labels" in card
+    assert f"| demo_wide | train | utility_greedy/t0 | {entry.expert_step:,} | {greedy[number]:.1f} |" in card
+
+
+def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
+    chosen, profile, folder = task
+    with_returns(folder, [0, 60, 20, 5, 0])
+    root = package_release(folder.parent, tmp_path / "lite", [chosen], profile, tmp_path, "lite")
+    dataset = load_icrl4aht(root)
+    network, params, card = load_policy(folder / "checkpoints/c1")
+    states = [history.state[:] for history in dataset]
+    for history, labels in zip(dataset, relabel(chosen.layout, network, params, states), strict=True):
+        np.testing.assert_array_equal(history.expert_actions[:], labels)
+        assert (history.entry.expert_return, history.entry.expert_step) == (60, card["steps"])
+    expert = read_provenance(root / "meta/provenance.json")[chosen.task_id].expert
+    assert expert is not None
+    assert (expert.step, expert.last_return_greedy) == (card["steps"], 0)
+    assert "except for 1 of 1 tasks, where an earlier one earns clearly more" in (root / "README.md").read_text()
+    assert verify_release(root).ok
+
+
+@pytest.mark.parametrize(("share", "weak"), [(0.4, True), (0.6, False)])
+def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_path, share, weak):
+    chosen, profile, folder = task
+    rewards = np.load(folder / "rewards.npy")
+    rewards[:, 0::100] = 20
+    np.save(folder / "rewards.npy", rewards)
+    ends = rewards.reshape(8, 5, 100).sum(axis=-1).mean()
+    with_returns(folder, [ends * share] * 5)
+    root = package_release(folder.parent, tmp_path / "lite", [chosen], profile, tmp_path, "lite")
+    card = (root / "README.md").read_text()
+    assert ("| **demo_wide** | **train** |" in card) == weak
+    assert ("The labels of 1 task earn less than half" in card) == weak
+    assert ("No labels earn less than half" in card) != weak
+
+
+# The policy in the release.
+
+
+@pytest.fixture
+def with_policies(task, tmp_path) -> Path:
+    """A release with the policies of the labellers."""
+    chosen, profile, folder = task
+    return package_release(
+        folder.parent, tmp_path / "with", [chosen], replace(profile, policies=True), tmp_path, "lite"
+    )
+
+
+def policy_files(root: Path) -> dict[str, str]:
+    return {name: digest for name, digest in read_manifest(root).items() if name.startswith("experts/")}
+
+
+def test_policies_are_in_the_release_if_the_profile_says_so(built, with_policies, tmp_path):
+    assert not policy_files(built / "a" / "lite")
+    (of_task,) = read_provenance(with_policies / "meta/provenance.json").values()
+    assert of_task.expert is not None
+    folder = f"experts/{of_task.expert.policy_sha256}"
+    files = policy_files(with_policies)
+    assert set(files) == {f"{folder}/{name}" for name in (POLICY_WEIGHTS, POLICY_CARD)}
+    assert files[f"{folder}/{POLICY_WEIGHTS}"] == of_task.expert.policy_sha256
+    assert load_policy(with_policies / folder)[2]["steps"] == of_task.expert.step
+    assert verify_release(with_policies).ok
+    full = to_release(load_icrl4aht(with_policies), tmp_path / "full", "full")
+    assert policy_files(full) == files
+    assert policy_files(combine_releases(tmp_path / "both", [full])) == files
+
+
+def test_downloads_bring_the_policies(with_policies, tmp_path):
+    copy = tmp_path / "copy"
+    with http_server(with_policies) as server:
+        fetch_planned(plan_download(server.url, to=copy))
+    assert policy_files(copy) == policy_files(with_policies)
+    assert verify_release(copy).files == verify_release(with_policies).files
+
+
+def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
+    root = with_policies
+    weights = next(root.glob("experts/*/policy.safetensors"))
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    provenance = json.loads((root / "meta/provenance.json").read_text())
+    (of_task,) = provenance.values()
+    of_task["expert"]["return_greedy"] = 99.0
+    (root / "meta/provenance.json").write_text(json.dumps(provenance))
+    write_manifest(root)
+    problems = [(finding.file, finding.problem) for finding in verify_release(root).findings]
+    assert problems[0][0] == weights.relative_to(root).as_posix()
+    assert f"expected {weights.parent.name} as meta/provenance.json says of task" in problems[0][1]
+    assert [file for file, _ in problems[1:]] == ["meta/histories.jsonl"] * 3
+    assert "expected (99.0, " in problems[1][1]
+
+
+@pytest.mark.parametrize("name", ["../../outside", "a" * 63, "A" * 64])
+def test_only_a_hash_names_the_folder_of_a_policy(with_policies, tmp_path, name):
+    provenance = json.loads((with_policies / "meta/provenance.json").read_text())
+    (of_task,) = provenance.values()
+    of_task["expert"]["policy_sha256"] = name
+    (with_policies / "meta/provenance.json").write_text(json.dumps(provenance))
+    write_manifest(with_policies)
+    assert any("policy_sha256" in finding.problem for finding in verify_release(with_policies).findings)
+    with pytest.raises(IndexFormatError, match="policy_sha256"):
+        to_release(load_icrl4aht(with_policies), tmp_path / "out", "full")

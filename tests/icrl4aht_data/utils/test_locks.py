@@ -1,0 +1,72 @@
+"""Locks whose files are removed after use: they exclude one another all the same, and leave nothing behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from filelock import Timeout
+
+from icrl4aht_data.utils.locks import process_lock, remove_empty_folders
+
+COUNT = """
+import sys
+from pathlib import Path
+from tests.icrl4aht_data.utils.test_locks import count
+count(Path(sys.argv[1]), 50)
+"""
+
+
+def count(folder: Path, times: int) -> None:
+    """Add one to the number in a file, so slowly that a lock that does not exclude others loses some."""
+    path = folder / "number.txt"
+    for _ in range(times):
+        with process_lock(folder / "locks" / "below" / ".number.lock"):
+            number = int(path.read_text())
+            time.sleep(0.001)
+            path.write_text(str(number + 1))
+        remove_empty_folders(folder / "locks")
+
+
+def test_a_removed_lock_file_still_excludes_others(tmp_path):
+    (tmp_path / "number.txt").write_text("0")
+    threads = [threading.Thread(target=count, args=(tmp_path, 25)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (tmp_path / "number.txt").read_text() == "100"
+    assert [path.name for path in tmp_path.iterdir()] == ["number.txt"]
+
+
+@pytest.mark.slow
+def test_a_removed_lock_file_still_excludes_other_processes(tmp_path):
+    (tmp_path / "number.txt").write_text("0")
+    processes = [subprocess.Popen([sys.executable, "-c", COUNT, str(tmp_path)]) for _ in range(4)]
+    assert [process.wait(120) for process in processes] == [0] * 4
+    assert (tmp_path / "number.txt").read_text() == "200"
+    assert [path.name for path in tmp_path.iterdir()] == ["number.txt"]
+
+
+def test_a_held_lock_is_waited_for_or_reported(tmp_path):
+    path = tmp_path / ".run.lock"
+    with process_lock(path):
+        assert path.exists()
+        with pytest.raises(Timeout), process_lock(path, wait=False):
+            pass
+        assert path.exists(), "who did not get the lock leaves its file"
+    assert not path.exists()
+
+
+def test_links_and_files_are_left_when_empty_folders_are_removed(tmp_path):
+    for name in ("kept/a", "kept/b/c", "elsewhere/empty"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "kept/b/file").touch()
+    (tmp_path / "kept/link").symlink_to(tmp_path / "elsewhere")
+    remove_empty_folders(tmp_path / "kept")
+    assert sorted(path.name for path in (tmp_path / "kept").rglob("*")) == ["b", "file", "link"]
+    assert (tmp_path / "elsewhere/empty").exists()
