@@ -189,7 +189,7 @@ def report_command(runs: tuple[Path, ...], out: Path | None, html: Path | None, 
     loaded = merge([read_run(run) for run in runs])
     paths = write_report(loaded, out or runs[0] / "report")
     if html:
-        with bars() as show:
+        with bars(edges=True) as show:
             paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
     paths += write_model_cards(loaded, paths[0].parent)
     click.echo(markdown(loaded))

@@ -258,6 +258,9 @@ def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
+    started, ended = (line for line in result.stderr.splitlines() if line.startswith("episodes of the report: "))
+    assert started.endswith("started, 1")
+    assert ": 1 of 1 after" in ended
     text = (tmp_path / "report.html").read_text()
     assert Outside(text).images.count("data:image/gif") == 1
     (task,) = read_tasks(tmp_path / "own.jsonl")
