@@ -13,6 +13,7 @@ from baselines.agents.egos import AGENTS, find_agent
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
 from baselines.methods.options import ModelOptions
+from baselines.report.overlap import overlap_legend, overlap_marks
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import EvaluationRun, note_results, read_run
 from baselines.training.histories import prepare
@@ -125,11 +126,13 @@ def _evaluate_demo(name: str, tasks: Sequence[Task], protocol: Protocol, results
 
 
 def _format_returns(runs: list[EvaluationRun]) -> str:
-    """Returns text with mean returns, one line per agent."""
+    """Returns text with mean returns, one line per agent, and the meaning of marks behind them."""
     cells = list(runs[0].cells)
-    lines = [f"{'return with':14}" + "".join(f"{family:>8}" for _, family in cells)]
-    lines += [f"{run.agent:14}" + "".join(f"{run.cells[cell].mean():8.1f}" for cell in cells) for run in runs]
-    return "\n".join(lines)
+    lines = [f"{'return with':14}" + "".join(f"{family:>8}  " for _, family in cells)]
+    for run in runs:
+        scores = [f"{run.cells[cell].mean():8.1f}{overlap_marks(run.overlaps([cell])):2}" for cell in cells]
+        lines.append(f"{run.agent:14}" + "".join(scores))
+    return "\n".join([*lines, *overlap_legend(name for run in runs for name in run.overlaps(cells))])
 
 
 def _draw_best_episode(dataset: Dataset, path: Path) -> None:

@@ -218,7 +218,8 @@ def run_experiment(
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"
-    report.append(write_page_with_episodes(runs, page, episodes=plan.gifs, notes=notes, suite=plan.suite))
+    options: dict[str, Any] = {"episodes": plan.gifs, "notes": notes, "suite": plan.suite, "progress": progress}
+    report.append(write_page_with_episodes(runs, page, **options))
     return ExperimentOutcome(report, notes)
 
 

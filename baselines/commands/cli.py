@@ -179,7 +179,8 @@ def evaluate_command(
 def report_command(runs: tuple[Path, ...], out: Path | None, html: Path | None, gifs: bool, suite: Path | None) -> None:
     """Compare results with the paper's.
 
-    RESULTS are folders that `evaluate` made. Prints the paper's tables with its numbers and ours, and writes them as
+    RESULTS are folders that `evaluate` made. Prints a table for each agent and track, with the paper's numbers next to
+    results of protocol published, and marks scores with teammates or on layouts that were in training. Writes them as
     Markdown, CSV and curves, with a card for each trained model. Results of one agent on different layouts are merged.
     """
     from baselines.report.model_card import write_model_cards
@@ -190,7 +191,8 @@ def report_command(runs: tuple[Path, ...], out: Path | None, html: Path | None, 
     loaded = merge([read_run(run) for run in runs])
     paths = write_report(loaded, out or runs[0] / "report")
     if html:
-        paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite))
+        with bars(edges=True) as show:
+            paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
     paths += write_model_cards(loaded, paths[0].parent)
     click.echo(markdown(loaded))
     for path in paths:
@@ -406,7 +408,8 @@ def ablate_command(what: str, **options: Any) -> None:
 def tracks_command(**options: Any) -> None:
     """Train and evaluate on both tracks.
 
-    The paper's Tables 1 and 2; with other methods 4 and 5. Writes runs, results and OUT/report.
+    The paper's Tables 1 and 2; with other methods 4 and 5. Its numbers are shown with --protocol published. Writes
+    runs, results and OUT/report.
     """
     _run_experiment("tracks", **options)
 

@@ -60,6 +60,8 @@ def evaluate(
         suite: folder with the checkpoints of learned teammates, if tasks have any.
         out: folder for one JSON file per task. Results found there under the same settings are not computed again.
         details: further settings that the results depend on, as JSON; stored and compared with the results.
+            `trained_on` among them states the training data, which reports compare with the tasks: see
+            `baselines.training.seen.read_trained_on`.
         done: called with the number of tasks finished since the last call, for progress.
         played: called with the number of episodes played since the last call, or found in `out`; by several threads.
 

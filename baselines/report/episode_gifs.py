@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +22,8 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.utils.threads import usable_cores
+
+_PROGRESS = "episodes of the report"
 
 
 class EpisodeGif(NamedTuple):
@@ -55,7 +57,12 @@ def episode_gif(
     return float(reward.sum())
 
 
-def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None = None) -> list[EpisodeGif]:
+def family_gifs(
+    runs: Sequence[EvaluationRun],
+    folder: Path,
+    suite: Path | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> list[EpisodeGif]:
     """Write the first episode of an evaluated task for each agent and family of teammates.
 
     The task is on a layout where that family leaves headroom, if there is one among the results.
@@ -64,6 +71,7 @@ def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None 
         runs: what is reported.
         folder: for the GIFs.
         suite: folder of learned teammates' checkpoints.
+        progress: called with (description, episodes drawn, episodes), from the calling thread.
 
     Returns:
         Run after run, families in order. If an agent cannot be restored, the caption says why.
@@ -83,8 +91,13 @@ def family_gifs(runs: Sequence[EvaluationRun], folder: Path, suite: Path | None 
         run, source, task = chosen[number]
         return _draw_result(run, source, task, egos[source.folder], folder / f"{number}.gif", suite)
 
+    progress(_PROGRESS, 0, len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
-        return list(pool.map(draw, range(len(chosen))))
+        drawn = [pool.submit(draw, number) for number in range(len(chosen))]
+        for done, future in enumerate(as_completed(drawn), start=1):
+            future.result()
+            progress(_PROGRESS, done, len(chosen))
+    return [future.result() for future in drawn]
 
 
 def _draw_result(

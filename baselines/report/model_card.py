@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.report.overlap import describe_training, overlap_legend
-from baselines.report.results import EvaluationRun, ResultSource, count_text
+from baselines.report.results import EvaluationRun, ResultSource, instances_range
 from baselines.report.summary import track_tables
 from icrl4aht_data.utils.templates import fill_template
 
@@ -51,8 +51,7 @@ def model_card(run: EvaluationRun) -> str:
 def _model_row(run: EvaluationRun, source: ResultSource, trained: Mapping[str, Any]) -> str:
     """Returns a row of the table of models: training data and seed, and the evaluation."""
     histories = trained["config"]["histories"]
-    numbers = sorted({len(run.cells[cell]) for cell in source.tasks})
-    instances = count_text(numbers[0], "instance") if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} instances"
+    instances = instances_range(len(run.cells[cell]) for cell in source.tasks)
     selection = (
         f"{histories['sizes']['train']} of {', '.join(histories['layouts'])}; the release's manifest has SHA-256 "
         f"`{trained['manifest_sha256']}`"

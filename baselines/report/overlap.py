@@ -63,13 +63,15 @@ def _is_layout_test(task: Task) -> bool:
 
 def overlap_marks(overlaps: Iterable[str]) -> str:
     """Returns the marks of kinds of overlap, such as " †§"; empty if there is none."""
-    marks = "".join(kind.mark for name, kind in OVERLAPS.items() if name in set(overlaps))
+    found = set(overlaps)
+    marks = "".join(kind.mark for name, kind in OVERLAPS.items() if name in found)
     return f" {marks}" if marks else ""
 
 
 def overlap_legend(overlaps: Iterable[str]) -> list[str]:
     """Returns an explanation of each mark, such as "† ...", in the order of `OVERLAPS`."""
-    return [f"{kind.mark} {kind.meaning}" for name, kind in OVERLAPS.items() if name in set(overlaps)]
+    found = set(overlaps)
+    return [f"{kind.mark} {kind.meaning}" for name, kind in OVERLAPS.items() if name in found]
 
 
 def describe_overlap(tasks: Sequence[Task], seen: SeenInTraining | None) -> str:

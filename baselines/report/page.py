@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +22,7 @@ from baselines.report.results import (
     cell_order,
     count_text,
     group_of,
+    instances_range,
     read_published,
 )
 from baselines.report.tables import (
@@ -34,6 +35,7 @@ from baselines.report.tables import (
     score_cells,
     sweep_points,
     sweep_scores,
+    table_cells,
 )
 from generation.teammates.instances import INSTANCES
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, Cell, has_headroom, read_headroom
@@ -100,6 +102,7 @@ def write_page_with_episodes(
     episodes: bool = True,
     notes: Sequence[str] = (),
     suite: Path | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
     """Write the page with an episode per family of teammates, of at most three runs. Returns its path.
 
@@ -107,13 +110,14 @@ def write_page_with_episodes(
         runs, path, notes: see `write_page`.
         episodes: False for a page without episodes.
         suite: folder of learned teammates' checkpoints.
+        progress: called with (description, episodes drawn, episodes).
     """
     shown = _most_informative(runs)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
         notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
     with TemporaryDirectory() as folder:
-        return write_page(runs, path, family_gifs(shown, Path(folder), suite), notes)
+        return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 
 
 def _most_informative(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
@@ -185,11 +189,11 @@ def _protocol_section(protocol: str, runs: list[EvaluationRun], folder: Path) ->
     return [*parts, "<h3>Headroom</h3>", _headroom_table(protocol)]
 
 
-def _conditions(runs: Iterable[EvaluationRun]) -> str:
-    """Returns text with protocol, seeds, instances and length of the evaluation of some runs."""
-    texts = dict.fromkeys(source.conditions for run in runs for source in run.sources)
-    numbers = sorted({len(returns) for run in runs for returns in run.cells.values()})
-    instances = count_text(numbers[0], "instance") if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} instances"
+def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = None) -> str:
+    """Returns text with protocol, seeds, length and instances of the results of some runs, all or those of `cells`."""
+    shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
+    texts = dict.fromkeys(run.source(cell).conditions for run, cell in shown)
+    instances = instances_range(len(run.cells[cell]) for run, cell in shown)
     return f"Evaluated under {'; '.join(texts)}; {instances} in a cell"
 
 
@@ -207,8 +211,9 @@ def _overlap_note(runs: Sequence[EvaluationRun]) -> str:
 
 def _table_caption(table: PaperTable, rows: Sequence[TableRow], runs: Sequence[EvaluationRun], protocol: str) -> str:
     agents = {row.agent for row in rows}
-    shown = [run for run in runs if run.label in agents]
-    text = f"{_conditions(shown)}." if shown else "Not run."
+    cells = table_cells(table)
+    shown = [run for run in runs if run.label in agents and not cells.isdisjoint(run.cells)]
+    text = f"{_conditions(shown, cells)}." if shown else "Not run."
     if protocol == PUBLISHED_PROTOCOL:
         text += f" Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
     if table.group != "cell":
@@ -267,7 +272,7 @@ def _other_cells(runs: list[EvaluationRun]) -> list[str]:
                 for run in shown
             ]
             columns = ["agent", *map(_cell_name, of_group)]
-            caption = escape(f"{text} {_conditions(shown)}.")
+            caption = escape(f"{text} {_conditions(shown, of_group)}.")
             parts += [f"<p class=caption>{caption}</p>", _html_table(columns, body)]
     return parts
 
@@ -302,6 +307,7 @@ def _gain_cell(run: EvaluationRun, cell: Cell) -> str:
 
 def _headroom_table(protocol: str) -> str:
     measured = read_headroom(protocol)
+    conditions = f"protocol {protocol}, {INSTANCES} instances, 1 seed (0), 100 episodes of 100 steps"
     body = []
     for family in HEURISTICS:
         row = [_th(family)]
@@ -311,12 +317,13 @@ def _headroom_table(protocol: str) -> str:
                 row.append('<td class="none">not measured</td>')
             else:
                 kind = "" if has_headroom(references) else "flat"
-                row.append(f'<td class="{kind}">{" / ".join(f"{references[a]:z.1f}" for a in REFERENCES)}</td>')
+                tooltip = _tooltip(f"stay / random / oracle, {layout}, {family}: {conditions}.")
+                means = " / ".join(f"{references[agent]:z.1f}" for agent in REFERENCES)
+                row.append(f'<td class="{kind}"{tooltip}>{means}</td>')
         body.append((False, row))
     note = (
-        f"<p class=caption>Mean return of the reference egos stay / random / oracle (scripted, full information), "
-        f"measured under protocol {escape(protocol)} with the published test tasks: {INSTANCES} instances in each "
-        f"cell, 1 seed (0), 100 episodes of 100 steps.</p>"
+        f"<p class=caption>Mean return of the reference egos stay / random / oracle (scripted, full information) with "
+        f"the published test tasks: {escape(conditions)}.</p>"
     )
     return note + _html_table(["family", *TEST_LAYOUTS], body)
 

@@ -42,9 +42,9 @@ _GROUPS = {"train": "training", "heldout": "held out", "test": "own"}
 """Split of tasks that are not published test tasks -> name of their group in reports."""
 
 GROUP_TEXTS = {
-    "training": "Training tasks (split `train`): the teammates and layouts that models are made to be trained with. "
+    "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
     "Their returns do not show generalisation.",
-    "held out": "Held-out tasks (split `heldout`): learned teammates that a suite keeps out of its training tasks. "
+    "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
     "Where an agent was trained with one of them or with others of their algorithm, its score is marked. The paper "
     "gives these as a figure without numbers (App. F).",
     "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
@@ -282,6 +282,12 @@ def instances_text(cell: Cell, played: int) -> str:
     """Returns the number of instances, such as "1 of 5 instances", or "1 instance" for tasks that are not published."""
     total = published_instances(cell)
     return f"{played} of {count_text(total, 'instance')}" if total else count_text(played, "instance")
+
+
+def instances_range(numbers: Iterable[int]) -> str:
+    """Returns numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    found = sorted(set(numbers))
+    return count_text(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:

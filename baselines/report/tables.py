@@ -16,7 +16,7 @@ from baselines.report.overlap import describe_overlap
 from baselines.report.results import (
     PUBLISHED_PROTOCOL,
     EvaluationRun,
-    count_text,
+    instances_range,
     instances_text,
     normalised_score,
     published_cells,
@@ -115,9 +115,7 @@ def fill_table(table: PaperTable, runs: Sequence[EvaluationRun], protocol: str) 
         protocol: name of the protocol.
     """
     covers_track = table.columns in (_TEAMMATE, _LAYOUT)
-    tested = TRACKS if table.group == "track" else table.columns
-    layouts = {name for column in tested for name in (TRACKS[column]["test"] if column in TRACKS else (column,))}
-    present = [run for run in runs if any(published_instances(cell) and cell[0] in layouts for cell in run.cells)]
+    present = [run for run in runs if not table_cells(table).isdisjoint(run.cells)]
     by_label = {run.label: run for run in present}
     stated = [name for name in table.agents if protocol == PUBLISHED_PROTOCOL or name in by_label]
     others = [run.label for run in present if covers_track and run.label not in table.agents]
@@ -134,6 +132,12 @@ def fill_table(table: PaperTable, runs: Sequence[EvaluationRun], protocol: str) 
             ]
             filled.append(TableRow(label, agent, scores))
     return filled
+
+
+def table_cells(table: PaperTable) -> set[Cell]:
+    """Returns the cells that a table covers."""
+    columns = [TRACKS[column]["test"] if table.group == "track" else (column,) for column in table.columns]
+    return {(layout, family) for layouts in columns for layout in layouts for family in HEURISTICS}
 
 
 def _cells_and_published(
@@ -192,8 +196,7 @@ def _shortfall(run: EvaluationRun, cells: Sequence[Cell]) -> str:
         return ""
     if len(cells) == 1:
         return instances_text(*next(iter(numbers.items())))
-    low, high = min(numbers.values()), max(numbers.values())
-    return f"{count_text(low, 'instance') if low == high else f'{low} to {high} instances'} a cell"
+    return f"{instances_range(numbers.values())} a cell"
 
 
 def _describe_cell(run: EvaluationRun, cell: Cell) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
 
 TRAINED_ON = "trained_on"
@@ -63,7 +64,7 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
         where: origin of the record, for the message.
 
     Raises:
-        OptionError: if it is no such list.
+        OptionError: if it is no such list, or for an unknown layout, family or algorithm.
     """
     if not isinstance(entries, list | tuple):
         raise OptionError(f"{where}: {TRAINED_ON}: expected a list of entries, found {str(entries)[:200]!r}")
@@ -90,4 +91,8 @@ def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str]
             f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(FAMILIES)}), perhaps an algorithm of this "
             f"family and a list of teammates' ids; found {str(entry)[:200]!r}"
         )
-    return layout, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)
+    try:
+        name = get_layout(layout).name
+    except UnknownNameError as error:
+        raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
+    return name, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)

@@ -41,7 +41,8 @@ def test_every_step_is_taken(tmp_path, monkeypatch):
     for expected in ("1/6", "target_actions", "context_next_obs", "no problem in", "6/6", "done in", str(page)):
         assert expected in text, expected
     returns = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.count(" ") > 3}
-    assert len(returns["AD"]) == 1
+    assert returns["AD"][1:] == ["†"], "it was trained with H4"
+    assert "† the agent was trained with teammates of this family" in text
     assert (tmp_path / "learning_curves.png").stat().st_size > 5_000
     assert (tmp_path / "episode.gif").read_bytes()[:6] == b"GIF89a"
     assert "<h1>ICRL4AHT report</h1>" in page.read_text()

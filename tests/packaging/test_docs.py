@@ -284,7 +284,7 @@ write_tasks(Path("mine.jsonl"), [preset, drawn])
 tasks = read_tasks(Path("mine.jsonl"))
 short = dataclasses.replace(get_protocol("seeded"), episodes=1, steps=10)
 run = as_run(evaluate("stay", stay, tasks[:1], short), tasks=tasks)
-assert "| H5 |" in markdown([run])
+assert "| H5 (training) |" in markdown([run])
 (row,) = rows(run)
 random_release(Path("release"), layouts=("open_kitchen",))
 ok = verify_release("release", level="deep").ok

@@ -158,6 +158,8 @@ def test_the_page_says_what_each_number_is(write, kind):
         assert (explanation in unescape(text)) == kind.tasks.startswith(name)
     assert "Learned teammates are held out of training" not in text
     assert ("The paper's numbers belong to protocol" in text) == (kind.protocol == "seeded")
+    scores = Cells(text.partition("Settings and hashes")[0]).found
+    assert all(tooltip for tooltip, shown in scores if re.match(r"\s*[+-]?\d", shown)), "every number has a tooltip"
     assert ("normalised" in first[1]) == (is_test and kind.instances == 5)
 
 

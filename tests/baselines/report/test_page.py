@@ -223,7 +223,13 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
 
     runs = [with_tasks(agent) for agent in ("stay", "oracle", "AD", "DPT")]
     runs.insert(3, with_tasks("AD", variant=("K", 250)))
-    text = write_page_with_episodes(runs, tmp_path / "report.html").read_text()
+    drawn: list[tuple[int, int]] = []
+
+    def progress(what: str, done: int, total: int) -> None:
+        drawn.append((done, total))
+
+    text = write_page_with_episodes(runs, tmp_path / "report.html", progress=progress).read_text()
+    assert drawn == [(done, 6) for done in range(7)]
     found = re.findall(r"<figcaption>([^<]+? with \S+ on \S+): team return 7 ", text)
     assert found == [
         f"{agent} with {mate} on demo_wide" for mate in ("H1/t0", "H4/t0") for agent in ("AD", "DPT", "AD, K = 250")
@@ -252,6 +258,9 @@ def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
+    started, ended = (line for line in result.stderr.splitlines() if line.startswith("episodes of the report: "))
+    assert started.endswith("started, 1")
+    assert ": 1 of 1 after" in ended
     text = (tmp_path / "report.html").read_text()
     assert Outside(text).images.count("data:image/gif") == 1
     (task,) = read_tasks(tmp_path / "own.jsonl")

@@ -65,6 +65,10 @@ def test_records_join_the_entries_of_a_kind():
     any_algorithm = read_trained_on([{"layout": "demo_wide", "family": "rl"}], "run.json")
     assert any_algorithm.teammates == dict.fromkeys(("fcp", "brdiv", "lbrdiv", "comedi"))
     assert read_trained_on([], "run.json") == SeenInTraining()
+    (alias,) = read_trained_on([{"layout": "demo_cook_wide", "family": "H4"}], "run.json").layouts
+    assert alias == "demo_wide"
+    with pytest.raises(OptionError, match=r"trained_on: unknown layout 'demo_wid'.*mean 'demo_wide'"):
+        read_trained_on([{"layout": "demo_wid", "family": "H4"}], "run.json")
 
 
 @pytest.mark.parametrize(
