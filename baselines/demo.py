@@ -109,10 +109,10 @@ def run_demo(
 
 def _train_demo(folder: Path, model: ModelOptions, options: TrainOptions, console: Console) -> None:
     job = prepare("ad", model, options, HistoryOptions((DEMO_LAYOUT,)))
-    with bars() as show:
+    with bars(edges=True) as show:
 
-        def done(step: int, loss: float) -> None:
-            show("AD", step, options.steps, f", loss {loss:.3f}")
+        def done(step: int, loss: float | None) -> None:
+            show("AD", step, options.steps, "" if loss is None else f", loss {loss:.3f}")
 
         train(job.method, job.data, job.options, folder, job.about, done=done)
     console.print(f"losses on training and held-out histories: {folder / 'curves.png'}", highlight=False)
@@ -121,9 +121,9 @@ def _train_demo(folder: Path, model: ModelOptions, options: TrainOptions, consol
 def _evaluate_demo(name: str, tasks: Sequence[Task], protocol: Protocol, results: Path) -> EvaluationRun:
     agent = find_agent(name)
     folder = results / agent.name
-    with bars() as show:
-        done = counted(show, agent.name, len(tasks))
-        evaluate(agent.name, agent.make, tasks, protocol, out=folder, details=agent.details, done=done)
+    with bars(edges=True) as show:
+        played = counted(show, f"{agent.name}, episodes", len(tasks) * protocol.episodes)
+        evaluate(agent.name, agent.make, tasks, protocol, out=folder, details=agent.details, played=played)
     note_results(folder, Path(name) if agent.details else None)
     return read_run(folder)
 

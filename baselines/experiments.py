@@ -360,7 +360,7 @@ def _train_entry(
 ) -> None:
     job = _prepare_entry(method, entry, layout, plan)
     steps = job.options.steps
-    what = f"{job.method.label} {entry.name} on {layout}: training"
+    what = f"{job.method.label} {entry.name} on {layout}: training steps"
     progress(what, 0, steps)
     train(
         job.method,
@@ -385,16 +385,17 @@ def _evaluate_entry(
 ) -> None:
     agent = find_agent(str(folder / "run"), plan.acting or experiment.acting)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
-    what = f"{agent.name} {entry.name} on {tasks[0].layout.name}: evaluation"
+    what = f"{agent.name} {entry.name} on {tasks[0].layout.name}: episodes"
+    protocol = get_protocol(plan.protocol, plan.episodes)
     evaluate(
         agent.name,
         agent.make,
         tasks,
-        get_protocol(plan.protocol, plan.episodes),
+        protocol,
         seeds=range(plan.seeds),
         suite=plan.suite,
         out=folder / "results",
         details=details,
-        done=counted(progress, what, len(tasks)),
+        played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
     )
     note_results(folder / "results", folder / "run", tasks if experiment.held_out else ())

@@ -19,6 +19,7 @@ from baselines.commands.options import (
     episodes_option,
     experiment_options,
     find_ego,
+    format_loss,
     gifs_option,
     history_filters,
     model_options,
@@ -150,17 +151,18 @@ def evaluate_command(
         )
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
-    with bars() as show:
+    played = get_protocol(protocol, episodes)
+    with bars(edges=True) as show:
         evaluate(
             ego.name,
             ego.make,
             chosen,
-            get_protocol(protocol, episodes),
+            played,
             seeds=range(seeds),
             suite=suite,
             out=out,
             details=ego.details,
-            done=counted(show, f"{ego.name}, {protocol}", len(chosen)),
+            played=counted(show, f"{ego.name}, {protocol}, episodes", len(chosen) * played.episodes * seeds),
         )
     note_results(out, Path(agent) if ego.details else None, chosen if manifest else ())
     noun = "result" if len(chosen) == 1 else "results"
@@ -198,7 +200,7 @@ def report_command(
         check_new_file(html, overwrite)
     paths = write_report(loaded, folder)
     if html:
-        with bars() as show:
+        with bars(edges=True) as show:
             paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
     paths += write_model_cards(loaded, paths[0].parent)
     click.echo(markdown(loaded))
@@ -251,7 +253,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
-    with bars() as show:
+    with bars(edges=True) as show:
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
         _console.print(f"wrote {path}")
@@ -282,7 +284,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     name = get_layout(layout or trained.layouts[0]).name
     check_fits(trained, get_layout(name), run)
     tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
-    with bars() as show:
+    with bars(edges=True) as show:
         found = []
         for episode in measure_drift(trained.method, trained.params, trained.context, tasks, played):
             found.append(episode)
@@ -367,10 +369,10 @@ def train_command(
     sized: dict[str, Any] = {"layers": layers, "width": width}
     job = prepare(method, ModelOptions(**(sized | model)), options, choice)
     folder = out or Path("runs") / method
-    with bars() as show:
+    with bars(edges=True) as show:
 
-        def done(step: int, loss: float) -> None:
-            show(method, step, options.steps, f", loss {loss:.3f}")
+        def done(step: int, loss: float | None) -> None:
+            show(method, step, options.steps, format_loss(loss))
 
         run_training(
             job.method,
@@ -451,7 +453,7 @@ def _run_experiment(
 
     training = {"batch_size": default_batch_size()} | train
     plan = ExperimentPlan(root=root and str(root), suite=suite, train=training, **options)
-    with bars() as show:
+    with bars(edges=True) as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:
         click.echo(note)
@@ -469,10 +471,10 @@ def control_command(out: Path) -> None:
     """
     from baselines.control.control import format_checks, run_control
 
-    with bars() as show:
+    with bars(edges=True) as show:
 
-        def done(name: str, total: int, step: int, loss: float) -> None:
-            show(name, step, total, f", loss {loss:.3f}")
+        def done(name: str, total: int, step: int, loss: float | None) -> None:
+            show(name, step, total, format_loss(loss))
 
         checks = run_control(out, done=done)
     click.echo(format_checks(checks))

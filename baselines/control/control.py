@@ -23,7 +23,7 @@ from baselines.methods.dpt import dpt
 from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.training.options import TrainOptions
-from baselines.training.trainer import TrainingData, TrainState, train
+from baselines.training.trainer import StepProgress, TrainingData, TrainState, train
 
 BANDIT_MODEL = ModelOptions(layers=2, width=32, heads=2, dropout=0.0)
 DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
@@ -73,8 +73,8 @@ class ControlCheck(NamedTuple):
     note: str
 
 
-ControlProgress = Callable[[str, int, int, float], None]
-"""Called with (part, its updates, updates so far, loss)."""
+ControlProgress = Callable[[str, int, int, float | None], None]
+"""Called with (part, its updates, updates so far, the loss last logged or None)."""
 
 
 def run_control(
@@ -99,7 +99,7 @@ def format_checks(checks: list[ControlCheck]) -> str:
     return "\n".join(lines)
 
 
-def dpt_on_bandits(folder: Path, size: ControlSize, done: Callable[[int, float], None]) -> list[ControlCheck]:
+def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
     """Compare DPT's regret with that of Thompson sampling, whose posterior it approximates (Lee et al. 2023)."""
     rng, small = np.random.default_rng(0), worlds.bandit()
     method = dpt(BANDIT_MODEL, small.world, finished_episodes_only=False)
@@ -108,7 +108,7 @@ def dpt_on_bandits(folder: Path, size: ControlSize, done: Callable[[int, float],
     return _bandit_checks("DPT", "Thompson sampling", worlds.thompson, method, state, size, rng)
 
 
-def ad_on_bandits(folder: Path, size: ControlSize, done: Callable[[int, float], None]) -> list[ControlCheck]:
+def ad_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
     """Compare AD's regret with that of its source, upper confidence bounds."""
     rng, small = np.random.default_rng(1), worlds.bandit()
     method = ad(BANDIT_MODEL, small.world)
@@ -151,7 +151,7 @@ def _bandit_checks(
     ]
 
 
-def ad_in_dark_room(folder: Path, size: ControlSize, done: Callable[[int, float], None]) -> list[ControlCheck]:
+def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
     """Measure AD's return over the episodes of a task, on goals held out from training."""
     rng, small = np.random.default_rng(2), worlds.dark_room()
     goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
@@ -196,7 +196,7 @@ def _train(
     size: ControlSize,
     number: int,
     folder: Path,
-    done: Callable[[int, float], None],
+    done: StepProgress,
 ) -> TrainState:
     """Train on the first set of rows and validate on the second."""
     updates = size.updates[number]

@@ -47,6 +47,7 @@ def evaluate(
     out: Path | None = None,
     details: dict[str, Any] | None = None,
     done: Callable[[int], None] = lambda tasks: None,
+    played: Callable[[int], None] = lambda episodes: None,
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
@@ -62,6 +63,7 @@ def evaluate(
             `trained_on` among them states the training data, which reports compare with the tasks: see
             `baselines.training.seen.read_trained_on`.
         done: called with the number of tasks finished since the last call, for progress.
+        played: called with the number of episodes played since the last call, or found in `out`; by several threads.
 
     Raises:
         OptionError: if `out` has results of other settings, or the ego's actions are not integers in 0..5.
@@ -78,6 +80,7 @@ def evaluate(
     stored = {task.task_id: find_result(out, task.task_id, settings) for task in tasks} if out else {}
     results = {task_id: result for task_id, result in stored.items() if result}
     done(len(results))
+    played(len(results) * len(seeds) * protocol.episodes)
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
     for task in tasks:
         if task.task_id not in results:
@@ -88,7 +91,7 @@ def evaluate(
 
     def run(group: list[Task], stopped: Event) -> list[Result]:
         prepared = prepare_rollout(lambda layout: egos[layout.name], group, protocol, seeds, suite)
-        return _evaluate_group(group, prepared, len(seeds), settings, stopped)
+        return _evaluate_group(group, prepared, len(seeds), settings, stopped, played)
 
     # Groups run side by side: one compiles while another plays, and one alone does not use all cores. An ego outside
     # JAX gets a single thread, since its `reset` must come right before its episodes.
@@ -120,18 +123,24 @@ def _check_teammate(task: Task, suite: Path | None) -> None:
 
 
 def _evaluate_group(
-    tasks: list[Task], prepared: PreparedRollout, seeds: int, settings: dict[str, Any], stopped: Event
+    tasks: list[Task],
+    prepared: PreparedRollout,
+    seeds: int,
+    settings: dict[str, Any],
+    stopped: Event,
+    done: Callable[[int], None],
 ) -> list[Result]:
     """Returns the results of tasks of one layout and teammate family; none if it was stopped."""
     returns = []
-    for played in play_episodes(prepared, prepared.rollout.protocol.episodes):
+    for episode in play_episodes(prepared, prepared.rollout.protocol.episodes):
         if stopped.is_set():
             return []
-        ego = played.actions[..., EGO]
+        ego = episode.actions[..., EGO]
         low, high = int(ego.min()), int(ego.max())
         if low < 0 or high >= len(ACTIONS):
             raise OptionError(f"the ego returned actions {low}..{high} on {tasks[0].layout.name}, expected 0..5")
-        returns.append(np.asarray(played.reward, np.float64).sum(axis=-1))
+        returns.append(np.asarray(episode.reward, np.float64).sum(axis=-1))
+        done(len(tasks) * seeds)
     per_task = np.stack(returns, axis=-1).reshape(len(tasks), seeds, -1)
     return [Result(task.task_id, settings, rows.tolist()) for task, rows in zip(tasks, per_task, strict=True)]
 

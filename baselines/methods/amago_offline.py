@@ -1,4 +1,4 @@
-"""AMAGO-Offline (paper, Sec. 4.5): an actor-critic on the sequence encoder that maximises return, offline.
+"""AMAGO-Offline (paper, Sec. 5.4): an actor-critic on the sequence encoder that maximises return, offline.
 
 As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder and exist once for each of several discount
 factors; the ego acts by the longest. Returns continue over episodes, as an in-context learner's do, so that what an

@@ -1,4 +1,4 @@
-"""Hybrid-AD (paper, Sec. 4.4, "Recurrent Architecture Variant"): AD's loss on a recurrent state tracker.
+"""Hybrid-AD (paper, Sec. 5.3, "Recurrent Architecture Variant"): AD's loss on a recurrent state tracker.
 
 Shapes: `B` batch size, `N` tokens of a sequence, `D` width.
 """

@@ -12,7 +12,7 @@ Positions = Literal["none", "rope"]
 """Position embedding of tokens: none, as published, or rotary (Su et al. 2021)."""
 
 SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 768, 100_000)}
-"""Size name -> layers, width, training steps (paper, Sec. 4.4, "Model Scale and Training Budget")."""
+"""Size name -> layers, width, training steps (paper, Sec. 5.3, "Model Scale and Training Budget")."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ def model_card(run: EvaluationRun) -> str:
 
     Args:
         run: results of a model that was trained here. A run that was merged from models of several layouts has one
-            card, with a row of the table of models for each; settings are those of the first.
+            card, with a row of the table of models for each, and settings for each that differ.
     """
     sources = [(source, source.trained) for source in run.sources if source.trained]
     trained = sources[0][1]
@@ -44,7 +44,7 @@ def model_card(run: EvaluationRun) -> str:
         data_version=histories["data_version"],
         code_version=config["package_version"],
         models="\n".join(_model_row(run, source, trained) for source, trained in sources),
-        settings=_bullets({**config["model"], **config["train"]}),
+        settings=_settings(sources),
         protocol=run.protocol,
         results="\n\n".join(table for _, table in track_tables(run)),
         limits="\n".join(f"* {limit}" for limit in limits),
@@ -82,6 +82,17 @@ def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]
 def card_name(run: EvaluationRun) -> str:
     """Returns the file name of a model's card."""
     return f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md"
+
+
+def _settings(sources: Sequence[tuple[ResultSource, Mapping[str, Any]]]) -> str:
+    """Returns the settings of models as lists, one for each set of equal settings."""
+    tested_on: dict[str, list[str]] = {}
+    for source, trained in sources:
+        listed = _bullets({**trained["config"]["model"], **trained["config"]["train"]})
+        tested_on.setdefault(listed, []).extend(source.layouts)
+    if len(tested_on) == 1:
+        return next(iter(tested_on))
+    return "\n\n".join(f"Tested on {', '.join(layouts)}:\n\n{listed}" for listed, layouts in tested_on.items())
 
 
 def _bullets(settings: Mapping[str, Any]) -> str:

@@ -36,6 +36,10 @@ BATCH_AXIS = "data"
 """The mesh's one axis: rows of a batch."""
 
 
+StepProgress = Callable[[int, float | None], None]
+"""Called with (steps done, the loss last logged or None)."""
+
+
 class TrainingData(NamedTuple):
     """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
@@ -190,7 +194,7 @@ def train(
     devices: Any = None,
     tensorboard: bool = False,
     save_minutes: float = SAVE_MINUTES,
-    done: Callable[[int, float], None] = lambda step, loss: None,
+    done: StepProgress = lambda step, loss: None,
 ) -> TrainState:
     """Train to the end, from the start or from the last checkpoint in the folder.
 
@@ -206,7 +210,7 @@ def train(
         devices: all by default.
         tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
         save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
-        done: called with a step and its loss whenever they are logged.
+        done: called after every step, see `StepProgress`.
 
     Returns:
         The state after the last step.
@@ -236,12 +240,14 @@ def train(
         stop = stack.enter_context(StopSignals())
         clock = _StepClock(first)
         save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
+        loss: float | None = None
         for step, batch in enumerate(batches, start=first + 1):
             state, numbers = trainer.step(state, batch)
             last, lines = step == options.steps, []
             if step % options.log_every == 0 or last:
                 lines.append({"step": step, "part": "train", **_as_floats(numbers)})
-                done(step, lines[0]["loss"])
+                loss = lines[0]["loss"]
+            done(step, loss)
             if step % options.validate_every == 0 or last:
                 lines += trainer.validation_lines(state, data.validation, step)
             if lines:

@@ -73,15 +73,41 @@ def test_a_tiny_experiment_ends_in_a_report(release, tmp_path, monkeypatch):
     """One task of five steps with a model of one layer."""
     monkeypatch.setitem(PROTOCOLS, "seeded", dataclasses.replace(PROTOCOLS["seeded"], steps=5))
     plan = dataclasses.replace(SMALL, root=str(release), layouts=("demo_wide",), train=TRAIN | {"context": 8})
+    plan = dataclasses.replace(plan, filters={"algorithm": ("utility_greedy",)})
     done = run_experiment("tracks", plan, tmp_path)
+    (config,) = (json.loads(path.read_text()) for path in tmp_path.rglob("config.json"))
+    assert config["histories"]["algorithm"] == ["utility_greedy"]
+    assert [cell["algorithm"] for cell in config["trained_on"]] == ["utility_greedy"]
     assert done.notes == ["Teammate and layout generalization (`tracks`)"]
     assert all(path.is_file() for path in done.report)
     lines = (tmp_path / "report" / "report.csv").read_text().splitlines()
     assert [line.split(",")[:6] for line in lines[1:]] == [["AD", "seeded", "demo_wide", "H4", "1", "2"]]
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")}
     assert len(before) == 1
+    assert read_result(next(iter(before))).settings["details"]["trained_on"] == config["trained_on"]
     run_experiment("tracks", plan, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")} == before
+
+
+def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_path, monkeypatch):
+    """Cached acting has down to 4/5 K steps."""
+    chosen = []
+    monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
+
+    def find_agent(folder: str, acting: str) -> None:
+        chosen.append(acting)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(experiments, "find_agent", find_agent)
+    plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
+    for experiment, changed in (
+        ("sweep context", plan),
+        ("sweep context", dataclasses.replace(plan, acting="cached")),
+        ("sweep size", dataclasses.replace(plan, values=("small",), model={"heads": 2})),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            run_experiment(experiment, changed, tmp_path)
+    assert chosen == ["exact", "cached", "cached"]
 
 
 def interrupt_after(what: str):
@@ -99,7 +125,7 @@ def swept(release, tmp_path_factory) -> tuple[Path, ExperimentPlan]:
     """An experiment that was interrupted twice, then run to its end."""
     out = tmp_path_factory.mktemp("swept")
     plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
-    for what in ("K250 on demo_wide: training", "K250 on demo_wide: evaluation"):
+    for what in ("K250 on demo_wide: training steps", "K250 on demo_wide: episodes"):
         with pytest.raises(KeyboardInterrupt):
             run_experiment("sweep context", plan, out, interrupt_after(what))
     assert Checkpoints(out / "ad-K250" / "demo_wide" / "run" / CHECKPOINTS).latest == 2
@@ -129,7 +155,7 @@ def test_finished_work_is_kept(swept, monkeypatch):
     monkeypatch.setattr(experiments, "write_page_with_episodes", lambda *a, **k: out)
     run_experiment("sweep context", plan, out, lambda what, *counts: steps.append((what.split(": ")[1], *counts)))
     assert [(path, path.stat().st_mtime_ns) for path in results] == before
-    assert steps == [("training", 0, 2), ("training", 2, 2), ("evaluation", 0, 1), ("evaluation", 1, 1)]
+    assert steps == [("training steps", 0, 2), ("training steps", 2, 2), *((("episodes", n, 2)) for n in (0, 0, 2))]
     with pytest.raises(OptionError, match=r"train\.seed: the run has 0, expected 3"):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
 
@@ -202,7 +228,8 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
 
     monkeypatch.setattr(experiments, "run_experiment", note_call)
     small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-films"]
-    small += ["--layers", "2", "--warmup", "0.5"]
+    small += ["--layers", "2", "--warmup", "0.5", "--save-minutes", "0.5"]
+    small += ["--teammate-family", "rl", "--algorithm", "fcp", "--algorithm", "brdiv"]
     chosen = ["--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]
     result = CliRunner().invoke(cli, ["ablate", "ta", *chosen, *small], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -210,6 +237,9 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
     ((name, plan, out),) = calls
     assert (name, out) == ("ablate ta", Path("runs/ablate-ta"))
     options: dict[str, Any] = {
+        "filters": {"teammate_family": ("rl",), "algorithm": ("fcp", "brdiv")},
+        "acting": None,
+        "save_minutes": 0.5,
         "layouts": ("cramped_up",),
         "values": ("ta",),
         "train": {"steps": 1, "batch_size": 2, "warmup": 0.5},
@@ -283,7 +313,7 @@ def test_teammates_that_were_trained_with_are_refused(suite, tmp_path):
 def test_impossible_plans(release, tmp_path):
     def fails(error, match, name="ablate ta", **changes):
         with pytest.raises(error, match=match):
-            run_experiment(name, dataclasses.replace(SMALL, root=str(release), **changes), tmp_path)
+            run_experiment(name, dataclasses.replace(SMALL, **{"root": str(release), **changes}), tmp_path)
 
     fails(UnknownNameError, "unknown experiment 'sweep contexts'.*Did you mean 'sweep context'", "sweep contexts")
     fails(UnknownNameError, "unknown setting of ablate ta 'tb'; valid: none, ta, next_obs", values=("tb",))
@@ -295,6 +325,10 @@ def test_impossible_plans(release, tmp_path):
     )
     fails(UnknownNameError, "unknown teammate family of these tasks 'rl'; valid: H1, H2, H3, H4", families=("rl",))
     fails(OptionError, "tasks = 0: expected at least 1", tasks=0)
+    absent = "algorithm = fcp: none of .* on .*; these have utility_greedy: choose among them"
+    fails(EmptySelectionError, absent, filters={"algorithm": ("utility_greedy", "fcp")})
+    learned: dict[str, Any] = {"root": None, "filters": {"teammate_family": ("rl",)}, "layouts": ("demo_wide",)}
+    fails(EmptySelectionError, "no training histories of teammate_family rl on demo_wide; it has asymm_both", **learned)
     result = CliRunner().invoke(cli, ["sweep", "context", "--context", "9"])
     assert "context = 9: `sweep context` varies it; choose by --only, such as K250" in str(result.exception)
     assert (

@@ -65,7 +65,10 @@ def test_an_interrupted_run_resumes_to_the_same_results(together, tmp_path):
         started.append(layout.name)
         return random(layout)
 
-    assert returns(evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path)) == together
+    played: list[int] = []
+    again = evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
+    assert returns(again) == together
+    assert played == [5 * 4, 5, 5, 5, 5]  # the finished tasks at once, then episode by episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10
     assert read_result(tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json") == first[0]
@@ -262,6 +265,8 @@ def test_commands(tmp_path):
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert result.exit_code == 0, result.output
     assert "1 result in" in result.output
+    assert "stay, published, episodes: started, 4\n" in result.output  # no terminal: plain lines
+    assert "stay, published, episodes: 4 of 4 after" in result.output
     (path,) = (tmp_path / "run" / "tasks").iterdir()
     assert read_result(path).returns == [[40.0] * 4]
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])

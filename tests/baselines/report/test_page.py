@@ -179,10 +179,10 @@ def test_models_of_different_layouts_are_one_agent():
 
 
 def test_trained_models_have_cards(tmp_path):
-    def trained(layout, tested_on, size, **options):
+    def trained(layout, tested_on, size, layers=4, **options):
         histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [layout], "data_version": "1.0.0"}
         histories["sizes"] = {"train": size}
-        config = {"model": {"layers": 4}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+        config = {"model": {"layers": layers}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
         found = evaluated_run("AD", (tested_on,), **options)
         source = found.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12"})
         return dataclasses.replace(found, sources=(source,))
@@ -202,11 +202,13 @@ def test_trained_models_have_cards(tmp_path):
     assert "| H3 | 11.0 ± 0.0<br>" in card
     assert "It is one run, of seed 3" in card
     assert card.count("* † the agent was trained with teammates of this family") == 2, "at the table, among the limits"
-    both = merge([first, trained("asymm_both", "asymm_right", 8, trained_on=None)])
+    both = merge([first, trained("asymm_both", "asymm_right", 8, layers=2, trained_on=None)])
     (path,) = write_model_cards(both, tmp_path)
     card = path.read_text()
     assert "| asymm_right | 8 of asymm_both; the release's manifest has SHA-256 `ab12` | unknown | 3 |" in card
     assert "Each model is one run" in card
+    assert "Tested on demo_wide:\n\n* layers: 4" in card
+    assert "Tested on asymm_right:\n\n* layers: 2" in card
     assert "* ? unknown training data" in card
 
 
@@ -258,6 +260,9 @@ def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
+    started, ended = (line for line in result.stderr.splitlines() if line.startswith("episodes of the report: "))
+    assert started.endswith("started, 1")
+    assert ": 1 of 1 after" in ended
     text = (tmp_path / "report.html").read_text()
     assert Outside(text).images.count("data:image/gif") == 1
     (task,) = read_tasks(tmp_path / "own.jsonl")
