@@ -151,7 +151,7 @@ class ExperimentPlan:
     suite: Path | None = None
     train: dict[str, Any] = field(default_factory=dict)
     model: dict[str, Any] = field(default_factory=dict)
-    filters: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    filters: dict[str, Any] = field(default_factory=dict)
     values: tuple[str, ...] = ()
     families: tuple[str, ...] = ()
     tasks: int | None = None

@@ -338,7 +338,7 @@ def train_command(
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
-    filters: dict[str, tuple[str, ...]],
+    filters: dict[str, Any],
     save_minutes: float,
     tensorboard: bool,
     coordinator: str | None,

@@ -115,7 +115,8 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
                     f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
                     f"another layout or release"
                 )
-    return dataset.filter(**{FILTERS[name]: values for name, values in filters.items()}) if filters else dataset
+    fields: Any = {FILTERS[name]: values for name, values in filters.items()}
+    return dataset.filter(**fields) if filters else dataset
 
 
 def field_values(dataset: Dataset, field: str) -> np.ndarray:

@@ -274,7 +274,7 @@ class TestHeldOut:
     def test_filters_choose_the_histories_and_are_recorded(self):
         """The bundled release has teammates of several families and algorithms on asymm_both."""
 
-        def job(**filters: tuple[str, ...]) -> dict[str, Any]:
+        def job(**filters: Any) -> dict[str, Any]:
             return prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters)).about
 
         everything, learned = job()["trained_on"], job(teammate_family=("rl",))
@@ -288,7 +288,7 @@ class TestHeldOut:
         assert cell["histories"] < len(load_icrl4aht(layout="asymm_both", teammate_kind=one))  # some are held out
 
     def test_filters_that_no_history_passes(self):
-        def fails(match: str, **filters: tuple[str, ...]) -> None:
+        def fails(match: str, **filters: Any) -> None:
             with pytest.raises(EmptySelectionError, match=match):
                 prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters))
 
