@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.errors import ShardCorruptError
+from icrl4aht_data.errors import RemoteError, ShardCorruptError
 from icrl4aht_data.format import chunks
 from icrl4aht_data.format.chunks import check_chunk, chunk_hash, chunk_table_path, decode_chunk, encode_chunk
 from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.schema import CHUNK_DTYPE, CHUNK_DTYPES, FIELDS
+from icrl4aht_data.format.schema import CHUNK_DTYPE, CHUNK_DTYPES, FIELDS, MANIFEST
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from tests.helpers.forged_chunks import forge_crc32, with_other_actions, with_trailing_bytes
@@ -117,6 +118,18 @@ def test_a_forged_chunk_is_refused(stored, tmp_path, monkeypatch, mode, form):
         read_window(tmp_path / "forged", mode)
     np.testing.assert_array_equal(read_window(stored, mode)[0], load_icrl4aht(stored)[0].actions[:])
     assert not np.array_equal(forged, load_icrl4aht(stored)[0].actions[:])
+
+
+def test_a_server_with_true_tables_and_other_bytes_is_refused(stored, tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setattr(MemoryFileSystem, "store", {})
+    forge(stored, tmp_path / "forged", "other actions")
+    shutil.copyfile(stored / MANIFEST, tmp_path / "forged" / MANIFEST)
+    MemoryFileSystem().put(str(tmp_path / "forged"), "/forged", recursive=True)
+    dataset = load_icrl4aht("memory://forged", obs="state")
+    np.testing.assert_array_equal(dataset[0].read("rewards"), load_icrl4aht(stored)[0].read("rewards"))
+    with pytest.raises(RemoteError, match=r"bytes \d+\.\.\d+: expected blake2b"):
+        dataset[0].read("actions")
 
 
 def test_verify_finds_a_forged_chunk(stored, tmp_path):
