@@ -69,7 +69,9 @@ def stored_task(
             yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read))
             done()
 
-    files = checkpoint_files(dataset.origin.below(TEAMMATES), task, dataset.root)
+    if task.teammate.get("kind") == "rl":
+        dataset.origin.below(f"{TEAMMATES}/{task.teammate['theta']['sha256']}")  # fetched and checked
+    files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
     if provenance.expert is not None:
         sha256 = provenance.expert.policy_sha256
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
