@@ -11,7 +11,7 @@ from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import describe, shard_sizes
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.paths import resolve_inside
@@ -34,6 +34,7 @@ def check_index(index: Index, tasks: list[Task], chosen: set[str], report: Repor
     if not index.entries:
         report.add(HISTORIES, "no histories")
     _check_info(index, tasks, chosen, report)
+    _check_experts(index, report)
     shards = {entry.shard for entry in index.entries}
     for shard in shards:
         stem, count = shard.removesuffix(".h5").split("-")[0], int(shard.removesuffix(".h5").split("-")[-1])
@@ -62,6 +63,22 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 def _describes(task: Task, entry: Entry) -> bool:
     names = ("track", "split", "teammate_kind", "teammate_family", "seed")
     return task.layout.name == entry.layout and all(getattr(task, name) == getattr(entry, name) for name in names)
+
+
+def _check_experts(index: Index, report: Report) -> None:
+    """Check that the index has the returns and steps of experts that the provenance has."""
+    try:
+        provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
+    except Icrl4ahtError as error:
+        if report.ok:  # otherwise it is reported already
+            report.add(PROVENANCE, str(error))
+        return
+    fields = {task_id: of_task.entry_fields() for task_id, of_task in provenance.items()}
+    for entry in index.entries:
+        for name, expected in fields.get(entry.task_id, Provenance().entry_fields()).items():
+            if (found := getattr(entry, name)) != expected:
+                where = f"history {entry.history_id}: {name}"
+                report.add(HISTORIES, f"{where} {found}, but {PROVENANCE} has {expected} of its task")
 
 
 def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:

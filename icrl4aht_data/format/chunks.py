@@ -7,6 +7,7 @@ and the codec reverses HDF5's shuffle and deflate filters.
 from __future__ import annotations
 
 import hashlib
+import struct
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ DEFLATE_RATIO = 1100
 DEFLATE_LEVEL = 8
 """Compression level of chunks."""
 
+_POSITION = struct.Struct("<QIII")  # a row of version 2; the hash follows in later versions
 _TABLE_BYTES = 256 * 2**20  # a thousand times the chunk table of a shard of usual size
 _ROW_BYTES = 16 * 2**20  # most stored bytes that one row may cover, thirty times our largest chunk
 
@@ -94,12 +96,13 @@ def check_chunk(data: bytes, row: np.void) -> None:
     Raises:
         ValueError: says what differs, what was expected, and what was found.
     """
-    _, size, _, crc32, *hashes = row.item()
+    stored = row.tobytes()  # twice as fast as access by field names
+    _, size, _, crc32 = _POSITION.unpack_from(stored)
     if len(data) != size:
         raise ValueError(f"expected {size} bytes, found {len(data)}")
     if (found := zlib.crc32(data)) != crc32:
         raise ValueError(f"expected crc32 {crc32:08x}, found {found:08x}")
-    if hashes and (digest := chunk_hash(data)) != (expected := hashes[0].tobytes()):
+    if (expected := stored[_POSITION.size :]) and (digest := chunk_hash(data)) != expected:
         raise ValueError(f"expected blake2b {expected.hex()}, found {digest.hex()}")
 
 

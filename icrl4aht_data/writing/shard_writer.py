@@ -72,10 +72,10 @@ def write_shard(
         table["hash"] = [digest for _, digest in checksums]
         locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
         table["offset"], table["size"], table["rows"] = np.array(locations, np.uint64).T
-    np.save(table_path, np.concatenate([table, _metadata_lines(path, table)]), allow_pickle=False)
+    np.save(table_path, np.concatenate([table, metadata_lines(path, table)]), allow_pickle=False)
 
 
-def _metadata_lines(path: Path, chunks: np.ndarray) -> np.ndarray:
+def metadata_lines(path: Path, chunks: np.ndarray) -> np.ndarray:
     """Return chunk table lines for the bytes between the chunks: HDF5 writes them, so they are read from the file."""
     ordered = np.sort(chunks, order="offset")
     starts = [*ordered["offset"].tolist(), path.stat().st_size]

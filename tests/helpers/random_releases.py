@@ -108,6 +108,9 @@ def long_index(root: Path, lines: int = 3000) -> list[Entry]:
         line |= {"history_id": number, "env_idx": int(rng.integers(1024)), "score": float(rng.normal()), "h5_row": None}
         line["task_id"] += f"_{number // 40}"
         line["shard"] = line["shard"].replace("00000-of-00001", f"{number // 500:05}-of-00006")
+        if number % 2:
+            line |= {"source": f"source_{number % 3}", "expert_step": number, "expert_return": -1.0}
+            line["expert_return_sampled"] = float(rng.normal())
         made.append(line | ({"h5_row": number % 500} if number % 3 else {}))
     (root / "meta").mkdir(parents=True)
     (root / "meta" / "info.json").write_text(

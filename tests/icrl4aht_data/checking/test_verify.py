@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from icrl4aht_data import verify_release
+from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.checking.report import Level
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance
+from icrl4aht_data.format.schema import HISTORIES, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing import release
+from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
 
@@ -86,6 +87,32 @@ def rewritten(tmp_path, spoil, kind: Kind = "lite"):
     arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
     new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, spoil(arrays))])
     return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="", kept_steps=20)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("expert_return", 0.5), ("expert_return_sampled", None), ("expert_step", 8)]
+)
+def test_returns_of_experts_are_those_of_the_provenance(tmp_path, name, value):
+    (task,) = make_tasks(["demo_simple"])
+    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
+    labels = ExpertLabels("ab", "greedy", step=7, return_greedy=0.0, return_sampled=16.9, episodes=200)
+    new = NewTask(task, Provenance(expert=labels), 1, lambda: [NewHistory(0, arrays)], source="dqn")
+    root = write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+    to_release(load_icrl4aht(root), tmp_path / "converted", "full")
+    for folder in (root, tmp_path / "converted"):
+        (entry,) = load_icrl4aht(folder).entries
+        assert (entry.source, entry.expert_return, entry.expert_return_sampled, entry.expert_step) == (
+            "dqn",
+            0,
+            16.9,
+            7,
+        )
+        assert not problems(folder)
+    line = json.loads((root / HISTORIES).read_text()) | {name: value}
+    (root / HISTORIES).write_text(json.dumps(line) + "\n")
+    write_manifest(root)
+    (problem,) = problems(root)
+    assert f"history 0: {name} {value}, but meta/provenance.json has" in problem
 
 
 def at(name, index, value):

@@ -104,6 +104,8 @@ def test_queries_find_what_a_scan_finds(long, folder):
         {"layout": ["demo_wide", "cramped_room_up"], "split": "train"},
         {"teammate_family": "H4", "teammate_kind": "utility_greedy", "track": "layout"},
         {"task_id": entries[777].task_id},
+        {"source": "source_1"},
+        {"source": ["ppo", "source_0"], "split": "train"},
         {"task_id": [entries[777].task_id, entries[1].task_id], "layout": entries[1].layout},
     ):
         found = index.query(**wanted)

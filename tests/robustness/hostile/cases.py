@@ -268,8 +268,8 @@ def gigabyte_of_zeros() -> bytes:
 def inflating(root: Path) -> None:
     """Replace the first chunk by one that inflates to a gigabyte."""
     data, path, rows = gigabyte_of_zeros(), root / SHARD, np.load(root / TABLE)
-    rows["offset"][0], rows["size"][0] = path.stat().st_size, len(data)
-    rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
+    rows["offset"][0], rows["size"][0], rows["crc32"][0] = path.stat().st_size, len(data), zlib.crc32(data)
+    rows["hash"][0] = np.frombuffer(chunk_hash(data), np.uint8)
     with path.open("ab") as stream:
         stream.write(data)
     np.save(root / TABLE, rows)
@@ -285,7 +285,7 @@ def inflating_within_bounds(root: Path) -> None:
         stream.write(data.ljust(int(rows["size"][0]), b"\0"))
         stream.seek(int(rows["offset"][0]))
         data = stream.read(int(rows["size"][0]))
-    rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
+        rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
     np.save(root / TABLE, rows)
 
 
