@@ -89,6 +89,12 @@ def read_manifest(folder: Path) -> dict[str, str]:
     return parse_manifest(read_text(path), path)
 
 
+def _listed(root: Path) -> Mapping[str, str]:
+    """The manifest of a release folder, parsed again only if its text has changed."""
+    path = resolve_inside(root, MANIFEST)
+    return _parsed_once(read_text(path), path)
+
+
 @lru_cache(maxsize=16)
 def _parsed_once(text: str, path: Path) -> Mapping[str, str]:
     return MappingProxyType(parse_manifest(text, path))
@@ -107,8 +113,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         IndexFormatError, ChunkTableError: if a file is missing, not listed or another one, or if there is no valid
             manifest; names the file, the expected and the found hash, and what to do.
     """
-    manifest = resolve_inside(root, MANIFEST)
-    listed = _parsed_once(read_text(manifest), manifest)
+    manifest, listed = root / MANIFEST, _listed(root)
     for name in names:
         path = resolve_inside(root, name)
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
@@ -132,10 +137,15 @@ def check_meta(root: Path) -> None:
 
     The card of a release's sources may be missing, since nothing is read from it.
     """
-    manifest = resolve_inside(root, MANIFEST)
-    listed = [name for name in _parsed_once(read_text(manifest), manifest) if re.fullmatch(r"meta/[^/]+", name)]
+    listed = [name for name in _listed(root) if re.fullmatch(r"meta/[^/]+", name)]
     read = {name for name in (INFO, HISTORIES, TASKS, PROVENANCE) if name in listed or (root / name).exists()}
     check_against_manifest(root, sorted(read | {name for name in listed if (root / name).exists()}))
+
+
+def check_folder(root: Path, folder: str) -> None:
+    """Check the files of a release's folder that the manifest lists, as far as they exist; see
+    `check_against_manifest`."""
+    check_against_manifest(root, [n for n in _listed(root) if n.startswith(f"{folder}/") and (root / n).exists()])
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:

@@ -31,7 +31,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import check_against_manifest, parse_manifest, read_manifest
+from icrl4aht_data.format.manifest import check_against_manifest, check_folder, parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.addresses import without_credentials
 from icrl4aht_data.remote.download_note import read_note
@@ -88,15 +88,18 @@ class ReleaseLocation:
         return path
 
     def below(self, name: str) -> Path:
-        """Path of a folder, which need not exist; all its files are fetched first if they are not downloaded.
+        """Path of a folder, which need not exist; all its files are fetched first if they are not downloaded, and
+        checked against the manifest.
 
         Raises:
             UnsafePathError: if it leads out of the release.
             RemoteError, OfflineError: if a file cannot be fetched.
+            IndexFormatError: if a file is not the one that the manifest lists.
         """
         path = resolve_inside(self.folder, name)
         if self.remote is not None:
             self.remote.fetch(known for known in self.remote.manifest if known.startswith(f"{name}/"))
+        check_folder(self.folder, name)
         return path
 
     def is_here(self, name: str) -> bool:

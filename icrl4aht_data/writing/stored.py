@@ -69,5 +69,7 @@ def stored_task(
             yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read))
             done()
 
-    files = checkpoint_files(dataset.origin.below(TEAMMATES), task, dataset.root)
+    if task.teammate.get("kind") == "rl":
+        dataset.origin.below(f"{TEAMMATES}/{task.teammate['theta']['sha256']}")  # fetched and checked
+    files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
     return NewTask(task, provenance, len(dataset), load, files, dataset.entries[0].source)

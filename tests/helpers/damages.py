@@ -51,7 +51,7 @@ def _make_pipe(path: Path) -> None:
     os.mkfifo(path)
 
 
-DAMAGES: dict[str, Callable[[Path], None]] = {
+DAMAGES: dict[str, Callable[[Path], object]] = {
     "a bit flipped": flip_bit,
     "a bit flipped, times as before": _flip_unnoticed,
     "empty": lambda path: path.write_bytes(b""),

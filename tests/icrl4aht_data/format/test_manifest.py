@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from generation.teammates.registry import recover_teammate
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, ReleaseError, RootNotFoundError
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import check_against_manifest, check_meta, write_manifest
-from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
 from icrl4aht_data.utils import remembered
+from icrl4aht_data.writing.convert import to_release
 from tests.helpers.damages import DAMAGES, flip_bit, restore
 from tests.helpers.random_releases import SHARD
 from tests.robustness.limits import permissions_count
@@ -95,6 +98,20 @@ def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged)
     flip_bit(damaged / chunk_table_name(SHARD))
     with pytest.raises(ChunkTableError, match="expected sha256"):
         dataset[0].read("actions")
+
+
+def test_checkpoints_are_checked_before_they_are_copied_or_play(tmp_path):
+    shutil.copytree(MINI, tmp_path / "release")
+    dataset = load_icrl4aht(tmp_path / "release", teammate_family="rl", layout="cramped_up")[:1]
+    digest = dataset.recover_teammate(int(dataset.ids[0]))["theta"]["sha256"]
+    for name in ("policy.json", "policy.safetensors"):
+        path = tmp_path / "release" / TEAMMATES / digest / name
+        flip_bit(path, path.stat().st_size // 2)
+        with pytest.raises(IndexFormatError, match=rf"{name}: expected sha256"):
+            recover_teammate(dataset, int(dataset.ids[0]))
+        with pytest.raises(IndexFormatError, match=rf"{name}: expected sha256"):
+            to_release(dataset, tmp_path / "copy", "lite")
+        flip_bit(path, path.stat().st_size // 2)
 
 
 def test_an_edited_release_with_a_new_manifest_opens(damaged):

@@ -398,7 +398,8 @@ def bit_flips(workspace: Workspace, n: int) -> Iterator[Attempt]:
 
     modes: list[CacheMode] = ["ram", "stream", "ram", "stream", "mmap"]
     for number in range(n):
-        (path, mode), rng = (paths[number % len(paths)], modes[number // len(paths) % len(modes)]), workspace.rng
+        path, rng = paths[number % len(paths)], workspace.rng
+        mode = modes[number // len(paths) % len(modes)]
         yield partial(attempt, path, int(rng.integers(path.stat().st_size)), int(rng.integers(8)), mode)
 
 
