@@ -87,8 +87,9 @@ def compiled_quickly() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def temporary_cache(tmp_path_factory) -> None:
-    """Redirect the package's cache to a folder of this session."""
+    """Redirect the package's cache, and what it notes and downloads, to folders of this session."""
     os.environ["ICRL4AHT_CACHE_DIR"] = str(tmp_path_factory.mktemp("cache"))
+    os.environ["ICRL4AHT_DATA_DIR"] = str(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="session")
