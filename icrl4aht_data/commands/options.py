@@ -277,5 +277,5 @@ def _in_words(error: OSError) -> str:
         path = path.with_name(path.stem.removeprefix("."))
     remedy = _REMEDIES.get(error.errno)
     if error.errno in FULL:
-        remedy = f"{describe_disk(path)}: {remedy}"
+        remedy = f"{remedy}: {describe_disk(path)}"
     return f"{path}: {os.strerror(error.errno)}" + (f"; {remedy}" if remedy else "")
