@@ -84,6 +84,10 @@ class ProgressBoard:
         self._done += 1
         self._show()
 
+    def print_lines(self) -> None:
+        """Print the line of all tasks, see `LineProgress`."""
+        self._bars.print_lines()
+
     def _show(self) -> None:
         speed = sum(speed for _, _, speed in self._running.values())
         completed = self._done * self._updates + sum(updates for _, updates, _ in self._running.values())

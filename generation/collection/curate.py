@@ -57,14 +57,14 @@ def plot_filter(path: Path, title: str, rewards: np.ndarray, streams: np.ndarray
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields the final checkpoint's most probable action at every step of each stream.
+    """Yields a policy's most probable action at every step of each stream.
 
     The recurrent state is zero at the start of each episode, as in training.
 
     Args:
         layout: the layout.
         network: the ego's network.
-        params: its final parameters.
+        params: parameters of the checkpoint that labels.
         states: uint8 (T, S) for each stream.
 
     Yields:

@@ -26,7 +26,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, KINDS, MANIFEST, TASKS
+from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
@@ -34,6 +34,11 @@ from icrl4aht_data.remote.download import chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.paths import resolve_inside
+
+_WITHOUT_HASHES = (
+    "format version {version} has no chunk hashes: reading checks chunks by CRC-32 only, which a forger can satisfy; "
+    "`icrl4aht-data convert --to {kind}` writes a release with hashes"
+)
 
 
 def verify_release(
@@ -105,16 +110,13 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         report.add("meta", str(unreadable))
         return
     index, tasks = read_index(origin.folder), read_tasks(resolve_inside(origin.folder, TASKS))
+    if not index.info.has_chunk_hashes:
+        report.notes.append(_WITHOUT_HASHES.format(version=index.info.format_version, kind=index.info.kind))
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
-    if "hash" not in (CHUNK_DTYPES[index.info.format_version].names or ()):
-        report.notes.append(
-            f"format version {index.info.format_version}: its chunk tables have no strong hashes, only CRC-32, which "
-            f"finds accidents but no forgery; `icrl4aht-data convert` brings it to version {FORMAT_VERSION}"
-        )
     check_references(listed, index, tasks, report)
-    check_provenance(index, tasks, report)
+    check_provenance(index, tasks, listed, report)
     check_index(index, tasks, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)

@@ -39,7 +39,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import describe, read_info
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS, Entry
+from icrl4aht_data.format.schema import ALL_KINDS, FORMAT_VERSION, OBSERVATIONS, Entry
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
@@ -361,7 +361,8 @@ def convert(
 
     SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. Writes a release
     folder (full, lite, observations), a folder with the published code's two files (published), or a Parquet file with
-    the index (parquet). Published files become lite by default, or observations where they have no state records.
+    the index (parquet). Published files become lite by default, or observations where they have no state records; a
+    release of an older format version keeps its kind by default, and becomes one of the current version.
     """
     with bars(quiet) as show:
         advance = partial(show, "histories")
@@ -381,6 +382,8 @@ def convert(
             )
         else:
             dataset = _load(source, filters)
+            if form is None and dataset.info.format_version < FORMAT_VERSION:
+                form = dataset.info.kind
             if form is None:
                 raise click.UsageError("give the form to convert to: --to full, lite, observations, published, parquet")
             if tasks or family_map or kept_steps != KEPT_STEPS:

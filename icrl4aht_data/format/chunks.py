@@ -94,7 +94,8 @@ def check_chunk(data: bytes, row: np.void) -> None:
     Raises:
         ValueError: says what differs, what was expected, and what was found.
     """
-    _, size, _, crc32, *hashes = row.item()
+    values: Any = row.item()
+    _, size, _, crc32, *hashes = values
     if len(data) != size:
         raise ValueError(f"expected {size} bytes, found {len(data)}")
     if (found := zlib.crc32(data)) != crc32:

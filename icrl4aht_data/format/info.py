@@ -21,7 +21,7 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind
+from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
@@ -134,6 +134,11 @@ class ReleaseInfo:
     layouts: dict[str, LayoutSummary]
     shards: dict[str, _Bytes] = field(default_factory=dict)
     statistics: dict[str, LayoutStatistics] = field(default_factory=dict)
+
+    @property
+    def has_chunk_hashes(self) -> bool:
+        """Whether chunk tables have hashes, see `schema.CHUNK_DTYPES`; CRC-32 alone does not notice a forgery."""
+        return "hash" in (CHUNK_DTYPES[self.format_version].names or ())
 
     def to_json(self) -> dict[str, Any]:
         """The object to write, without `shards` and `statistics` where they are empty."""

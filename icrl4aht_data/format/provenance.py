@@ -133,6 +133,15 @@ class Provenance:
     suite: TeammateSuite | None = None
     other: dict[str, Any] = field(default_factory=dict)
 
+    def entry_fields(self) -> dict[str, Any]:
+        """The fields of the task's index entries that describe the policy behind the expert actions."""
+        expert = self.expert
+        return {
+            "expert_return": None if expert is None else expert.return_greedy,
+            "expert_return_sampled": None if expert is None else expert.return_sampled,
+            "expert_step": None if expert is None else expert.step,
+        }
+
     def to_json(self) -> dict[str, Any]:
         """The object to write, without what was not recorded."""
         content = {name: value for name, value in asdict(self).items() if name != "other" and value is not None}

@@ -130,7 +130,7 @@ class History:
 
     @property
     def expert_actions(self) -> LazyArray:
-        """(T,) int32: greedy actions of the final ego at the same steps, 0..5 (paper, App. D.1)."""
+        """(T,) int32: greedy actions of a checkpoint of the ego at the same steps, 0..5 (paper, App. D.1)."""
         return LazyArray(self, "expert_actions")
 
     @property

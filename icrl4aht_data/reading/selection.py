@@ -159,10 +159,11 @@ class Selection:
     def __repr__(self) -> str:
         layouts = [layout.name for layout in self.layouts]
         tasks = len(np.unique(self.column("task_id")))
+        weak = "" if self.info.has_chunk_hashes else f" of format {self.info.format_version}, without chunk hashes,"
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
-            f"{self.info.kind} release {self.info.data_version} at {self.origin})"
+            f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
         )
 
     def history(self, history_id: int) -> History:

@@ -28,7 +28,7 @@ from icrl4aht_data.format.chunks import (
 )
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FIELDS, Entry, Field
+from icrl4aht_data.format.schema import CHUNK_DTYPES, FIELDS, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
 from icrl4aht_data.remote.partial_file import PartialFile, fetch_chunks
@@ -67,7 +67,8 @@ class Shard:
         cache: ChunkCache | None = None,
     ) -> None:
         self.path, self.name = resolve_inside(location.folder, name), name
-        self.kind, self.format_version = info.kind, info.format_version
+        self.kind: Kind = info.kind
+        self.format_version = info.format_version
         self.layout = get_layout(entries[0].layout)
         self.entries = {entry.history_id: entry for entry in entries}
         self._remote = location.remote
@@ -253,14 +254,15 @@ class Shard:
         return [(self._remote.part(self.name), self.table[rows])] if rows else []
 
     def fingerprint(self, history_id: int) -> bytes:
-        """Hashes of a history's chunks, which differ where its stored content differs."""
+        """Names of a history's fields and hashes of its chunks, which differ where its stored content differs."""
         entry = self.entries[history_id]
         stored = entry.stored_fields(self.kind)
         first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
-        if self.format_version >= 3:
-            return self.table["hash"][first : first + chunks].tobytes()
-        # Whoever knows a CRC-32 can make other content with it, so the stored bytes themselves are hashed.
-        return b"".join(chunk_hash(self.checked_bytes(row)) for row in range(first, first + chunks))
+        rows, names = range(first, first + chunks), " ".join(field.name for field in stored).encode()
+        if "hash" in (self.table.dtype.names or ()):
+            return names + self.table["hash"][first : first + chunks].tobytes()
+        # Other content can have the same CRC-32, so the stored bytes of version 2 are hashed here.
+        return names + b"".join(chunk_hash(self.checked_bytes(row)) for row in rows)
 
     def chunks(self) -> Iterator[tuple[int, int, Field]]:
         """Every chunk as (row in the chunk table, history id, field)."""

@@ -127,7 +127,7 @@ class LineProgress(Progress):
             return f"{filesize.decimal(int(speed))} a second"
         units = {"second": speed, "minute": 60 * speed, "hour": 3600 * speed}
         unit = next((name for name, rate in units.items() if rate >= 1), "hour")
-        return f"{units[unit]:,.{0 if units[unit] >= 10 else 1}f} a {unit}"
+        return f"{units[unit]:,.{0 if units[unit] >= 10 else 1}f} {'an' if unit == 'hour' else 'a'} {unit}"
 
 
 def _unit(task: Task) -> str:

@@ -33,7 +33,7 @@ def combine_releases(
 
     Args:
         target: the folder to write, which appears when it is complete.
-        roots: releases of one kind, one format and one episode length, no two with a task in common.
+        roots: releases of one kind and one episode length, no two with a task in common.
         data_version: version of the combination; by default that of the releases, if they agree.
         overwrite: replace a release at `target`.
         done: called after the histories of a task.
@@ -70,7 +70,6 @@ def _check_compatible(datasets: Sequence[Dataset]) -> None:
     for other in others:
         found = other.info.to_json()
         for name, remedy in (
-            ("format_version", "rebuild the older one"),
             ("kind", "combine releases of one kind"),
             ("environment", "they cannot be combined"),
         ):

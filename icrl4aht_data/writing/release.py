@@ -236,7 +236,7 @@ class _ShardWriter:
 
     def _entry(self, new: NewTask, history: NewHistory) -> Entry:
         """Return the index entry of a history, without id and position in a shard."""
-        arrays, task, expert = history.arrays, new.task, new.provenance.expert
+        arrays, task = history.arrays, new.task
         if not 0 <= history.env_idx < 2**63:
             raise OptionError(
                 f"task {task.task_id}: env_idx: expected a stream's number from 0, found {history.env_idx}"
@@ -274,9 +274,7 @@ class _ShardWriter:
             return_end=float(end[0]),
             return_mean=float(returns.mean()),
             source=new.source,
-            expert_return=None if expert is None else expert.return_greedy,
-            expert_return_sampled=None if expert is None else expert.return_sampled,
-            expert_step=None if expert is None else expert.step,
+            **new.provenance.entry_fields(),
         )
 
     def _with_positions(self, entries: list[Entry], shard: str) -> list[Entry]:

@@ -78,13 +78,13 @@ def write_shard(
         file.flush()
         content: bytes = file.id.get_file_image()
     saved = BytesIO()
-    np.save(saved, np.concatenate([table, _metadata_lines(content, table)]), allow_pickle=False)
+    np.save(saved, np.concatenate([table, metadata_lines(content, table)]), allow_pickle=False)
     for name, data in ((path, content), (table_path, saved.getbuffer())):
         with add_filename(name):
             name.write_bytes(data)
 
 
-def _metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
+def metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
     """Return chunk table lines for the bytes of a file between the chunks, which HDF5 writes."""
     ordered = np.sort(chunks, order="offset")
     starts = [*ordered["offset"].tolist(), len(content)]

@@ -316,3 +316,11 @@ def test_faults_of_task_files_are_named_with_the_line(tmp_path, change, message)
     path.write_text(f"{first}\n{change(first, second)}\n", encoding="utf-8")
     with pytest.raises(TaskFormatError, match=rf"^{re.escape(str(path))}, line 2: {message}"):
         read_tasks(path)
+
+
+def test_policies_of_labellers_are_a_switch_of_the_profile(changed):
+    assert not load_profile("paper").policies
+    assert load_profile("mini").policies
+    assert load_profile(changed("keep = 8", "keep = 8\npolicies = true")).policies
+    with pytest.raises(OptionError, match=r"release\.policies = 1: expected true or false"):
+        load_profile(changed("keep = 8", "keep = 8\npolicies = 1"))

@@ -158,7 +158,7 @@ class TestFormat:
         for path in (lite[0] / "data").rglob("*.h5"):
             stored = lite[0] / "meta/chunks" / path.relative_to(lite[0] / "data").with_suffix(".npy")
             table, header = np.load(stored), 10 + int.from_bytes(stored.read_bytes()[8:10], "little")
-            assert header + 20 * len(table) == stored.stat().st_size
+            assert header + 36 * len(table) == stored.stat().st_size
             assert table["size"][table["rows"] == 0].max() <= 2048
             table.sort(order="offset")
             ends = np.cumsum(table["size"], dtype=np.int64)
@@ -208,6 +208,7 @@ JSON_NAMES = {
     frozenset({list}): "3 ints",
     frozenset({int, type(None)}): "int or null",
     frozenset({float, int}): "number",
+    frozenset({float, int, type(None)}): "number or null",
 }
 TYPE_NAMES = {"int32": "i4", "int8": "i1", "float32": "f4", "bool": "bool"}
 

@@ -73,6 +73,7 @@ def test_no_problems(elsewhere):
         "ok": True,
         "data_version": info.data_version,
         "format_version": FORMAT_VERSION,
+        "has_chunk_hashes": True,
         "kind": "lite",
         "histories": info.histories,
     }

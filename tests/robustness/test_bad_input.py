@@ -72,16 +72,17 @@ def test_no_release_here(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "error", "what_to_do"),
-    [(3, FormatTooNewError, "pip install -U"), (0, FormatTooOldError, "fetch the release again")],
+    [(4, FormatTooNewError, "pip install -U"), (1, FormatTooOldError, "fetch the release again")],
 )
 def test_other_format_versions(damaged, version, error, what_to_do):
     (damaged / "meta" / "info.json").write_text(json.dumps({"format_version": version, "renamed": 1}))
-    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 2.*{what_to_do}"):
+    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 2 and 3.*{what_to_do}"):
         load_icrl4aht(damaged)
 
 
 @pytest.mark.parametrize(
-    "content", ["", "[]", "{}", '{"format_version": "x"}', '{"format_version": 2}', "\x00", "[" * 9999]
+    "content",
+    ["", "[]", "{}", '{"format_version": "x"}', '{"format_version": 2}', '{"format_version": 3}', "\x00", "[" * 9999],
 )
 def test_malformed_info(damaged, content):
     (damaged / "meta" / "info.json").write_text(content)

@@ -144,5 +144,5 @@ def test_version_2_has_no_strong_hashes(learned, tmp_path):
     random_release(tmp_path / "new", layouts=("demo_wide",), streams=1)
     assert not verify_release(tmp_path / "new").notes
     old = spoiled(tmp_path / "new", tmp_path / "old", INFO, lambda c: c.update(format_version=2))
-    assert any("no strong hashes" in note for note in verify_release(old).notes)
+    assert any("has no chunk hashes" in note for note in verify_release(old).notes)
     assert (old / TASKS).is_file()

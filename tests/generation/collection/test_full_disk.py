@@ -1,0 +1,149 @@
+"""Collecting on a full disk: a clear error, no signal, nothing left behind, the other tasks finished."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from collections import namedtuple
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from generation.collection import failures
+from generation.collection.failures import FailureLog
+from generation.collection.job import CollectionError, TaskOutcome
+from generation.collection.options import CollectOptions
+from generation.collection.record import array_shapes
+from generation.collection.run import collect_tasks
+from generation.collection.task import run_task
+from generation.collection.task_folder import ArtefactWriter, DiskFullError, partial_folder
+from generation.learners.resume import RunLog
+from generation.profiles import load_profile
+from tests.helpers.tiny import artefact, start
+from tests.robustness.limits import can_mount, file_size_limit
+
+Usage = namedtuple("Usage", "total used free")
+
+
+@pytest.fixture
+def task(built):
+    profile = load_profile(str(built / "tiny.toml"))
+    return profile.heuristic_tasks()[0], profile
+
+
+def never(update, metrics):
+    raise AssertionError("the task was started")
+
+
+def test_free_space_is_checked_before_the_work(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 5_000))
+    folder = tmp_path / "task"
+    message = rf"^{folder}: the disk is full: this task needs [\d,]{{6,}} bytes, 5,000 are free; .* another --out$"
+    with pytest.raises(DiskFullError, match=message):
+        run_task(*task, folder, never)
+    assert not [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")]
+
+
+def test_arrays_are_allocated_not_sparse(task, tmp_path):
+    writer = ArtefactWriter(tmp_path, task[0], task[1].ego, 0)
+    writer.close()
+    for name, (shape, dtype) in array_shapes(task[0].layout, task[1].ego).items():
+        path = tmp_path / f"{name}.npy"
+        assert path.stat().st_blocks * 512 >= path.stat().st_size
+        found = np.load(path)
+        assert (found.shape, found.dtype) == (shape, dtype)
+        np.save(tmp_path / "saved.npy", np.zeros(shape, dtype))
+        assert path.read_bytes() == (tmp_path / "saved.npy").read_bytes()
+
+
+def test_a_limit_that_only_the_allocation_meets_leaves_nothing(task, tmp_path):
+    with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
+        run_task(*task, tmp_path / "task", never)
+    assert not partial_folder(tmp_path / "task").exists()
+
+
+def test_a_log_on_a_full_disk_is_an_error_once(tmp_path):
+    log = RunLog(tmp_path, lambda line: True)
+    log._metrics.close()
+    log._metrics = Path("/dev/full").open("a", encoding="utf-8")  # noqa: SIM115  `close` closes it
+    with pytest.raises(OSError, match="No space left"):
+        log.write({"update": 0})
+    log.close()
+
+
+def test_failures_wait_for_room(task, tmp_path, monkeypatch):
+    def full(path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    log, outcome = FailureLog(tmp_path / "failed.jsonl"), TaskOutcome(task[0], "failed", 1, "DiskFullError: no room")
+    with monkeypatch.context() as patch:
+        patch.setattr(failures, "atomic_write", full)
+        log.add(outcome)
+        assert not log.is_written
+    log.forget(["another"])
+    assert log.is_written
+    assert json.loads((tmp_path / "failed.jsonl").read_text())["error"] == "DiskFullError: no room"
+
+
+def test_the_other_tasks_are_finished(built, pair, tmp_path, monkeypatch):
+    """The first of two tasks meets a full disk; the second is finished, and the list of failures says so."""
+    profile = load_profile(str(built / "pair.toml"))
+    tasks = profile.heuristic_tasks()
+    second = tmp_path / "artefacts" / tasks[1].task_id
+    shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
+    output = StringIO()
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 5_000))
+    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {tasks[0].task_id}; "):
+        collect_tasks(tasks, profile, tmp_path, Console(file=output, width=500), CollectOptions())
+    assert second.is_dir()
+    (line,) = (tmp_path / "failed.jsonl").read_text().splitlines()
+    assert json.loads(line)["error"].startswith("DiskFullError: ")
+    assert "failed once: DiskFullError: " in output.getvalue()
+    assert "Traceback" not in output.getvalue()
+
+
+COLLECT_ON_SMALL_DISKS = """
+import sys
+from pathlib import Path
+from rich.console import Console
+from generation.collection.job import CollectionError
+from generation.collection.options import CollectOptions
+from generation.collection.run import collect_tasks
+from generation.profiles import load_profile
+from tests.robustness.limits import small_disk
+
+profile = load_profile(sys.argv[1])
+folder = Path(sys.argv[2])
+for size in map(int, sys.argv[3].split(",")):
+    with small_disk(folder, size) as enlarge:
+        try:
+            collect_tasks(profile.heuristic_tasks(), profile, folder, Console(), CollectOptions())
+            print("size", size, "enough")
+        except CollectionError as error:
+            artefacts = folder / "artefacts"
+            left = sorted(path.name for path in artefacts.iterdir() if path.is_dir()) if artefacts.exists() else []
+            print("size", size, "full", left, error)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not can_mount(), reason="mounts disks")
+def test_disks_of_20_sizes(built, tmp_path):
+    """No signal and no traceback; what is left of a task that failed can be resumed."""
+    size = sum(path.stat().st_size for path in artefact(built / "a").rglob("*") if path.is_file())
+    sizes = [4096 * max(2, round(size * 2.2 * share / 19 / 4096)) for share in range(20)]
+    arguments = [str(built / "tiny.toml"), str(tmp_path / "disk"), ",".join(map(str, sizes))]
+    process = start("-c", COLLECT_ON_SMALL_DISKS, *arguments)
+    output, errors = process.communicate()
+    assert process.returncode == 0, output + errors
+    assert "Traceback" not in output + errors
+    lines = [line.split(maxsplit=3) for line in output.splitlines() if line.startswith("size ")]
+    print(output)
+    assert [int(line[1]) for line in lines] == sizes
+    assert [line[2] for line in lines[:8]] == ["full"] * 8
+    assert lines[-1][2] == "enough"
