@@ -112,14 +112,14 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
     for name in names:
         path = resolve_inside(root, name)
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
-        if name not in listed:
-            raise kind(f"{path}: {MANIFEST} does not list this file: fetch the release again, or write its manifest")
         try:
             with wrap_read_errors(path):
                 plain_size(path, LARGEST)
-                found = remembered_hash(path)
+                found = remembered_hash(path) if name in listed else None
         except IndexFormatError as error:
             raise kind(str(error)) from error
+        if found is None:
+            raise kind(f"{path}: {manifest} does not list this file; fetch the release again")
         if found != listed[name]:
             raise kind(
                 f"{path}: expected sha256 {listed[name]} as {MANIFEST} says, found {found}: the file is damaged or was "

@@ -17,6 +17,7 @@ from icrl4aht_data.errors import (
     ShardMismatchError,
     ShardMissingError,
     ShardTruncatedError,
+    ShardUnreadableError,
 )
 from icrl4aht_data.format.chunks import (
     DEFLATE_RATIO,

@@ -67,7 +67,7 @@ def small_disk(folder: Path, size: int) -> Iterator[Callable[[], None]]:
     try:
         yield lambda: _mount(folder, "remount,size=64m")
     finally:
-        subprocess.run(["umount", folder], check=True)
+        subprocess.run(["umount", "--lazy", folder], check=True)  # files of it may still be mapped
 
 
 def _mount(folder: Path, options: str) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,18 +14,26 @@ from filelock import FileLock
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import parse_manifest
+from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import atomic_write
+from tests.helpers.paths import ROOT
 from tests.robustness.faults.series import FAMILIES, run
 from tests.robustness.faults.workspace import Workspace
 from tests.robustness.limits import file_size_limit
 
-SLOW = {"slow server", "cache build killed", "download killed", "two readers at once"}
+SLOW = {"slow server", "cache build killed", "download killed", "two readers at once", "two cache builds at once"}
 """Families of which one attempt takes more than a second."""
-QUICK = {"bit flips": 9, "mutated index or manifest": 5, "disk full": 2, "cache's disk full": 2}
+QUICK = {"bit flips": 9, "mutated index or manifest": 5, "disk full": 2, "cache's disk full": 2, "damaged caches": 3}
 """Attempts in the default tests; one of every other family."""
-LONG = {"bit flips": 36, "mutated index or manifest": 25, "slow server": 8, "429 with Retry-After": 3}
+LONG = {
+    "bit flips": 1000,
+    "damaged caches": 20,
+    "mapped arrays' disk full": 1,
+    "mutated index or manifest": 25,
+    "slow server": 8,
+    "429 with Retry-After": 3,
+}
 """Attempts in the slow tests; two of the families in `SLOW`, of S3 and of version changes, four of every other."""
 
 
@@ -45,12 +56,24 @@ def test_nothing_is_lost(workspace, name, count, capsys):
     assert (line["tried"], line["lost"]) == (count, 0), capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_no_full_disk_ends_a_process():
+    """In a process of its own: writing to a map of a file on a full disk would end it by a signal."""
+    command = [sys.executable, "-m", "tests.robustness.faults.series", "mapped arrays' disk full", "disk full"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert [json.loads(line)["tried"] for line in done.stdout.splitlines()] == [20, 20, 40]
+
+
 def test_episodes_one_step_shorter_by_a_flipped_bit(workspace, tmp_path):
     """15 steps become 14 by one bit, and 90 steps are six complete episodes of either length."""
     root = tmp_path / "release"
     shutil.copytree(workspace.small, root)
     info = root / "meta" / "info.json"
     info.write_text(info.read_text().replace('"kept_steps": 15', '"kept_steps": 14'))
+    with pytest.raises(IndexFormatError, match=r"info\.json: expected sha256"):
+        load_icrl4aht(root)
+    write_manifest(root)
     dataset = load_icrl4aht(root, layout="demo_wide")
     with pytest.raises(OptionError, match="some history's episodes have not 14 steps; run `icrl4aht-data verify`"):
         dataset.ad(batch_size=4, length=5, episodes=(1, 4))

@@ -132,6 +132,7 @@ def test_a_link_is_not_written_through(tmp_path):
 def test_names_are_not_read_as_markup(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
+    write_manifest(damaged)
     result = CliRunner().invoke(cli, ["list", str(damaged)], catch_exceptions=False)
     assert "[/b][link=file:///]" in result.output
 

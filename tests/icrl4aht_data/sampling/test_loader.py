@@ -84,7 +84,7 @@ class TestCaches:
         first = load_icrl4aht(lite[0], layout="demo_wide", cache="mmap").ad(batch_size=2, length=9)[0]
         (made,) = (path for path in tmp_path.iterdir() if path.name.startswith("histories-"))
         stamps = {path.name: path.stat().st_mtime_ns for path in made.iterdir()}
-        assert set(stamps) == {f"{name}.npy" for name in lite[1][0]}
+        assert set(stamps) == {"contents.json", *(f"{name}.npy" for name in lite[1][0])}
         assert_equal(load_icrl4aht(lite[0], layout="demo_wide", cache="mmap").ad(batch_size=2, length=9)[0], first)
         assert {path.name: path.stat().st_mtime_ns for path in made.iterdir()} == stamps
 

@@ -24,7 +24,7 @@ SIZE = 8 * 150_000 + 300
 def folder(tmp_path, monkeypatch) -> Path:
     """An empty cache folder."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(remembered, "_TICK_NS", 10**6)  # so that no test has to wait
+    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)  # so that no test has to wait long
     return tmp_path / "cache"
 
 

@@ -20,7 +20,7 @@ CONTENT = bytes(range(256)) * 5000  # more than a file that is always hashed
 def file(tmp_path, monkeypatch) -> Path:
     """A file that was last changed some time ago; the cache folder is `cache` next to it."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(remembered, "_TICK_NS", 10**6)  # so that no test has to wait
+    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)  # so that no test has to wait long
     path = tmp_path / "file"
     path.write_bytes(CONTENT)
     return path
@@ -98,7 +98,7 @@ def test_without_a_folder_for_notes(file, tmp_path, monkeypatch):
 
 
 def test_files_of_a_folder_are_remembered_together(tmp_path, monkeypatch):
-    monkeypatch.setattr(remembered, "_TICK_NS", 10**6)
+    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)
     (tmp_path / "a").write_bytes(CONTENT)
     (tmp_path / "b").write_bytes(b"x")
     first = remembered_block_hashes(tmp_path, ["a", "b"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,14 +22,17 @@ import numpy as np
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.errors import CacheError, Icrl4ahtError
 from icrl4aht_data.format import columns
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
-from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.partial_file import PartialFile
 from icrl4aht_data.remote.store import Store
+from icrl4aht_data.utils import remembered
+from tests.helpers.damages import DAMAGES, contents
 from tests.helpers.paths import ROOT
 from tests.robustness.faults.remote import ALWAYS, ANY, on_http
 from tests.robustness.faults.workspace import (
@@ -135,6 +139,7 @@ _DOWNLOAD = """
 import sys
 from pathlib import Path
 from icrl4aht_data.remote import partial_file
+from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 
 partial_file._REQUEST_BYTES = int(sys.argv[3])
@@ -162,6 +167,19 @@ for number in itertools.count():
     os.environ["ICRL4AHT_CACHE_DIR"] = f"{sys.argv[2]}/{number}"
     print(number, flush=True)
     load_icrl4aht(sys.argv[1], cache="mmap").storage
+"""
+
+
+_BUILD_ONCE = """
+import os, sys
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.format import columns
+
+columns._UNCACHED = 0
+os.environ["ICRL4AHT_CACHE_DIR"] = sys.argv[2]
+print(flush=True)
+sys.stdin.readline()
+load_icrl4aht(sys.argv[1], cache="mmap").storage
 """
 
 
@@ -254,6 +272,80 @@ def two_downloads(workspace: Workspace, n: int) -> Iterator[Attempt]:
             yield partial(attempt, target)
 
 
+def full_mmap(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Mapped arrays and the cached index do not fit on the disk, or their files reach a limit of size.
+
+    The sizes go from nothing to more than is needed.
+    """
+
+    def attempt(size: int, mounted: bool) -> str:
+        with workspace.fresh_folders() as to, patch.object(columns, "_UNCACHED", 0):
+            caches = to.parent / "cache"
+            with _limited(caches, size, mounted) as enlarge:
+                dataset = load_icrl4aht(workspace.release, obs="uint8", cache="mmap")
+                try:
+                    workspace.check_batches(dataset)
+                    return "fits"
+                except CacheError as error:
+                    check(f"{caches}: the cache folder has no room for arrays of " in str(error), repr(error))
+                    left = [path for path in caches.iterdir() if not path.name.startswith(("index-", ".hashes"))]
+                    check(all(path.name.startswith("histories-") for path in left), f"left behind: {left}")
+                enlarge()
+                workspace.check_batches(dataset)
+                return "error"
+
+    with workspace.fresh_folders() as to, patch.object(columns, "_UNCACHED", 0):
+        workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
+        sizes = [path.stat().st_size for path in to.parent.rglob("*.npy")]
+    most = 1.2 * (sum(sizes) + PAGE * len(sizes) if can_mount() else max(sizes))
+    for number in range(n):
+        yield partial(attempt, PAGE + int(most * number / max(n - 1, 1)) // PAGE * PAGE, can_mount())
+
+
+def damaged_caches(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """A file of the caches of index and arrays, or of the notes about hashes, is damaged in one of many ways."""
+    caches = workspace.new_path()
+
+    def read() -> None:
+        with (
+            environment({"ICRL4AHT_CACHE_DIR": str(caches)}),
+            patch.object(columns, "_UNCACHED", 0),
+            patch.object(remembered, "_SMALL", 0),
+            patch.object(remembered, "_TICK_NS", 2 * 10**7),
+        ):
+            workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
+
+    def attempt(name: str, damage: str) -> None:
+        DAMAGES[damage](caches / name)
+        read()
+        if name.endswith((".npy", "contents.json")):
+            check((caches / name).read_bytes() == right[name], f"{name}: not rebuilt")
+        shutil.rmtree(caches / name, ignore_errors=True)  # a folder where a note was
+        read()
+
+    read()
+    right = contents(caches)
+    for _ in range(n):
+        yield partial(attempt, str(workspace.rng.choice(list(right))), str(workspace.rng.choice(list(DAMAGES))))
+
+
+def two_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
+    """Two processes build the caches of index and arrays at the same time."""
+
+    def attempt() -> None:
+        caches = workspace.new_path()
+        _check_success([_start(_BUILD_ONCE, workspace.release, caches, wait=True) for _ in range(2)], "\n")
+        names = {path.name.split("-")[0] for path in caches.iterdir()}
+        check(names <= {"index", "histories", ".hashes"}, f"left behind: {names}")
+        with environment({"ICRL4AHT_CACHE_DIR": str(caches)}), patch.object(columns, "_UNCACHED", 0):
+            made = contents(caches)
+            workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
+            check(contents(caches) == made, "built again")
+
+    for _ in range(n):
+        yield partial(attempt)
+
+
 class DamagedCopy:
     """A copy of the small release, and what reading it gave before it was damaged."""
 
@@ -262,9 +354,9 @@ class DamagedCopy:
         shutil.copytree(workspace.small, self.root)
         self.before = self.read()
 
-    def read(self, root: Path | None = None) -> tuple[bytes, str]:
+    def read(self, root: Path | None = None, cache: CacheMode = "ram") -> tuple[bytes, str]:
         """Return a hash of all arrays and of batches, and the metadata as text."""
-        dataset = load_icrl4aht(root or self.root, obs="uint8", cache="ram", threads=1)
+        dataset = load_icrl4aht(root or self.root, obs="uint8", cache=cache, threads=1)
         histories = [(repr(h.entry), dataset.recover_teammate(h.entry.history_id)) for h in dataset]
         return hash_arrays(dataset) + hash_batches(dataset), f"{histories} {dataset.info}"
 
@@ -278,31 +370,36 @@ class DamagedCopy:
         finally:
             path.write_bytes(right)
 
-    def check(self) -> str | None:
+    def check(self, cache: CacheMode = "ram") -> str:
         """Check that `verify` finds the damage, and that reading raises one of our errors or gives the right data."""
         check(not verify_release(self.root).ok, "verify finds nothing")
         try:
-            after = self.read()
+            after = self.read(cache=cache)
         except Icrl4ahtError:
-            return None
-        check(after[0] == self.before[0], "other data without an error")
-        return None if after[1] == self.before[1] else "metadata unnoticed"
+            return "error"
+        check(after == self.before, "other data without an error")
+        return "same data"
 
 
 def bit_flips(workspace: Workspace, n: int) -> Iterator[Attempt]:
-    """One bit of one file of a release is inverted."""
+    """One bit of one file of a release is inverted; `verify` has to find it, and no reading may believe it.
+
+    Every file of the release has its turn, and every cache mode; the file's times are set back.
+    """
     release = DamagedCopy(workspace)
     paths = sorted(path for path in release.root.rglob("*") if path.is_file())
 
-    def attempt(path: Path, position: int, bit: int) -> str | None:
-        data = bytearray(path.read_bytes())
+    def attempt(path: Path, position: int, bit: int, cache: CacheMode) -> str:
+        before, data = path.stat(), bytearray(path.read_bytes())
         data[position] ^= 1 << bit
-        with release.damaged(path, bytes(data)):
-            return release.check()
+        with release.damaged(path, bytes(data)), workspace.fresh_folders():
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+            return release.check(cache)
 
+    modes: list[CacheMode] = ["ram", "stream", "ram", "stream", "mmap"]
     for number in range(n):
-        path, rng = paths[number % len(paths)], workspace.rng
-        yield partial(attempt, path, int(rng.integers(path.stat().st_size)), int(rng.integers(8)))
+        (path, mode), rng = (paths[number % len(paths)], modes[number // len(paths) % len(modes)]), workspace.rng
+        yield partial(attempt, path, int(rng.integers(path.stat().st_size)), int(rng.integers(8)), mode)
 
 
 def mutations(workspace: Workspace, n: int) -> Iterator[Attempt]:
@@ -316,7 +413,17 @@ def mutations(workspace: Workspace, n: int) -> Iterator[Attempt]:
         while mutated == data:
             mutated = _mutated(data, rng, name)
         with release.damaged(release.root / name, mutated), time_limit(20), memory_limit(2 * 2**30):
-            return release.check() if name != MANIFEST else check_manifest()
+            return check_manifest() if name == MANIFEST else check_forged()
+
+    def check_forged() -> str | None:
+        """Check a file that the manifest does not fit, then with a manifest that fits it: no error but ours."""
+        release.check()
+        with release.damaged(release.root / MANIFEST, (release.root / MANIFEST).read_bytes()):
+            write_manifest(release.root)
+            verify_release(release.root)
+            with suppress(Icrl4ahtError):
+                release.read()
+        return None
 
     def check_manifest() -> str | None:
         with on_http(workspace, release.root) as target, workspace.fresh_folders() as to:

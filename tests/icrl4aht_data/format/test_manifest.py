@@ -1,0 +1,161 @@
+"""Files of a release that are checked against its manifest before they are believed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import ChunkTableError, IndexFormatError, ReleaseError, RootNotFoundError
+from icrl4aht_data.format.chunks import chunk_table_name
+from icrl4aht_data.format.manifest import check_against_manifest, check_meta, write_manifest
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.utils import remembered
+from tests.helpers.damages import DAMAGES, flip_bit, restore
+from tests.helpers.random_releases import SHARD
+from tests.robustness.limits import permissions_count
+
+
+@pytest.mark.parametrize("name", [HISTORIES, INFO, PROVENANCE, TASKS])
+def test_no_flipped_bit_of_meta_is_read(damaged, name):
+    """Also if the file's times are set back."""
+    path, rng = damaged / name, np.random.default_rng(0)
+    right, before = path.read_bytes(), path.stat()
+    for _ in range(40):
+        flip_bit(path, int(rng.integers(len(right))), int(rng.integers(8)))
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        with pytest.raises(
+            IndexFormatError, match=rf"{path}: expected sha256 \w{{64}} as {MANIFEST} says, found \w{{64}}"
+        ):
+            load_icrl4aht(damaged)
+        path.write_bytes(right)
+    load_icrl4aht(damaged)
+
+
+def test_no_flipped_bit_of_a_chunk_table_is_read(damaged):
+    path, rng = damaged / chunk_table_name(SHARD), np.random.default_rng(0)
+    right = path.read_bytes()
+    for _ in range(20):
+        flip_bit(path, int(rng.integers(len(right))), int(rng.integers(8)))
+        dataset = load_icrl4aht(damaged)
+        with pytest.raises(ChunkTableError, match=rf"{path}: expected sha256"):
+            dataset[0].read("actions")
+        path.write_bytes(right)
+    load_icrl4aht(damaged)[0].read("actions")
+
+
+@pytest.mark.parametrize("name", [HISTORIES, TASKS, MANIFEST, chunk_table_name(SHARD)])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_an_error_that_names_it(damaged, name, damage):
+    path = damaged / name
+    right = path.read_bytes()
+    if (name, damage) == (MANIFEST, "a bit flipped, times as before"):
+        pytest.skip("changes what is expected of another file")
+    DAMAGES[damage](path)
+    with pytest.raises(ReleaseError, match=str(path)):
+        load_icrl4aht(damaged)[0].read("actions")
+    restore(path, right)
+    load_icrl4aht(damaged)[0].read("actions")
+
+
+def test_a_release_without_its_manifest(damaged):
+    (damaged / MANIFEST).unlink()
+    with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: missing; fetch the release again"):
+        load_icrl4aht(damaged)
+
+
+def test_a_file_of_meta_that_the_manifest_does_not_list(damaged):
+    path = damaged / MANIFEST
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if PROVENANCE not in line))
+    with pytest.raises(IndexFormatError, match=rf"{PROVENANCE}: .*{MANIFEST} does not list this file; fetch"):
+        load_icrl4aht(damaged)
+    (damaged / PROVENANCE).unlink()  # a release may be without it
+    load_icrl4aht(damaged)
+    check_against_manifest(damaged, [INFO, chunk_table_name(SHARD)])
+
+
+def test_a_folder_that_is_no_release(tmp_path):
+    with pytest.raises(RootNotFoundError, match=r"no release here, expected meta/info\.json in it"):
+        load_icrl4aht(tmp_path)
+
+
+def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged):
+    dataset = load_icrl4aht(damaged)
+    for name in (TASKS, PROVENANCE):
+        flip_bit(damaged / name)
+        with pytest.raises(IndexFormatError, match=rf"{name}: expected sha256"):
+            dataset.recover_teammate(0)
+        flip_bit(damaged / name)
+    flip_bit(damaged / chunk_table_name(SHARD))
+    with pytest.raises(ChunkTableError, match="expected sha256"):
+        dataset[0].read("actions")
+
+
+def test_an_edited_release_with_a_new_manifest_opens(damaged):
+    path = damaged / INFO
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"data_version": "9.9.9"}))
+    with pytest.raises(IndexFormatError, match="was edited"):
+        load_icrl4aht(damaged)
+    write_manifest(damaged)
+    assert load_icrl4aht(damaged).info.data_version == "9.9.9"
+
+
+def test_a_large_file_is_hashed_once_per_change(damaged, tmp_path, monkeypatch):
+    computed: list[Path] = []
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(remembered, "_SMALL", 0)
+    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)
+    compute = remembered.file_hash
+    monkeypatch.setattr(remembered, "file_hash", lambda path: computed.append(path) or compute(path))
+    for _ in range(2):
+        check_meta(damaged)
+    assert sorted(path.name for path in computed) == ["histories.jsonl", "info.json", "provenance.json", "tasks.jsonl"]
+    flip_bit(damaged / HISTORIES)
+    for _ in range(2):
+        with pytest.raises(IndexFormatError, match="expected sha256"):
+            check_meta(damaged)
+    assert len(computed) == 5
+
+
+@pytest.mark.parametrize("folder", ["a file", "read-only"])
+def test_a_cache_folder_that_cannot_be_written(damaged, tmp_path, monkeypatch, folder):
+    cache = tmp_path / "cache"
+    cache.mkdir(mode=0o555) if folder == "read-only" else cache.touch()
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(cache))
+    monkeypatch.setattr(remembered, "_SMALL", 0)
+    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)
+    with permissions_count():
+        for _ in range(2):
+            load_icrl4aht(damaged, layout="demo_wide", threads=1, cache="stream").ad(batch_size=2, length=5)[0]
+        flip_bit(damaged / INFO)
+        with pytest.raises(IndexFormatError, match="expected sha256"):
+            load_icrl4aht(damaged)
+    assert not cache.is_dir() or not list(cache.iterdir())
+
+
+@pytest.mark.parametrize("name", [MANIFEST, INFO, HISTORIES, chunk_table_name(SHARD), SHARD])
+@pytest.mark.parametrize("cache", ["ram", "mmap", "stream"])
+def test_a_file_without_permission_to_read(damaged, tmp_path, monkeypatch, name, cache):
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+    (damaged / name).chmod(0)
+    with permissions_count(), pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"):
+        load_icrl4aht(damaged, layout="coord_simple", cache=cache, threads=1).ad(batch_size=2, length=5)[0]
+    shutil.rmtree(tmp_path / "cache", ignore_errors=True)
+
+
+def test_a_folder_without_permission_to_read(damaged):
+    (damaged / "meta").chmod(0)
+    with permissions_count(), pytest.raises(ReleaseError, match=r"meta/info\.json.*Permission denied"):
+        load_icrl4aht(damaged)
+    (damaged / "meta").chmod(0o755)
+    dataset = load_icrl4aht(damaged, threads=1)
+    (damaged / SHARD).parent.chmod(0)
+    with permissions_count(), pytest.raises(ReleaseError, match="Permission denied"):
+        dataset[0].read("actions")
+    (damaged / SHARD).parent.chmod(0o755)
