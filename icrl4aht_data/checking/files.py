@@ -16,7 +16,6 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import INFO, MANIFEST, PROVENANCE, TEAMMATES
-from icrl4aht_data.remote.download import ORIGIN
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.files import plain_size
 from icrl4aht_data.utils.hashes import file_hash
@@ -45,7 +44,7 @@ def check_files(
     if not quick or origin.remote is None:  # files of a remote need not be downloaded for a quick check
         for name in sorted(expected - present):
             report.add(name, "listed in the manifest, but missing")
-    for name in sorted(present - listed.keys() - {MANIFEST, ORIGIN}):
+    for name in sorted(present - listed.keys() - {MANIFEST}):
         if not name.startswith(_HUB_FILES):
             report.add(name, "not listed in the manifest")
     both, sizes = sorted(expected & present), {} if quick else _recorded_sizes(root, listed)

@@ -30,6 +30,7 @@ from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
+from icrl4aht_data.remote.addresses import without_credentials
 from icrl4aht_data.remote.download import chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
@@ -67,7 +68,7 @@ def verify_release(
     """
     if level not in get_args(Level):
         raise unknown("level", level, get_args(Level))
-    report = Report(str(MINI if root is None else root), level)
+    report = Report(without_credentials(str(MINI if root is None else root)), level)
     try:
         origin = open_root(MINI if root is None else root)
     except Icrl4ahtError as error:

@@ -221,27 +221,31 @@ def download(
     """Download a release, or a part of it.
 
     ADDRESS is hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...; by default $ICRL4AHT_REMOTE. Each file
-    is checked when it arrives; the same command resumes an interrupted download. Without --to, a Hub repository goes
-    into the Hub's cache, another release below $ICRL4AHT_DATA_DIR (~/.local/share/icrl4aht);
-    load_icrl4aht(root=ADDRESS) finds either.
+    is checked when it arrives; the same command resumes an interrupted download, and replaces files that have changed.
+    Without --to, a Hub repository goes into the Hub's cache, another release below $ICRL4AHT_DATA_DIR
+    (~/.local/share/icrl4aht); load_icrl4aht(root=ADDRESS) finds either. FOLDER must be new, empty, or have files of
+    this release only.
     """
     if root is None:
         raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
-    plan = plan_download(str(root), to=to, **_wanted(filters))
-    facts = plan.to_json()
-    if not dry_run:
-        with bars(quiet, of_bytes=True) as show:
+    with bars(quiet, of_bytes=True) as show:
+        plan = plan_download(str(root), to=to, advance=show, **_wanted(filters))
+        facts = plan.to_json()
+        if not dry_run:
             traffic = fetch_planned(plan, counted(show, "download", plan.size))
-        facts |= {"fetched_bytes": traffic.bytes, "requests": traffic.requests}
+            facts |= {"fetched_bytes": traffic.bytes, "requests": traffic.requests}
     if as_json:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet:
         if dry_run:
-            for name in plan.absent:
+            for name in sorted((*plan.absent, *plan.changed)):
                 click.echo(f"{plan.files[name]:>15,}  {name}")
+        for name in plan.replaced:
+            click.echo(f"{name}: had changed, was fetched again")
         verb = "to download" if dry_run else "downloaded"
-        here = len(plan.files) - len(plan.absent)
-        click.echo(f"{plan.root}: {len(plan.absent)} files, {plan.size:,} bytes {verb}; {here} files present already")
+        fetched = len(plan.absent) + len(plan.changed)
+        here = f"{len(plan.files) - fetched} files present already, with the right hashes"
+        click.echo(f"{plan.root}: {fetched} files, {plan.size:,} bytes {verb}; {here}")
         click.echo(f"folder: {plan.root.folder}")
 
 

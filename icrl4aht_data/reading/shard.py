@@ -117,14 +117,15 @@ class Shard:
 
     def _check_size(self) -> None:
         """Check that the file is long enough for every chunk."""
-        try:
-            size = self.path.stat().st_size
-        except FileNotFoundError as error:
-            if self._remote is None:
-                raise self._missing() from error
+        if self._remote is not None:
             size = self._remote.size(self.name)
-        except OSError as error:
-            raise self._unreadable(error) from error
+        else:
+            try:
+                size = self.path.stat().st_size
+            except FileNotFoundError as error:
+                raise self._missing() from error
+            except OSError as error:
+                raise self._unreadable(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
             raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")
@@ -218,6 +219,8 @@ class Shard:
         try:
             check_chunk(data, self.table[row])
         except ValueError as error:
+            if self._remote is not None:
+                return self._remote.part(self.name).chunk(self.table[row])
             raise ShardCorruptError(
                 f"{self.path}: {self.describe(row)}: {error}; the file is damaged, fetch the shard again"
             ) from error
@@ -245,7 +248,7 @@ class Shard:
 
         Empty for a shard on this machine's disk.
         """
-        if self._remote is None or self.path.exists():
+        if self._remote is None or self._remote.is_here(self.name):
             return []
         wanted = set()
         for _, history_id, field, start, stop in ranges:

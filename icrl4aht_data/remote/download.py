@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
+from icrl4aht_data.remote.addresses import without_credentials
+from icrl4aht_data.remote.download_note import read_note, write_note
 from icrl4aht_data.remote.partial_file import map_parallel
-from icrl4aht_data.remote.remote_release import Advance, ReleaseLocation, folder_lock, is_address, open_root
+from icrl4aht_data.remote.remote_release import Advance, ReleaseLocation, is_address, open_root
 from icrl4aht_data.remote.store import RetryPolicy, Traffic
-from icrl4aht_data.utils.files import atomic_write, has_content, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, has_content
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import resolve_inside
-
-ORIGIN = ".origin.json"
-"""Note in a folder that `download` filled: the address, and the files requested. No manifest lists this file."""
-
-_PLAIN_ADDRESS = re.compile(r"(hf|s3|https?)://[^:\s]+(:\d+)?(/[^:\s]*)?")
-"""Addresses that are trusted in a note; fsspec knows others, which open local files or chain several protocols."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +32,23 @@ class DownloadPlan:
         root: the remote release.
         files: name -> bytes of all files requested.
         absent: names of those that are not downloaded yet.
+        changed: names of those that were downloaded and are not what the manifest lists any more.
     """
 
     root: ReleaseLocation
     files: dict[str, int]
     absent: list[str]
+    changed: list[str]
 
     @property
     def size(self) -> int:
-        """Bytes of the absent files; of one that is partially downloaded all bytes."""
-        return sum(self.files[name] for name in self.absent)
+        """Bytes of the absent and the changed files; of one that is partially downloaded all bytes."""
+        return sum(self.files[name] for name in (*self.absent, *self.changed))
+
+    @property
+    def replaced(self) -> list[str]:
+        """Names of the changed files that were fetched again so far; those of the index are by planning."""
+        return [] if self.root.remote is None else self.root.remote.replaced
 
     def to_json(self) -> dict[str, Any]:
         """The plan as `download --dry-run --json` prints it."""
@@ -56,6 +57,7 @@ class DownloadPlan:
             "folder": str(self.root.folder),
             "files": self.files,
             "absent": self.absent,
+            "changed": self.changed,
             "bytes": self.size,
         }
 
@@ -66,34 +68,53 @@ def default_remote() -> str | None:
 
 
 def plan_download(
-    url: str, *, to: Path | None = None, retry: RetryPolicy | None = None, **wanted: str | Iterable[str] | None
+    url: str,
+    *,
+    to: Path | None = None,
+    retry: RetryPolicy | None = None,
+    advance: Callable[[str, int, int], None] = lambda what, done, total: None,
+    **wanted: str | Iterable[str] | None,
 ) -> DownloadPlan:
-    """Plan a download; fetches the index of the release only.
+    """Plan a download; fetches the index of the release only, and compares the files that are here with the manifest.
 
     Args:
         url: address of the release.
-        to: folder for the files; by default the Hub's cache, or a folder in `cache.data_folder`.
+        to: folder for the files, which must not exist, be empty, or have files of this release; by default the Hub's
+            cache, or a folder in `cache.data_folder`.
         retry: policy for byte ranges.
+        advance: called with the name of a stage, and the bytes compared so far and in total.
         wanted: filters as in `load_icrl4aht`: only the shards with matching histories are fetched, with their chunk
             tables. Files that belong to no shard are always fetched.
 
     Raises:
-        OptionError: if `url` is no address.
+        OptionError: if `url` is no address, or `to` has files of something else, or changed files of a release that
+            was not downloaded by this user.
         RemoteError, OfflineError: if the index cannot be fetched.
         EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
     """
     if not is_address(url):
-        raise OptionError(f"{url}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
+        found = without_credentials(url)
+        raise OptionError(f"{found}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
     root = open_root(url, to, retry)
-    assert root.remote is not None
+    remote = root.remote
+    assert remote is not None
     names = sorted(chosen_files(root, **wanted))
-    absent = [name for name in names if not root.is_here(name)]
-    sizes = map_parallel(root.remote.size, names)
-    return DownloadPlan(root, dict(zip(names, sizes, strict=True)), absent)
+    sizes = dict(zip(names, map_parallel(remote.size, names), strict=True))
+    present = [name for name in names if remote.path(name).exists()]
+    total, done, changed = sum(sizes[name] for name in present), 0, []
+    for name in present:
+        if not remote.is_unchanged(name):
+            changed.append(name)
+        done += sizes[name]
+        advance("compare", done, total)
+    remote.check_replaceable(changed)
+    return DownloadPlan(root, sizes, sorted(sizes.keys() - present), changed)
 
 
 def fetch_planned(plan: DownloadPlan, advance: Advance = lambda size: None) -> Traffic:
     """Download the files of a plan, each checked on arrival; return the requests and bytes that it took.
+
+    Changed files are replaced; of a changed shard only the damaged parts are fetched.
 
     Raises:
         RemoteError: if a file cannot be fetched; a second call resumes.
@@ -102,13 +123,18 @@ def fetch_planned(plan: DownloadPlan, advance: Advance = lambda size: None) -> T
     remote = plan.root.remote
     assert remote is not None
     before = remote.store.traffic
+    if not remote.in_hub_cache:  # the client's own folder
+        write_note(remote.folder, remote.url, remote.manifest, plan.files)
+    for name in sorted(plan.changed, key=_tables_first):
+        remote.repair_file(name, advance)
+    remote.replaced.extend(plan.changed)
     remote.fetch(plan.absent, advance)
-    if not remote.in_hub_cache:  # the client's own folder gets no note
-        with folder_lock(remote.partial):
-            files = {*plan.files, *_read_note(remote.folder).get("files", [])}
-            with atomic_write(remote.folder / ORIGIN) as partial:
-                write_json(partial, {"url": remote.url, "files": sorted(files)})
     return remote.store.traffic - before
+
+
+def _tables_first(name: str) -> bool:
+    """Sorting key: a shard is repaired by its chunk table, which has to be right by then."""
+    return name.startswith("data/")
 
 
 def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
@@ -117,7 +143,7 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
     Args:
         root: an opened release.
         wanted: filters as in `load_icrl4aht`. Without any, all files; of a folder that `download` filled those that
-            the downloads requested (see `ORIGIN`).
+            the downloads requested, see `DownloadNote`.
     """
     index = read_index(root.folder)
     listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
@@ -125,23 +151,10 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
     shards = _selected_shards(index, **wanted) if any(wanted.values()) else all_shards
     others = all_shards - shards
     chosen = (set(listed) | shards) - others - {chunk_table_name(name) for name in others}
-    if any(wanted.values()) or root.remote is not None or not (root.folder / ORIGIN).exists():
+    note = None if any(wanted.values()) or root.remote is not None else read_note(root.folder)
+    if note is None or not note.belongs_to(listed):
         return chosen
-    requested = set(_read_note(root.folder)["files"])
-    return {name for name in chosen if name in requested or (root.folder / name).exists()}
-
-
-def _read_note(folder: Path) -> dict[str, Any]:
-    """Content of a folder's `ORIGIN`; empty without one."""
-    path = resolve_inside(folder, ORIGIN)
-    if not path.exists():
-        return {}
-    note = parse_json(read_text(path))
-    files = note.get("files") if isinstance(note, dict) else None
-    names_only = isinstance(files, list) and all(isinstance(name, str) for name in files)
-    if not (names_only and isinstance(note.get("url"), str)):
-        raise IndexFormatError(f"{path}: expected an object with url and files; remove it, or download again")
-    return note
+    return {name for name in chosen if name in note.files or (root.folder / name).exists()}
 
 
 def _selected_shards(index: Index, **wanted: Any) -> set[str]:
@@ -188,7 +201,7 @@ def repair(
             partial.write_bytes(manifest)
         names.update(wrong)
     outcome: dict[str, str | None] = {}
-    for name in sorted(names, key=lambda name: name.startswith("data/")):  # chunk tables before their shards
+    for name in sorted(names, key=_tables_first):
         try:
             outcome[name] = None
             remote.repair_file(name)
@@ -201,13 +214,15 @@ def _repair_source(root: str | Path, source: str | None) -> str:
     """The address to repair a release from: the given one, the release's own, the noted one, or the default."""
     if source is None and is_address(root):
         return str(root)
-    noted = _read_note(Path(root)).get("url") if Path(root).is_dir() else None
-    if source is None and noted and not _PLAIN_ADDRESS.fullmatch(noted):
-        raise OptionError(f"{Path(root) / ORIGIN}: came from {noted[:200]!r}: give --from, if you trust that address")
-    url = source or noted or default_remote()
+    note, default = read_note(Path(root)), default_remote()
+    noted = None if note is None else note.url
+    if default is not None and noted == without_credentials(default).rstrip("/"):
+        noted = default  # the address with its credentials
+    url = source or noted or default
     if url is None or not is_address(url):
+        found = url and without_credentials(url)
         raise OptionError(
-            f"{root}: repairing needs the address of a complete copy, found {url!r}: give --from, or set "
+            f"{root}: repairing needs the address of a complete copy, found {found!r}: give --from, or set "
             f"ICRL4AHT_REMOTE"
         )
     return url

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from icrl4aht_data.errors import OfflineError, RemoteError
+from icrl4aht_data.remote.addresses import check_redirect
 from icrl4aht_data.remote.store import RetryPolicy, Store, WrongLengthError, http_status, offline, wrap_remote_errors
+from icrl4aht_data.utils.files import TEXT_BYTES
 
 
 class HubStore(Store):
@@ -29,7 +31,7 @@ class HubStore(Store):
     def __init__(self, repo: str, revision: str | None, retry: RetryPolicy | None = None) -> None:
         super().__init__(f"hf://datasets/{repo}{f'@{revision}' if revision else ''}", retry)
         self.repo, self.revision = repo, revision
-        self._filesystem_url = "https://"
+        self._address = "https://"  # of the file system for byte ranges
         self._metadata: dict[str, Any] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -80,7 +82,7 @@ class HubStore(Store):
         options |= {"allow_patterns": [glob.escape(name) for name in names], "tqdm_class": CountingBar}
         options["local_files_only"] = cache_only = offline() or unreachable is not None
         folder, absent = Path(), list(names)
-        with wrap_remote_errors(address):
+        with wrap_remote_errors(address), _limited_answers(self.url):
             try:
                 folder = Path(snapshot_download(self.repo, **options))
                 absent = [name for name in names if not (folder / name).exists()]
@@ -134,7 +136,9 @@ class HubStore(Store):
 
         if name not in self._metadata:
             url = hf_hub_url(self.repo, name, repo_type="dataset", revision=self.revision)
-            self._metadata[name] = get_hf_file_metadata(url)
+            found = get_hf_file_metadata(url)
+            check_redirect(url, found.location, trusted=True)  # the Hub keeps large files on other hosts
+            self._metadata[name] = found
         return self._metadata[name]
 
     def _size(self, name: str) -> int:
@@ -158,3 +162,37 @@ class HubStore(Store):
                 raise ConnectionError(f"{name}: its location at the Hub's storage has expired") from None
             raise
         return self._counted(name, start, stop, data)
+
+
+@contextmanager
+def _limited_answers(url: str) -> Iterator[None]:
+    """Bound the bytes of all answers of the Hub's API, and of errors, together: its client reads them without limit.
+
+    Raises:
+        RemoteError: if more than `TEXT_BYTES` come.
+    """
+    from huggingface_hub import get_session
+
+    left = TEXT_BYTES
+
+    def limit(response: Any) -> None:
+        path, read = response.url.path, response.iter_bytes
+        if response.status_code < 400 and ("/api/" not in path or "/resolve/" in path):
+            return
+
+        def iter_bytes(chunk_size: int | None = None) -> Iterator[bytes]:
+            nonlocal left
+            for part in read(chunk_size):
+                left -= len(part)
+                if left < 0:
+                    raise RemoteError(f"{url}: expected at most {TEXT_BYTES:,} bytes from the Hub's API, and more came")
+                yield part
+
+        response.iter_bytes = iter_bytes  # decoded, so that a small compressed answer cannot become a huge one
+
+    hooks = get_session().event_hooks["response"]
+    hooks.append(limit)
+    try:
+        yield
+    finally:
+        hooks.remove(limit)

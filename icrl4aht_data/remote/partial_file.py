@@ -8,12 +8,13 @@ windows, resumed downloads and repairs all rely on this.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from icrl4aht_data.remote.store import Store
 from icrl4aht_data.utils.cache import cache_limit, data_folder
 from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.locks import in_new_folder
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -92,12 +94,18 @@ class PartialFile:
         Raises:
             OSError: if the disk is full or not writable; names the file.
         """
-        if not self.path.exists():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.path.touch()
-        with add_filename(self.path), self.path.open("r+b") as stream:
+        with add_filename(self.path), self.open_to_write() as stream:
             stream.seek(start)
             stream.write(data)
+
+    def open_to_write(self) -> BinaryIO:
+        """The file, created with its folder if necessary, open for writing at any position; a link is not followed.
+
+        Raises:
+            OSError: if the disk is full or not writable, or the path is a link.
+        """
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+        return in_new_folder(self.path, lambda: os.fdopen(os.open(self.path, flags, 0o666), "r+b"))
 
     def cache(self, fetched: ByteRange, data: bytes) -> None:
         """Write bytes that can be fetched again at any time; keep their chunks in memory if the disk is full."""
@@ -216,7 +224,7 @@ def _fetch_missing(file: PartialFile, size: int, chunks: np.ndarray | None, adva
 
     # Without checksums the file must grow from its beginning, or a hole would pass for data after a cut.
     map_parallel(fetch, spans, threads=1 if chunks is None else _PARALLEL_REQUESTS)
-    with add_filename(file.path), file.path.open("r+b") as stream:
+    with add_filename(file.path), file.open_to_write() as stream:
         stream.truncate(size)
 
 

@@ -1,9 +1,10 @@
 """Location of a release: a local folder, or an address whose files are downloaded when they are needed.
 
 A remote release has a local folder as well, its mirror, which receives complete files only, each checked against the
-manifest before it gets its name. The mirror of a Hub repository is its snapshot in the Hub's own cache; that of any
-other address is a folder below `cache.data_folder`, one per version, named by the manifest's hash. Unfinished files are
-kept in a folder next to the mirror.
+manifest before it gets its name, and again before it is used: a file that has changed since is fetched again. The
+mirror of a Hub repository is its snapshot in the Hub's own cache; that of any other address is a folder below
+`cache.data_folder`, one per version, named by the manifest's hash. Unfinished files are kept in a folder next to the
+mirror, which is removed when it is empty.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock
 
 from icrl4aht_data.errors import (
     Icrl4ahtError,
@@ -32,13 +33,20 @@ from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.remote.addresses import without_credentials
+from icrl4aht_data.remote.download_note import read_note
 from icrl4aht_data.remote.hub import HubStore
 from icrl4aht_data.remote.partial_file import PartialFile, complete_file, map_parallel
 from icrl4aht_data.remote.store import RetryPolicy, Store, offline
 from icrl4aht_data.utils.cache import data_folder
-from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size
+from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size, read_text
 from icrl4aht_data.utils.hashes import file_hash, git_hash
-from icrl4aht_data.utils.paths import LARGEST, resolve_inside
+from icrl4aht_data.utils.locks import lock_beside, process_lock, remove_empty_folders
+from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
+from icrl4aht_data.utils.remembered import remembered_hash
+
+_CLIENT_FOLDER = ".cache/huggingface"
+"""Where the Hub's client keeps notes on a folder that it downloads to."""
 
 _INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE)  # read when a release is opened
 
@@ -73,9 +81,9 @@ class ReleaseLocation:
             IndexFormatError, ChunkTableError: if it is not the one that the manifest lists.
         """
         path = resolve_inside(self.folder, name)
-        if self.remote is not None and not path.exists():
+        if self.remote is not None:
             self.remote.fetch([name])
-        if name.startswith("meta/"):
+        elif name.startswith("meta/"):
             check_against_manifest(self.folder, [name])
         return path
 
@@ -93,7 +101,7 @@ class ReleaseLocation:
 
     def is_here(self, name: str) -> bool:
         """Whether a file needs no fetching."""
-        return self.remote is None or (self.folder / name).exists()
+        return self.remote is None or self.remote.is_here(name)
 
 
 def open_root(root: str | Path, to: Path | None = None, retry: RetryPolicy | None = None) -> ReleaseLocation:
@@ -135,6 +143,8 @@ class Remote:
         manifest: file -> SHA-256, hexadecimal.
         store: reads byte ranges.
         in_hub_cache: whether `folder` belongs to the Hub's cache.
+        owned: whether changed files in `folder` may be replaced: it is a mirror, or this user has downloaded into it.
+        replaced: names of the changed files that were fetched again.
     """
 
     url: str
@@ -144,9 +154,11 @@ class Remote:
     manifest: dict[str, str]
     store: Store
     in_hub_cache: bool = False
+    owned: bool = True
+    replaced: list[str] = field(default_factory=list)
 
     def fetch(self, names: Iterable[str], advance: Advance = lambda size: None) -> None:
-        """Download complete files, several at once. Files that exist in the folder are left as they are.
+        """Download complete files, several at once, unless they are in the folder already; see `is_here`.
 
         A file that was cut resumes at the missing chunks, in the next attempt or the next call.
 
@@ -158,11 +170,46 @@ class Remote:
         unlisted = [name for name in wanted if name not in self.manifest]
         if unlisted:
             raise RemoteError(f"{self.url}: its manifest does not list {', '.join(unlisted[:5])}", missing=True)
-        absent = [name for name in wanted if not self.path(name).exists()]
+        absent = [name for name in wanted if not self.is_here(name)]
+        changed = [name for name in absent if self.path(name).exists()]
+        self.check_replaceable(changed)
         if absent and offline():
-            raise OfflineError(f"{self.url}: offline, and not downloaded: {', '.join(absent)}; go online to fetch them")
+            what = "not downloaded, or changed since" if changed else "not downloaded"
+            raise OfflineError(f"{self.url}: offline, and {what}: {', '.join(absent)}; go online to fetch them")
         if absent:
             self._fetch_files(absent, advance)
+            self.replaced.extend(changed)
+
+    def check_replaceable(self, changed: Sequence[str]) -> None:
+        """Check that changed files of the folder may be replaced.
+
+        Raises:
+            OptionError: if there are some, and the folder is one that this user has not downloaded.
+        """
+        if changed and not self.owned:
+            raise OptionError(
+                f"{self.folder}: {', '.join(changed[:5])}: not as its {MANIFEST} says, and not downloaded to here by "
+                f"you: `icrl4aht-data verify {self.folder} --repair --from {self.url}` replaces changed files; or give "
+                f"another folder"
+            )
+
+    def is_here(self, name: str) -> bool:
+        """Whether a file needs no fetching: it has the hash that the manifest lists. Of a shard only the size counts,
+        since the chunk table has the hash of every part that is read."""
+        if name.startswith("data/"):
+            path = self.path(name)
+            return path.is_file() and path.stat().st_size == self._shard_sizes.get(name)
+        return self.is_unchanged(name)
+
+    def is_unchanged(self, name: str) -> bool:
+        """Whether a file in the folder has the hash that the manifest lists; large ones are hashed once, see
+        `utils.remembered`."""
+        path = self.path(name)
+        try:
+            limit = self._shard_sizes.get(name, 0) if name.startswith("data/") else LARGEST
+            return path.stat().st_size <= limit and remembered_hash(path) == self.manifest[name]
+        except OSError:
+            return False
 
     def path(self, name: str) -> Path:
         """Path of a file in the mirror; it need not exist."""
@@ -186,8 +233,7 @@ class Remote:
         """Bytes of a file: of a shard as the release's info says, of another file as the remote says."""
         if name.startswith("data/") and name in self._shard_sizes:
             return self._shard_sizes[name]
-        path = self.path(name)
-        return path.stat().st_size if path.exists() else self._size_at_remote(name)
+        return self.path(name).stat().st_size if self.is_here(name) else self._size_at_remote(name)
 
     def _size_at_remote(self, name: str) -> int:
         size = self.store.size(name)
@@ -197,35 +243,43 @@ class Remote:
 
     def _fetch_files(self, names: Sequence[str], advance: Advance) -> None:
         """Download files that are not in the folder; if one fails, the others are downloaded first."""
-        map_parallel(lambda name: self._fetch_file(name, advance), names, _PARALLEL_FILES)
+        try:
+            map_parallel(lambda name: self._fetch_file(name, advance), names, _PARALLEL_FILES)
+        finally:
+            remove_empty_folders(self.partial)
 
     def _fetch_file(self, name: str, advance: Advance) -> None:
         target, part = self.path(name), self.part(name)
-        part.path.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(part.path.with_name(f".{part.path.name}.lock")):
-            if target.exists():  # downloaded by another process meanwhile
+        with process_lock(part.path.with_name(f".{part.path.name}.lock")):
+            if self.is_here(name):  # downloaded by another process meanwhile
                 return
             complete_file(part, self.size(name), self.manifest[name], self._chunks(name), advance)
             target.parent.mkdir(parents=True, exist_ok=True)
             part.path.replace(target)
 
-    def repair_file(self, name: str) -> None:
+    def repair_file(self, name: str, advance: Advance = lambda size: None) -> None:
         """Replace a damaged file of the folder; of a shard only the damaged chunks are fetched, in place.
+
+        Args:
+            name: the file.
+            advance: called with the number of valid bytes since the last call.
 
         Raises:
             RemoteError: if the remote's file is not the one that the manifest lists; the damaged file is kept.
         """
         target, chunks = self.path(name), self._chunks(name)
         in_place = chunks is not None and target.exists()
-        part = PartialFile(self.store, name, target) if in_place else self.part(name)
+        # In the Hub's cache a file of the release is a link to its content.
+        part = PartialFile(self.store, name, target.resolve()) if in_place else self.part(name)
         if not in_place:
             part.path.unlink(missing_ok=True)
         size = self._size_at_remote(name)
-        complete_file(part, size, self.manifest[name], chunks, lambda size: None, in_place)
+        complete_file(part, size, self.manifest[name], chunks, advance, in_place)
         if not in_place:
             target.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(target) as new:
                 shutil.move(part.path, new)
+            remove_empty_folders(self.partial)
 
     def _chunks(self, name: str) -> np.ndarray | None:
         """Chunk table of a shard (CHUNK_DTYPE (n,)), fetched if necessary; None for another file."""
@@ -243,8 +297,10 @@ class HubRemote(Remote):
         """Download files to the Hub's cache, or by way of `partial` to `folder`; remove those with a wrong hash."""
         assert isinstance(self.store, HubStore)
         damaged = ""
-        with nullcontext() if self.in_hub_cache else folder_lock(self.partial):
-            names = [name for name in names if not self.path(name).exists()]
+        with nullcontext() if self.in_hub_cache else process_lock(lock_beside(self.folder)):
+            names = [name for name in names if not self.is_here(name)]
+            for name in names if self.in_hub_cache else ():
+                _remove_from_cache(self.path(name))  # changed; the client would take what is there
             # Twice a shard's size, because the client counts the bytes before a cut as well.
             limit = sum(2 * self._shard_sizes.get(n, LARGEST) if n.startswith("data/") else LARGEST for n in names)
             local_dir = None if self.in_hub_cache else self.partial
@@ -254,23 +310,29 @@ class HubRemote(Remote):
                 if found != self.manifest[name]:
                     damaged = damaged or f"{self.url}/{name}: expected sha256 {self.manifest[name]}, found {found}"
                     _remove_from_cache(path)
-                elif not self.in_hub_cache:
+                    continue
+                if not self.in_hub_cache:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     path.replace(target)
+                self.part(name).path.unlink(missing_ok=True)
+            if not damaged and not self.in_hub_cache:
+                shutil.rmtree(self.partial / _CLIENT_FOLDER, ignore_errors=True)
+            remove_empty_folders(self.partial)
         if damaged:
             raise RemoteError(f"{damaged}: fetch it again; if that does not help, report it to its publisher")
 
 
 def _remove_from_cache(path: Path) -> None:
     """Remove a file of the Hub's cache: the link in the snapshot and the content that it points to."""
-    path.resolve().unlink()
+    path.resolve().unlink(missing_ok=True)
     path.unlink(missing_ok=True)
 
 
 def _open_hub(url: str, to: Path | None, retry: RetryPolicy | None) -> Remote:
     match = _HUB.fullmatch(url)
     if match is None:
-        raise OptionError(f"{url}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
+        found = without_credentials(url)
+        raise OptionError(f"{found}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
     with _missing_release(url):
         snapshot = HubStore(match["repo"], match["revision"]).fetch_files([MANIFEST], TEXT_BYTES, lambda size: None)
     path, store = snapshot / MANIFEST, HubStore(match["repo"], snapshot.name, retry)
@@ -282,31 +344,50 @@ def _open_hub(url: str, to: Path | None, retry: RetryPolicy | None) -> Remote:
     manifest = _parse_manifest(text, store.url)
     if to is None:
         partial = data_folder() / _folder_name(url) / f"{snapshot.name}.partial"
+        check_partial_folder(partial, manifest)
         return HubRemote(store.url, snapshot.name, snapshot, partial, manifest, store, in_hub_cache=True)
-    _write_manifest(to, text, manifest, store.url)
-    return HubRemote(store.url, snapshot.name, to, _partial_folder(to), manifest, store)
+    partial = _partial_folder(to)
+    check_partial_folder(partial, manifest)
+    _claim_folder(to, text, manifest, store.url, chosen=True)
+    return HubRemote(store.url, snapshot.name, to, partial, manifest, store, owned=read_note(to) is not None)
 
 
-def _open_address(url: str, to: Path | None, retry: RetryPolicy | None) -> Remote:
-    url = url.rstrip("/")
-    store, base = Store(url, retry), data_folder() / _folder_name(url)
+def _open_address(address: str, to: Path | None, retry: RetryPolicy | None) -> Remote:
+    store = Store(address, retry)
+    url, base = store.url, data_folder() / _folder_name(store.url)
     latest = base / "latest"  # the version that this address had when it was last opened
-    known = latest.read_text(encoding="utf-8") if latest.exists() else ""
+    known = _read_revision(latest)
     if offline():
         text = _downloaded_manifest(url, to or base / known)
+        if to is None and _revision(text) != known:
+            raise OfflineError(f"{base / known / MANIFEST}: changed since it was downloaded; go online to fetch it")
     else:
         with _missing_release(url):
             size = store.size(MANIFEST)
             if size > TEXT_BYTES:
                 raise IndexFormatError(f"{url}/{MANIFEST}: expected at most {TEXT_BYTES:,} bytes, found {size:,}")
             text = store.read(MANIFEST, 0, size)
-    manifest, revision = _parse_manifest(text, url), hashlib.sha256(text).hexdigest()[:16]
+    manifest, revision = _parse_manifest(text, url), _revision(text)
     folder = to or base / revision
-    _write_manifest(folder, text, manifest, url)
+    check_partial_folder(_partial_folder(folder), manifest)
+    _claim_folder(folder, text, manifest, url, chosen=to is not None)
     if to is None and known != revision:
-        with folder_lock(base), atomic_write(latest) as partial:
+        with process_lock(lock_beside(latest)), atomic_write(latest) as partial:
             partial.write_text(revision, encoding="utf-8")
-    return Remote(url, revision, folder, _partial_folder(folder), manifest, store)
+    owned = to is None or read_note(to) is not None
+    return Remote(url, revision, folder, _partial_folder(folder), manifest, store, owned=owned)
+
+
+def _revision(manifest: bytes) -> str:
+    return hashlib.sha256(manifest).hexdigest()[:16]
+
+
+def _read_revision(path: Path) -> str:
+    """The revision noted in a file; empty without one."""
+    with suppress(IndexFormatError):
+        text = read_text(path)
+        return text if re.fullmatch("[0-9a-f]{16}", text) else ""
+    return ""
 
 
 @contextmanager
@@ -316,7 +397,7 @@ def _missing_release(url: str) -> Iterator[None]:
         yield
     except RemoteError as error:
         if error.missing:
-            raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error.__cause__}") from error
+            raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error}") from None
         raise
 
 
@@ -333,14 +414,32 @@ def _parse_manifest(text: bytes, url: str) -> dict[str, str]:
     return parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}")
 
 
-def _write_manifest(folder: Path, text: bytes, manifest: dict[str, str], url: str) -> None:
-    """Write the manifest into the mirror, which may hold files of this manifest only."""
+def _claim_folder(folder: Path, text: bytes, manifest: dict[str, str], url: str, chosen: bool) -> None:
+    """Write the manifest into the folder for a release, which may hold files of this manifest only.
+
+    Args:
+        folder: the folder, which need not exist.
+        text: the manifest.
+        manifest: its content.
+        url: address of the release.
+        chosen: whether a user has chosen the folder, so that it may hold anything; else it is a mirror.
+
+    Raises:
+        OptionError: if the folder has files of something else.
+    """
     path = folder / MANIFEST
     if has_content(path, text):
         return
-    with folder_lock(_partial_folder(folder)):
-        if path.exists() and not has_content(path, text) and not _has_only_files_of(folder, manifest):
+    with process_lock(lock_beside(folder)):
+        note = read_note(folder)
+        ours = not chosen or (note is not None and note.belongs_to(manifest))
+        if path.exists() and not has_content(path, text) and not ours and not _has_only_files_of(folder, manifest):
             raise OptionError(f"{folder}: holds another release or version than {url} has now; give another folder")
+        if not ours and not path.exists() and folder.exists() and any(folder.iterdir()):
+            raise OptionError(
+                f"{folder}: not empty, and not a release, so that nothing is written into it; give a new or an empty "
+                f"folder"
+            )
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as partial:
             partial.write_bytes(text)
@@ -358,10 +457,21 @@ def _has_only_files_of(folder: Path, manifest: dict[str, str]) -> bool:
     return all(manifest.get(name) == digest for name, digest in listed.items() if (folder / name).exists())
 
 
-def folder_lock(folder: Path) -> FileLock:
-    """A lock between processes that write to a release; its file is created in `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return FileLock(folder / ".lock")
+def check_partial_folder(partial: Path, manifest: Mapping[str, str]) -> None:
+    """Check that a folder for unfinished files, which need not exist, has nothing but these, and no links.
+
+    Raises:
+        OptionError: if it is not a folder, or has a link or anything else; names it.
+    """
+    if partial.is_symlink() or (partial.exists() and not partial.is_dir()):
+        raise OptionError(f"{partial}: expected a folder for unfinished files, found something else; remove it")
+    for name in files_below(partial) if partial.exists() else ():
+        path, file = partial / name, re.sub(r"(^|/)\.([^/]+)\.lock$", r"\1\2", name)
+        with suppress(FileNotFoundError):  # another process has completed it
+            if not stat.S_ISREG(path.lstat().st_mode):
+                raise OptionError(f"{path}: not a plain file: remove it, since downloads are written there")
+            if file not in manifest and not name.startswith(f"{_CLIENT_FOLDER}/"):
+                raise OptionError(f"{path}: not of a download of this release: remove it, or rename {partial}")
 
 
 def _partial_folder(folder: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import os
@@ -13,8 +14,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from typing import Any, TypeVar
+from urllib.parse import urljoin
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
+from icrl4aht_data.remote.addresses import address_of, check_redirect, without_credentials
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -86,20 +89,24 @@ class Store:
     """Files below an address. Can be shared between threads, pickled, and used after a fork.
 
     Args:
-        url: address of a folder: https://, s3://, or any other that fsspec opens; see `HubStore` for the Hub.
+        url: address of a folder: https://, s3://, or any other that fsspec opens; see `HubStore` for the Hub. It may
+            have a user name and a password, or a query that is sent with every request.
         retry: policy for transient errors.
+
+    Attributes:
+        url: the address without credentials, for messages and files.
     """
 
     def __init__(self, url: str, retry: RetryPolicy | None = None) -> None:
-        self.url = url.rstrip("/")
+        self._address = url
+        self.url = without_credentials(url).rstrip("/")
         self.retry = retry or RetryPolicy()
-        self._filesystem_url = self.url
         self._filesystem: tuple[int, Any] = 0, None
         self._traffic = Traffic()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.url, self.retry)
+        return type(self), (self._address, self.retry)
 
     @property
     def traffic(self) -> Traffic:
@@ -138,13 +145,14 @@ class Store:
             raise OfflineError(f"{self.url}: offline, and {name} is not completely downloaded; go online to fetch it")
 
     def _size(self, name: str) -> int:
-        size = self._files.info(f"{self.url}/{name}")["size"]
+        size = self._files.info(address_of(self._address, name))["size"]
         if size is None:
             raise WrongLengthError("the server does not say how long the file is")
         return int(size)
 
     def _read(self, name: str, start: int, stop: int) -> bytes:
-        return self._counted(name, start, stop, self._files.cat_file(f"{self.url}/{name}", start=start, end=stop))
+        data = self._files.cat_file(address_of(self._address, name), start=start, end=stop)
+        return self._counted(name, start, stop, data)
 
     def _counted(self, name: str, start: int, stop: int, data: bytes) -> bytes:
         """The bytes start..stop in an answer, which may hold the complete file instead."""
@@ -159,7 +167,7 @@ class Store:
     def _files(self) -> Any:
         """The fsspec file system: one per process, because connections do not survive a fork."""
         if self._filesystem[0] != os.getpid():
-            self._filesystem = os.getpid(), _open_filesystem(self._filesystem_url)
+            self._filesystem = os.getpid(), _open_filesystem(self._address)
         return self._filesystem[1]
 
     def with_retries(self, name: str, request: Callable[[], T]) -> T:
@@ -217,11 +225,15 @@ def wrap_remote_errors(address: str, attempts: int = 1) -> Iterator[None]:
         if _is_disk_error(error):
             raise
         cause = _root_cause(error)
+        # A traceback shows the client's error too, which may have the complete address.
+        shown = error if without_credentials(f"{error} {cause}") == f"{error} {cause}" else None
+        if isinstance(cause, Icrl4ahtError):  # of a refused redirect
+            raise cause from None
         if isinstance(cause, FileNotFoundError) or http_status(error) == 404:
-            raise RemoteError(f"{address}: the remote has no such file", missing=True) from error
+            raise RemoteError(f"{address}: the remote has no such file", missing=True) from shown
         tried = f" ({attempts} attempts)" if attempts > 1 and _is_transient(error) else ""
         kept = "what has arrived is kept: repeat the command to resume"
-        raise RemoteError(f"{address}: {_one_line(cause)}{tried}; {kept}") from error
+        raise RemoteError(f"{address}: {_one_line(cause)}{tried}; {kept}") from shown
 
 
 def _open_filesystem(url: str) -> Any:
@@ -234,6 +246,7 @@ def _open_filesystem(url: str) -> Any:
 
         timeout = aiohttp.ClientTimeout(total=_TOTAL_TIMEOUT, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)
         options["client_kwargs"] = {"timeout": timeout, "response_class": _bounded_response()}
+        options["client_kwargs"]["trace_configs"] = [_redirect_guard()]
     elif scheme == "s3":
         once = {"total_max_attempts": 1}  # `RetryPolicy` alone retries
         options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT, "retries": once}
@@ -242,13 +255,31 @@ def _open_filesystem(url: str) -> Any:
     except ImportError as error:
         extra = {"s3": "s3"}.get(scheme)
         remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
-        raise OptionError(f"{url}: {error}; {remedy}") from error
+        raise OptionError(f"{without_credentials(url)}: {error}; {remedy}") from error
     except ValueError as error:
-        expected = "hf://datasets/<org>/<repo>, https://... or s3://..."
-        raise OptionError(f"{url}: not an address that fsspec opens: {error}; expected {expected}") from error
+        problem = without_credentials(f"{url}: not an address that fsspec opens: {error}")
+        raise OptionError(f"{problem}; expected hf://datasets/<org>/<repo>, https://... or s3://...") from None
     if scheme == "s3":
         files.retries = 1  # s3fs has retries of its own besides botocore's
     return files
+
+
+def _redirect_guard() -> Any:
+    """Hook of aiohttp's client that raises an error before a redirect is followed which `check_redirect` refuses."""
+    from aiohttp import TraceConfig
+
+    async def check(session: Any, context: Any, redirect: Any) -> None:
+        location = redirect.response.headers.get("Location") or redirect.response.headers.get("URI") or ""
+        target = urljoin(str(redirect.url), location)
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, check_redirect, str(redirect.url), target)
+        except RemoteError:
+            redirect.response.close()
+            raise
+
+    guard = TraceConfig()
+    guard.on_request_redirect.append(check)
+    return guard
 
 
 def _bounded_response() -> type:
@@ -326,5 +357,5 @@ def _retry_after(error: BaseException | None) -> float:
 
 def _one_line(error: BaseException) -> str:
     """The error's class and message on one line, without the library's advice in further paragraphs."""
-    text = " ".join(str(error).split())
+    text = without_credentials(" ".join(str(error).split()))
     return f"{type(error).__name__}: {text[:300]}" if text else type(error).__name__

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeVar
 
 from filelock import FileLock
+
+T = TypeVar("T")
+
+_ATTEMPTS = 100  # to make a file in a folder that other processes remove just then
 
 
 @contextmanager
@@ -25,13 +30,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
         OSError: if the file cannot be made.
     """
     lock = FileLock(path, timeout=-1 if wait else 0)
-    while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire()
-            break
-        except FileNotFoundError:
-            continue  # another process has removed the folder with its last file
+    in_new_folder(path, lock.acquire)
     try:
         yield
     finally:
@@ -43,6 +42,21 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
 def lock_beside(folder: Path) -> Path:
     """Path of a folder's lock: next to the folder, so that the folder can be renamed or removed meanwhile."""
     return folder.with_name(f".{folder.name}.lock")
+
+
+def in_new_folder(path: Path, create: Callable[[], T]) -> T:
+    """Call a function that creates a file, after making the file's folder; again, if another process has removed the
+    folder in between because it was empty.
+
+    Raises:
+        OSError: if the folder or the file cannot be made.
+    """
+    for _ in range(_ATTEMPTS):
+        with suppress(FileNotFoundError, FileExistsError):  # the second one if the folder was there, and then was not
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return create()
+    path.parent.mkdir(parents=True, exist_ok=True)  # something else is wrong, and is raised
+    return create()
 
 
 def remove_empty_folders(folder: Path) -> None:

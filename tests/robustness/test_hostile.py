@@ -24,7 +24,6 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, UnsafePathError
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.remote.download import ORIGIN, repair
 from icrl4aht_data.utils.files import atomic_write, parse_json
 from tests.helpers.paths import ROOT
 from tests.robustness.hostile.cases import CASES
@@ -110,15 +109,6 @@ def test_a_pipe_for_a_checkpoint(tmp_path):
     os.mkfifo(tmp_path / POLICY_CARD)
     with pytest.raises(OptionError, match="not a plain file"):
         load_policy(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "url", ["local:///etc", "reference://x", "simplecache::https://host/x", "memory://x", "git://x/y", "python://"]
-)
-def test_the_origin_file_does_not_choose_a_protocol(damaged, url):
-    (damaged / ORIGIN).write_text(json.dumps({"url": url, "files": []}))
-    with pytest.raises(OptionError, match="give --from"):
-        repair(damaged, ["README.md"])
 
 
 def test_a_link_is_not_written_through(tmp_path):

@@ -20,7 +20,7 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OfflineError, OptionError, RemoteError, RootNotFoundError, UnknownNameError
 from icrl4aht_data.format.chunks import chunk_table_path
-from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download, repair
+from icrl4aht_data.remote.download import fetch_planned, plan_download, repair
 from icrl4aht_data.remote.store import RetryPolicy, Store
 from tests.helpers.batches import assert_equal
 from tests.robustness import bench_remote
@@ -158,7 +158,6 @@ def test_a_download_into_a_given_folder(served, lite, tmp_path):
     assert verify_release(target).ok, "it has the part that was requested"
     fetch_planned(plan_download(served, to=target, layout="demo_wide"))
     assert verify_release(target, level="deep").notes == []
-    (target / ORIGIN).unlink()
     assert contents(target) == contents(lite[0])
     shard = load_icrl4aht(target).shards[0]
     (target / shard).unlink()

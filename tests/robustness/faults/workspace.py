@@ -21,7 +21,7 @@ from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.schema import MANIFEST, held_fields
 from icrl4aht_data.reading.selection import ReadOptions
 from icrl4aht_data.remote import partial_file
-from icrl4aht_data.remote.download import ORIGIN, fetch_planned, plan_download
+from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.remote_release import open_root
 from icrl4aht_data.remote.store import RetryPolicy
 from tests.helpers.damages import contents
@@ -162,7 +162,7 @@ class Workspace:
     def check_files(self, folder: Path, complete: bool = False) -> None:
         """Check that a folder has no files but those of the release, each with the right content."""
         found = contents(folder) if folder.exists() else {}
-        found = {name: data for name, data in found.items() if name != ORIGIN and not name.endswith(".partial")}
+        found = {name: data for name, data in found.items() if not name.endswith(".partial")}
         wrong = {name for name in found if found[name] != self.content.get(name)}
         # no hash protects the manifest; only with a wrong one may a partial download have a wrong file, the manifest
         check(not wrong or (wrong == {MANIFEST} and not complete), f"files that are not the release's: {wrong}")
@@ -211,7 +211,7 @@ class Workspace:
 
     def check_error(self, error: Exception, url: str = "") -> None:
         """Check that an error names a file of the release, or `url`."""
-        named = any(name in str(error) for name in [*self.content, ORIGIN]) or (url and url in str(error))
+        named = any(name in str(error) for name in self.content) or (url and url in str(error))
         check(named, f"no file is named: {error}")
 
     def count_requests(

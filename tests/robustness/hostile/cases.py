@@ -18,7 +18,6 @@ import numpy as np
 from icrl4aht_data.format.chunks import chunk_hash
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import CHUNK_DTYPE, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
-from icrl4aht_data.remote.download import ORIGIN
 from tests.helpers.random_releases import SHARD
 from tests.robustness.hostile.spoil import (
     TABLE,
@@ -111,7 +110,7 @@ add("release", "not a file that a release has", {f"manifest: {name}": listed(pat
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
 add("release", "listed in the manifest, but missing", {"manifest: many lines": listed(_many)})
 
-for _file in (INFO, HISTORIES, TASKS, PROVENANCE, TABLE, SHARD, "README.md", teammate, MANIFEST, ORIGIN):
+for _file in (INFO, HISTORIES, TASKS, PROVENANCE, TABLE, SHARD, "README.md", teammate, MANIFEST):
     _label = _file if isinstance(_file, str) else "teammate"
     add("release", "leads out of the release", {f"link out: {_label}": replaced(_file, link_out)})
     add("release", "neither a file nor a folder", {f"pipe: {_label}": replaced(_file, pipe)})
