@@ -169,8 +169,8 @@ def from_published(
     def load(groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
         seen: dict[bytes, _PublishedHistory] = {}
         for group in groups:
-            _check_content(group, seen)
             yield NewHistory(group.line["env_idx"], LazyArrays(group.field_names(), group.read))
+            _check_content(group, seen)
             advance(next(numbers), len(lines))
 
     with file:
