@@ -80,11 +80,10 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
 
 def _stream_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
     recorded, kept = found.streams_recorded, found.streams_kept
-    limits = [("streams_recorded", recorded)] * (recorded is not None) + [("streams_kept", kept)] * (kept is not None)
-    for name, value in limits:
-        if value < len(entries):
+    for name, value in (("streams_recorded", recorded), ("streams_kept", kept)):
+        if value is not None and value < len(entries):
             yield f"{name}: expected at least the {len(entries)} histories of the index, found {value}"
-    if None not in (recorded, kept) and kept > recorded:
+    if recorded is not None and kept is not None and kept > recorded:
         yield f"streams_kept: expected at most the {recorded} recorded ones, found {kept}"
     last = max(entries, key=lambda entry: entry.env_idx)
     if recorded is not None and last.env_idx >= recorded:

@@ -28,6 +28,7 @@ from icrl4aht_data.commands.options import (
     bars,
     counted,
     examples,
+    family_map_option,
     filter_options,
     json_option,
     overwrite_option,
@@ -340,13 +341,7 @@ def _verdict(report: Report) -> str:
     help="Tasks of published files.",
     show_default="tasks.jsonl in SOURCE",
 )
-@click.option(
-    "--family-map",
-    multiple=True,
-    metavar="OLD=NEW",
-    help="Teammate family in published files, and here: rl, H1 to H4, or a kind such as fcp; repeat for more.",
-    show_default="the names of the published code",
-)
+@family_map_option
 @click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Steps of an episode in published files.")
 @filter_options
 @quiet_option

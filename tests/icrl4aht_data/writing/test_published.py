@@ -138,7 +138,8 @@ def test_every_cell_of_a_cramped_map_is_told_by_its_short_view(layout):
 def test_short_views_of_nothing_are_refused(short_views, tmp_path):
     shutil.copytree(short_views[0], tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
-        file["/1/obs"][7] = 0
+        stored: Any = file["/1/obs"]
+        stored[7] = 0
     with pytest.raises(PublishedFormatError, match="group /1: obs: step 7 does not show cramped_up from any cell"):
         from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
 
