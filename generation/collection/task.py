@@ -19,7 +19,6 @@ from generation.collection.task_folder import (
     FULL_DISK,
     LEARNER,
     ArtefactWriter,
-    DiskFullError,
     check_room,
     disk_full,
     finish_artefact,
@@ -36,6 +35,7 @@ from generation.policy import Noise
 from generation.profiles import Profile
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.actions import TEAMMATE
 
 TEAMMATE_NOISE: Noise = "seeded"

@@ -34,7 +34,7 @@ from generation.learners.network import ActorCritic
 from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
+from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.utils.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
@@ -102,10 +102,6 @@ def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
         return same and complete and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
-
-
-class DiskFullError(Icrl4ahtError):
-    """The disk of an artefact has no room for it."""
 
 
 def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:

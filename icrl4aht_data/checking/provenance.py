@@ -12,19 +12,20 @@ from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, Entry
+from icrl4aht_data.format.schema import EXPERTS, HISTORIES, PROVENANCE, Entry
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.paths import resolve_inside
 
 _ROUNDING = 1e-3  # of the means that a stream filter records
 
 
-def check_provenance(index: Index, tasks: Sequence[Task], report: Report) -> None:
+def check_provenance(index: Index, tasks: Sequence[Task], listed: Iterable[str], report: Report) -> None:
     """Check what provenance says of each task's learner, its streams and their filter; see also `files.check_experts`.
 
     Args:
         index: the release's index.
         tasks: its tasks; none in a release that knows them by name only.
+        listed: the files of the manifest.
         report: receives the problems.
     """
     try:
@@ -39,12 +40,26 @@ def check_provenance(index: Index, tasks: Sequence[Task], report: Report) -> Non
     seeds = {task.task_id: task.seed for task in tasks}
     for task_id in provenance.keys() - members.keys():
         report.add(PROVENANCE, f"task {task_id!r}: has no history")
+    labellers = {of_task.expert.policy_sha256 for of_task in provenance.values() if of_task.expert is not None}
+    for name in listed:
+        if name.startswith(f"{EXPERTS}/") and name.split("/")[1] not in labellers:
+            report.add(name, f"{PROVENANCE} names no such policy")
     for task_id, entries in members.items():
         if task_id not in provenance:
             report.add(PROVENANCE, f"task {task_id!r}: missing")
             continue
         for fault in _faults(provenance[task_id], entries, seeds.get(task_id)):
             report.add(PROVENANCE, f"task {task_id!r}: {fault}")
+        _check_experts(provenance[task_id], entries, report)
+
+
+def _check_experts(found: Provenance, entries: Sequence[Entry], report: Report) -> None:
+    """Check that the index has the returns and steps of the labeller that provenance has."""
+    for entry in entries:
+        for name, expected in found.entry_fields().items():
+            if (value := getattr(entry, name)) != expected:
+                where = f"history {entry.history_id}: {name}"
+                report.add(HISTORIES, f"{where} {value}, but {PROVENANCE} has {expected} of its task")
 
 
 def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
@@ -65,11 +80,10 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
 
 def _stream_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
     recorded, kept = found.streams_recorded, found.streams_kept
-    limits = [("streams_recorded", recorded)] * (recorded is not None) + [("streams_kept", kept)] * (kept is not None)
-    for name, value in limits:
-        if value < len(entries):
+    for name, value in (("streams_recorded", recorded), ("streams_kept", kept)):
+        if value is not None and value < len(entries):
             yield f"{name}: expected at least the {len(entries)} histories of the index, found {value}"
-    if None not in (recorded, kept) and kept > recorded:
+    if recorded is not None and kept is not None and kept > recorded:
         yield f"streams_kept: expected at most the {recorded} recorded ones, found {kept}"
     last = max(entries, key=lambda entry: entry.env_idx)
     if recorded is not None and last.env_idx >= recorded:

@@ -26,7 +26,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, KINDS, MANIFEST, TASKS
+from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
@@ -116,13 +116,8 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
-    if "hash" not in (CHUNK_DTYPES[index.info.format_version].names or ()):
-        report.notes.append(
-            f"format version {index.info.format_version}: its chunk tables have no strong hashes, only CRC-32, which "
-            f"finds accidents but no forgery; `icrl4aht-data convert` brings it to version {FORMAT_VERSION}"
-        )
     check_references(listed, index, tasks, report)
-    check_provenance(index, tasks, report)
+    check_provenance(index, tasks, listed, report)
     check_index(index, tasks, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)

@@ -28,6 +28,7 @@ from icrl4aht_data.commands.options import (
     bars,
     counted,
     examples,
+    family_map_option,
     filter_options,
     json_option,
     overwrite_option,
@@ -50,6 +51,7 @@ from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.published_index import parse_family_map
 from icrl4aht_data.writing.release_folder import HISTORIES_H5
 from icrl4aht_data.writing.statistics import print_statistics
 
@@ -344,6 +346,7 @@ def _verdict(report: Report) -> str:
     help="Tasks of published files.",
     show_default="tasks.jsonl in SOURCE",
 )
+@family_map_option
 @click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Steps of an episode in published files.")
 @filter_options
 @quiet_option
@@ -353,6 +356,7 @@ def convert(
     overwrite: bool,
     form: str | None,
     tasks: Path | None,
+    family_map: tuple[str, ...],
     kept_steps: int,
     quiet: bool,
     **filters: tuple[str, ...],
@@ -371,7 +375,14 @@ def convert(
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, without filters")
             form = from_published(
-                source, target, form, tasks=tasks, kept_steps=kept_steps, overwrite=overwrite, advance=advance
+                source,
+                target,
+                form,
+                tasks=tasks,
+                family_map=parse_family_map(family_map),
+                kept_steps=kept_steps,
+                overwrite=overwrite,
+                advance=advance,
             )
         else:
             dataset = _load(source, filters)
@@ -379,8 +390,10 @@ def convert(
                 form = dataset.info.kind
             if form is None:
                 raise click.UsageError("give the form to convert to: --to full, lite, observations, published, parquet")
-            if tasks or kept_steps != KEPT_STEPS:
-                raise click.UsageError(f"{source} is a release: --tasks and --kept-steps are for published files")
+            if tasks or family_map or kept_steps != KEPT_STEPS:
+                raise click.UsageError(
+                    f"{source} is a release: --tasks, --family-map and --kept-steps are for published files"
+                )
             if form in ALL_KINDS:
                 to_release(dataset, target, form, overwrite=overwrite, advance=advance)
             elif form == "published":

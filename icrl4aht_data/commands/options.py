@@ -182,6 +182,13 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON i
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what exists, if it is what such a command wrote and nothing else."
 )
+family_map_option = click.option(
+    "--family-map",
+    multiple=True,
+    metavar="OLD=NEW",
+    help="Teammate family in published files, and here: rl, H1 to H4, or a kind such as fcp; repeat for more.",
+    show_default="the names of the published code",
+)
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
 
 
@@ -292,5 +299,5 @@ def _in_words(error: OSError) -> str:
         path = path.with_name(path.stem.removeprefix("."))
     remedy = _REMEDIES.get(error.errno)
     if error.errno in FULL:
-        remedy = f"{describe_disk(path)}: {remedy}"
+        remedy = f"{remedy}: {describe_disk(path)}"
     return f"{path}: {os.strerror(error.errno)}" + (f"; {remedy}" if remedy else "")

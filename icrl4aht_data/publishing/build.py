@@ -87,14 +87,13 @@ def build_release(
             _copy(source / name, root / name, link)
             advance("copying", number, len(kept))
         _keep_source_card(source, root)
-        write_manifest(root, kept)  # to open it; written again when it is complete
-        _add_figures_and_parquet(load_icrl4aht(root), root)
+        _add_figures_and_parquet(load_icrl4aht(source), root)
         for folder in sorted((root / TEAMMATES).glob("*/")):
             (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
         for name in _COPIED_TEXTS:
             shutil.copyfile(card_file(name), root / name)
         (root / RELEASE_CARD).write_text(dataset_card(root), encoding="utf-8")
-        digests = {name: file_hash(root / name) for name in files_below(root) if name != MANIFEST}
+        digests = {name: file_hash(root / name) for name in files_below(root)}
         for name, digest in kept.items():
             if digests.get(name) != digest:
                 raise ReleaseError(f"{source / name}: changed while it was copied, sha256 now {digests.get(name)}")

@@ -21,7 +21,8 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
         overwrite: replace a Parquet file of histories at `path`.
 
     Raises:
-        OptionError: if pyarrow is not installed, or `path` may not be written, see `new_file.check_new_file`.
+        OptionError: if pyarrow is not installed, or `path` may not be written, see `new_file.check_new_file`, or
+            is inside the release.
     """
     try:
         import pyarrow as pa
@@ -29,6 +30,8 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
     except ImportError as error:
         raise OptionError("Parquet needs pyarrow: pip install 'icrl4aht-data[hf]'") from error
     check_new_file(path, overwrite)
+    if path.resolve().is_relative_to(dataset.root.resolve()):
+        raise OptionError(f"{path}: is inside {dataset.root}, which is read; give another path")
     types = {float: pa.float64(), int: pa.int64(), int | None: pa.int64(), str: pa.string(), bool: pa.bool_()}
     types |= {float | None: pa.float64(), tuple[int, int, int]: pa.list_(pa.int64())}
     schema = pa.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()])

@@ -10,10 +10,11 @@ that knows its tasks by name.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +29,24 @@ from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.safe_hdf5 import exists, member, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
-    ENTRY_HINTS,
     FIELDS,
     OBSERVATIONS,
     PROVENANCE,
     TASKS,
     Kind,
-    check_value,
     episode_ends,
     held_fields,
+    record_field,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import parse_json, read_lines, write_json
+from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.utils.paths import resolve_inside
 from icrl4aht_data.utils.validation import check_int
 from icrl4aht_data.writing.hdf5_sink import new_hdf5
+from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
+from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import (
     HISTORIES_H5,
@@ -57,9 +59,6 @@ from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
-
-PUBLISHED_FIELDS = tuple(ENTRY_HINTS)[:14]
-"""Fields of an index line (paper, App. D.3)."""
 
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)
 
@@ -84,14 +83,15 @@ def to_published(
         chunk: steps per chunk.
         states: also store the state records, if there are any: without them `from_published` makes a release of
             observations.
-        overwrite: replace a folder that was written by this function, or a release.
+        overwrite: replace a folder that was written by this function, or a release. One with the files that would be
+            written, as after an interruption, is accepted in any case.
         advance: progress.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
     """
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
-    with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
+    with atomic_folder(target, overwrite=overwrite, sources=[dataset.root], keep_equal=True) as folder:
         with new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = new.file.create_group(f"/{number}")
@@ -127,6 +127,7 @@ def from_published(
     kind: Kind | None = None,
     *,
     tasks: Path | None = None,
+    family_map: Mapping[str, str] | None = None,
     data_version: str = "0.1.0",
     kept_steps: int = KEPT_STEPS,
     overwrite: bool = False,
@@ -140,6 +141,8 @@ def from_published(
         kind: by default "lite" if the groups have state records, "observations" if none has.
         tasks: a JSONL file with the tasks that the index names; by default `tasks.jsonl` in `source`. A release of
             observations can be made without: it knows of its tasks what the index says.
+        family_map: `teammate_family` of the index -> family (rl, H1..H4) or kind of teammate, in addition to the names
+            of the published code, see `published_index.FAMILY_MAP`.
         data_version: version of the data, SemVer.
         kept_steps: steps of every episode; an unfinished one may end a history.
         overwrite: replace a release at `target`.
@@ -150,12 +153,12 @@ def from_published(
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
-        PublishedFormatError: if a file is missing or malformed, or a group has no array that a release of that kind
-            needs; names file and group.
+        PublishedFormatError: if a file is missing or malformed, if a group has no array that a release of that kind
+            needs, or if a group, a stream or a content appears twice; names file and group.
     """
     kept_steps = check_int("kept_steps", kept_steps, 1)
     check_target(target, overwrite, [source])
-    lines = _read_index(resolve_inside(source, HISTORIES_INDEX))
+    lines = read_published_index(resolve_inside(source, HISTORIES_INDEX), family_map)
     provenance_path = resolve_inside(source, "provenance.json")
     provenance = read_provenance(provenance_path) if provenance_path.is_file() else {}
     numbers = iter(range(1, len(lines) + 1))
@@ -164,8 +167,10 @@ def from_published(
         file = h5py.File(path, "r")
 
     def load(groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
+        seen: dict[bytes, _PublishedHistory] = {}
         for group in groups:
             yield NewHistory(group.line["env_idx"], LazyArrays(group.field_names(), group.read))
+            _check_content(group, seen)
             advance(next(numbers), len(lines))
 
     with file:
@@ -175,7 +180,10 @@ def from_published(
             history.check_arrays()
         new = [
             NewTask(
-                task, provenance.get(task.task_id, Provenance()), len(members), lambda members=members: load(members)
+                task,
+                _with_notes(provenance.get(task.task_id, Provenance()), members[0]),
+                len(members),
+                lambda members=members: load(members),
             )
             for task, members in _tasks(histories, source, tasks, found)
         ]
@@ -196,23 +204,24 @@ def _wrap_errors(what: str) -> Iterator[None]:
         raise PublishedFormatError(f"{what}: {error}") from error
 
 
-def _read_index(path: Path) -> list[dict[str, Any]]:
-    lines = []
-    for number, text in enumerate(read_lines(path), start=1):
-        try:
-            line = parse_json(text)
-            missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
-            if missing:
-                raise PublishedFormatError(f"missing the fields {sorted(missing)}")
-            for name in PUBLISHED_FIELDS:
-                check_value(name, line[name])
-            named_task(line)
-        except Icrl4ahtError as error:
-            raise PublishedFormatError(f"{path}, line {number}: {error}") from error
-        lines.append(line)
-    if not lines:
-        raise PublishedFormatError(f"{path}: no histories")
-    return lines
+def _check_content(history: _PublishedHistory, seen: dict[bytes, _PublishedHistory]) -> None:
+    """Check that a history is not a copy of another one of its task; `seen` has those so far, by a hash."""
+    digest = hashlib.sha256(b"".join(history.read(name).tobytes() for name in ("actions", "rewards"))).digest()
+    other = seen.setdefault(digest, history)
+    record = record_field(history.kind).name
+    if other is not history and np.array_equal(other.read(record), history.read(record)):
+        raise PublishedFormatError(
+            f"{history.where}: has the content of group {other.line['h5_group']}, of the same task; leave one out"
+        )
+
+
+def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenance:
+    """Return provenance that says what the conversion changed: names of teammates, and rows of views."""
+    notes = dict(history.line.get("published", {}))
+    if history.short:
+        layout = get_layout(history.line["layout"])
+        notes |= {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=layout.height)}
+    return replace(provenance, other={**provenance.other, "published": notes}) if notes else provenance
 
 
 def _stored_kind(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
@@ -277,6 +286,11 @@ class _PublishedHistory:
         """File and group, for messages."""
         return f"{self.file.filename}, group {self.line['h5_group']}"
 
+    @property
+    def short(self) -> bool:
+        """Whether the views have fewer rows than those of a release, see `published_views`."""
+        return is_short(get_layout(self.line["layout"]), self.line["obs_shape"])
+
     def field_names(self) -> list[str]:
         """Return the names of the arrays that the release takes."""
         return [f.name for f in held_fields(self.kind) if self.kind not in f.optional or self.line[f"has_{f.name}"]]
@@ -311,10 +325,16 @@ class _PublishedHistory:
         """
         field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
         rows = steps if field.axis == "T" else steps // self.kept_steps
-        expected = (rows, *field.held(layout).shape)
+        shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
+        expected = (rows, *shape)
         with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
             found = read_dataset(member(self.file, f"{self.line['h5_group']}/{name}"), expected)
         array = self._compact(name, found)
+        if name == "obs" and self.short:
+            try:
+                return complete_views(layout, array)
+            except PublishedFormatError as error:
+                raise PublishedFormatError(f"{self.where}: obs: {error}") from error
         if name in ACTION_FIELDS:
             return FROM_PUBLISHED[array]
         if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self.kept_steps))):

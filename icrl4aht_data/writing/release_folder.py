@@ -14,7 +14,7 @@ from pathlib import Path
 from filelock import Timeout
 
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.manifest import is_known_file, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import explain_full_disk
@@ -37,13 +37,16 @@ Snapshot = dict[str, tuple[int, int, int]]
 
 
 @contextmanager
-def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[str | Path] = ()) -> Iterator[Path]:
+def atomic_folder(
+    target: Path, *, overwrite: bool = False, sources: Iterable[str | Path] = (), keep_equal: bool = False
+) -> Iterator[Path]:
     """Yield a new folder to fill, which becomes `target` if the block ends without an error.
 
     Args:
         target: the folder to write.
         overwrite: replace a release or converted published files at `target`.
         sources: folders that are read meanwhile; addresses are ignored.
+        keep_equal: without `overwrite`, accept a folder that would be replaced if the new one has the same files.
 
     Raises:
         OptionError: as `check_target`, before the block and again after it; if another process is writing the folder;
@@ -51,10 +54,13 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
         DiskFullError: if the disk is full; nothing is left of the new folder then.
     """
     sources = tuple(sources)
-    before = check_target(target, overwrite, sources)
+    before = _published_files(target, sources) if keep_equal and not overwrite else {}
+    before = before or check_target(target, overwrite, sources)
     target = target.resolve()
-    with explain_full_disk(target), _locked_folder(target, overwrite, sources, before) as folder:
+    with explain_full_disk(target), _locked_folder(target, overwrite or bool(before), sources, before) as folder:
         yield folder
+        if before and not overwrite and _hashes(folder) != _hashes(target):
+            raise OptionError(f"{target}: exists with other files; give another folder, or replace it by --overwrite")
 
 
 @contextmanager
@@ -62,9 +68,9 @@ def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path],
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
     lock = lock_beside(target)
-    foreign = [folder for folder in (new, old) if os.path.lexists(folder)]
-    if foreign and not lock.exists():  # a killed writer leaves its lock
-        raise OptionError(f"{foreign[0]}: was not left by this package; move it away, or give another folder")
+    for leftover in (new, old):
+        if not lock.exists() and not _was_left_by_a_writer(leftover):  # a killed writer leaves its lock, usually
+            raise OptionError(f"{leftover}: was not left by this package; move it away, or give another folder")
     try:
         with process_lock(lock, wait=False):
             try:
@@ -136,6 +142,26 @@ def _read_listing(folder: Path) -> dict[str, str]:
     if not all(len(line) == 2 and line[1] in PUBLISHED_FILES for line in lines):
         raise IndexFormatError(f"{folder / LISTING}: expected hashes of {', '.join(PUBLISHED_FILES)}")
     return {name: digest for digest, name in lines}
+
+
+def _published_files(target: Path, sources: Iterable[str | Path]) -> Snapshot:
+    """Return the files of a folder that `to_published` wrote; empty for anything else."""
+    try:
+        return check_target(target, True, sources) if (target / LISTING).is_file() else {}
+    except OptionError:
+        return {}
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    return {name: file_hash(folder / name) for name in files_below(folder)}
+
+
+def _was_left_by_a_writer(folder: Path) -> bool:
+    """Return whether nothing is there, or a folder with files as this package writes them only."""
+    own = {*PUBLISHED_FILES, LISTING, MANIFEST}
+    if not os.path.lexists(folder):
+        return True
+    return folder.is_dir() and all(name in own or is_known_file(name) for name in files_below(folder))
 
 
 def _snapshot(folder: Path) -> Snapshot:

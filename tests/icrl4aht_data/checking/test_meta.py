@@ -17,6 +17,7 @@ from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.release import write_release
 from tests.helpers.random_releases import SHARD, random_release
 from tests.robustness.limits import time_limit
 
@@ -101,8 +102,6 @@ def test_a_teammate_in_provenance_is_not_used(learned, tmp_path):
 def test_unsafe_versions_are_not_written(learned, tmp_path):
     with pytest.raises(ReleaseError, match=r"data version '\.\./\.\.'"):
         load_icrl4aht(spoiled(learned, tmp_path / "bad", INFO, lambda c: c.update(data_version="../..")))
-    from icrl4aht_data.writing.release import write_release
-
     with pytest.raises(OptionError, match="data version '1': expected"):
         write_release(tmp_path / "out", "lite", [], data_version="1")
 
@@ -145,5 +144,5 @@ def test_version_2_has_no_strong_hashes(learned, tmp_path):
     random_release(tmp_path / "new", layouts=("demo_wide",), streams=1)
     assert not verify_release(tmp_path / "new").notes
     old = spoiled(tmp_path / "new", tmp_path / "old", INFO, lambda c: c.update(format_version=2))
-    assert any("no strong hashes" in note for note in verify_release(old).notes)
+    assert any("has no chunk hashes" in note for note in verify_release(old).notes)
     assert (old / TASKS).is_file()

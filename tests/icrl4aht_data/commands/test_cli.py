@@ -81,6 +81,7 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
         *(("convert", ca, "--to", form, "--out", cb) for form in ("full", "published", "parquet")),
         *(("convert", ca, "--to", form, "--out", mine, "--overwrite") for form in ("full", "published", "parquet")),
         ("convert", ca, "--to", "parquet", "--out", f"{mine}/index.parquet", "--overwrite"),
+        ("convert", ca, "--to", "parquet", "--out", f"{ca}/index.parquet"),
         ("show", ca, "--plot", f"{mine}/curves.png"),
         ("show", ca, "--plot", f"{mine}/curves.png", "--overwrite"),
     ]

@@ -66,7 +66,7 @@ def test_a_malformed_provenance_is_named(tmp_path, note, message):
         ({"environment": {"max_steps": 400, "kept_steps": 0}}, "Expected `int` >= 1"),
         ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "max_steps and kept_steps only"),
         ({"shards": {"a": -1}}, "Expected `int` >= 0"),
-        ({"data_version": "\x1b[2J"}, "data_version: expected at most 512 printable characters"),
+        ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected one such as 1.0.0"),
     ],
 )
 def test_a_malformed_info_says_what_is_wrong(change, message):

@@ -64,7 +64,7 @@ def test_convert_brings_it_to_the_current_version(request, tmp_path, kind):
     as_version_2(shutil.copytree(root, tmp_path / "old"))
     (tmp_path / "old" / SOURCE_CARD).write_text("# sources\n")
     write_manifest(tmp_path / "old")
-    result = CliRunner().invoke(cli, ["convert", str(tmp_path / "old"), str(tmp_path / "new")])
+    result = CliRunner().invoke(cli, ["convert", str(tmp_path / "old"), "--out", str(tmp_path / "new")])
     assert result.exit_code == 0, result.output
     report = verify_release(tmp_path / "new", level="deep")
     assert report.ok and not report.notes
@@ -77,7 +77,7 @@ def test_convert_brings_it_to_the_current_version(request, tmp_path, kind):
 
 
 def test_a_current_release_needs_the_form(lite, tmp_path):
-    result = CliRunner().invoke(cli, ["convert", str(lite[0]), str(tmp_path / "new")])
+    result = CliRunner().invoke(cli, ["convert", str(lite[0]), "--out", str(tmp_path / "new")])
     assert result.exit_code == 2 and "give the form to convert to" in result.output
 
 
@@ -98,6 +98,7 @@ def test_chunk_tables_have_the_version_of_the_release(lite, old, tmp_path, versi
     """So that nobody can pass off tables without hashes as those of a release that has them."""
     root = shutil.copytree(lite[0] if version == 3 else old, tmp_path / "release")
     shutil.copyfile(chunk_table_path(old if version == 3 else lite[0], SHARD), chunk_table_path(root, SHARD))
+    write_manifest(root)
     with pytest.raises(ChunkTableError, match=f"the chunk table is not of format version {version}; fetch meta/ again"):
         load_icrl4aht(root)[0].actions[:]
     assert any("not of format version" in finding.problem for finding in verify_release(root).findings)
@@ -113,5 +114,6 @@ def test_versions_of_shards_are_compared(lite, old, tmp_path):
 def test_the_info_may_not_say_another_version(old, tmp_path):
     root = shutil.copytree(old, tmp_path / "release")
     (root / INFO).write_text((root / INFO).read_text().replace('"format_version": 2', '"format_version": 3'))
+    write_manifest(root)
     with pytest.raises(ChunkTableError, match="not of format version 3"):
         load_icrl4aht(root)[0].actions[:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from typing import Any
 
 import h5py
@@ -101,7 +102,7 @@ def test_published_files_with_faults(published, tmp_path):
 def test_targets_that_are_taken(lite, tmp_path):
     dataset = load_icrl4aht(lite[0])
     (tmp_path / "file").touch()
-    for write in (to_published, lambda *arguments, **options: to_release(*arguments, "full", **options)):
+    for write in (to_published, partial(to_release, kind="full")):
         with pytest.raises(OptionError, match="exists; give another folder, or replace it by --overwrite"):
             write(dataset, tmp_path)
         with pytest.raises(OptionError, match="is not a release"):

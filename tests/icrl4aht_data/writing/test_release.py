@@ -221,9 +221,11 @@ def test_a_writer_killed_between_the_two_renames(tmp_path):
     random_release(tmp_path / "release", seed=1)
     before = (tmp_path / "release" / "MANIFEST.sha256").read_bytes()
     (tmp_path / "release").rename(tmp_path / ".release.old")
-    with pytest.raises(OptionError, match=r"\.release\.old: was not left by this package"):
+    (tmp_path / ".release.partial").mkdir()
+    (tmp_path / ".release.partial" / "thesis.txt").write_text("years")
+    with pytest.raises(OptionError, match=r"\.release\.partial: was not left by this package"):
         write_cramped(tmp_path / "release", fail)
-    (tmp_path / ".release.lock").touch()
+    shutil.rmtree(tmp_path / ".release.partial")
     with pytest.raises(OptionError, match="release: exists"):
         write_cramped(tmp_path / "release", fail)
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before

@@ -1,0 +1,112 @@
+"""Index lines of published files: checked, and with the teammates' names of the published code translated.
+
+The published code's own files say `teammate_kind` "rl" or "heuristic", and `teammate_family` the algorithm (ippo, fcp,
+brdiv, ...) or the heuristic. Here, as in the paper, the family is rl or H1..H4, and the kind is that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.tasks import named_task
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError, unknown
+from icrl4aht_data.format.schema import ENTRY_HINTS, check_value
+from icrl4aht_data.utils.files import parse_json, read_lines
+
+PUBLISHED_FIELDS = tuple(ENTRY_HINTS)[:14]
+"""Fields of an index line (paper, App. D.3)."""
+
+_KINDS = dict.fromkeys(("ippo", *ALGORITHMS), "rl") | HEURISTIC_KINDS
+"""Names of algorithms and heuristics -> family."""
+
+FAMILY_MAP = (
+    {name: name for name in FAMILIES} | {name: name for name in _KINDS} | {"recipe_aware": "recipe_aware_button"}
+)
+"""`teammate_family` in published files -> a family, or a kind of teammate, which implies its family."""
+
+_GENERAL = {"rl": ("rl",), "heuristic": tuple(HEURISTIC_KINDS.values())}
+"""`teammate_kind` of the published code -> the families that it can mean."""
+
+
+def parse_family_map(pairs: tuple[str, ...]) -> dict[str, str]:
+    """Return the pairs OLD=NEW of a command line as a dict.
+
+    Raises:
+        OptionError: for a text that is not a pair, or a NEW that is neither a family nor a kind of teammate.
+    """
+    found = {}
+    for pair in pairs:
+        old, equals, new = pair.partition("=")
+        if not (old and equals and new):
+            raise OptionError(f"{pair!r}: expected OLD=NEW, such as ippo=fcp")
+        if new not in FAMILIES and new not in _KINDS:
+            raise unknown("family or kind of teammates", new, (*FAMILIES, *_KINDS))
+        found[old] = new
+    return found
+
+
+def read_published_index(path: Path, family_map: Mapping[str, str] | None = None) -> list[dict[str, Any]]:
+    """Read `histories_index.jsonl`.
+
+    Args:
+        path: the file.
+        family_map: `teammate_family` of the file -> a family or a kind of teammate, in addition to `FAMILY_MAP`.
+
+    Returns:
+        The lines; one whose names were translated has the original ones under "published".
+
+    Raises:
+        PublishedFormatError: names the line; for a field that is missing or wrong, and for a group or a stream of a
+            task that is used twice.
+    """
+    lines: list[dict[str, Any]] = []
+    seen: dict[Any, int] = {}
+    for number, text in enumerate(read_lines(path), start=1):
+        try:
+            line = _translate(_parse(text), FAMILY_MAP | dict(family_map or {}))
+            named_task(line)
+            for key, what in (
+                (line["h5_group"].strip("/"), f"group {line['h5_group']!r}"),
+                ((line["task_id"], line["env_idx"]), f"stream {line['env_idx']} of task {line['task_id']!r}"),
+            ):
+                if (first := seen.setdefault(key, number)) != number:
+                    raise PublishedFormatError(f"{what} is already that of line {first}; every history has its own")
+        except Icrl4ahtError as error:
+            raise PublishedFormatError(f"{path}, line {number}: {error}") from error
+        lines.append(line)
+    if not lines:
+        raise PublishedFormatError(f"{path}: no histories")
+    return lines
+
+
+def _parse(text: str) -> dict[str, Any]:
+    line = parse_json(text)
+    missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
+    if missing:
+        raise PublishedFormatError(f"missing the fields {sorted(missing)}")
+    for name in PUBLISHED_FIELDS:
+        check_value(name, line[name])
+    return line
+
+
+def _translate(line: dict[str, Any], family_map: Mapping[str, str]) -> dict[str, Any]:
+    """Return a line with a family and a kind as in the paper."""
+    family, kind = line["teammate_family"], line["teammate_kind"]
+    new = family_map.get(family) or family_map.get(family.lower())
+    if new is None:
+        error = unknown("teammate_family", family, family_map)
+        raise PublishedFormatError(f"{error} Say what it is by --family-map {family}=NEW")
+    new_family, new_kind = (new, kind) if new in FAMILIES else (_KINDS[new], new)
+    if kind in _GENERAL:
+        if new_family not in _GENERAL[kind]:
+            raise PublishedFormatError(f"teammate_kind {kind!r}, but teammate_family {family!r} is of {new_family}")
+        named = {value: name for name, value in HEURISTIC_KINDS.items()}.get(new_family, family)
+        new_kind = named if new in FAMILIES else new
+    elif new not in FAMILIES and family in FAMILIES:
+        new_kind = kind
+    translated = {"teammate_family": new_family, "teammate_kind": new_kind}
+    original = {"teammate_family": family, "teammate_kind": kind}
+    return line | translated | ({"published": original} if translated != original else {})

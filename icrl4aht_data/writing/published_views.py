@@ -1,0 +1,56 @@
+"""Observations of the published code on maps with fewer rows than a view has.
+
+There, a view has only as many rows as the map: 4 x 5 cells on the cramped layouts. It shows the rows from two above the
+agent to one below it; the row two below is missing. Where that row is outside of the map it is 0, as everything outside
+is. Where it is on the map its fixed cells are known (walls, pots, piles), what lies on them was not recorded and is 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrl4aht_data.errors import PublishedFormatError
+from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.layouts import WINDOW, Layout
+from icrl4aht_data.overcooked.observe import fixed_channels, observe
+from icrl4aht_data.overcooked.state import columns, record_size
+
+PADDING = (
+    "views of {rows} x 5 cells, as the published code makes them on this map, were padded to 5 x 5: the row two cells "
+    "below the ego shows the map's fixed cells, and 0 outside of the map; items, pots' contents and timers in it were "
+    "not recorded and are 0"
+)
+"""Description of completed views, for provenance."""
+
+
+def is_short(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
+    """Whether views of this shape have as many rows as the map of a layout, which are fewer than a view has."""
+    return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
+
+
+def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
+    """Return views with all rows.
+
+    Args:
+        layout: the layout.
+        short: uint8 (T, H, 5, C), H rows of the map; the ego is in the third row.
+
+    Returns:
+        uint8 (T, 5, 5, C).
+
+    Raises:
+        PublishedFormatError: without file and group, if a view shows the layout from no cell of the ego's room.
+    """
+    rows = short.shape[1]
+    fixed = fixed_channels(layout)
+    records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
+    records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
+    known = np.asarray(observe(layout, records, EGO))
+    cells = {view[:rows, :, fixed].tobytes(): cell for cell, view in enumerate(known)}
+    at = np.array([cells.get(view.tobytes(), -1) for view in np.ascontiguousarray(short[..., fixed])], np.int64)
+    if (at < 0).any():
+        raise PublishedFormatError(f"step {int(np.argmin(at))} does not show {layout.name} from any cell of the ego's")
+    full = np.zeros((len(short), *layout.obs_shape), np.uint8)
+    full[:, :rows] = short
+    full[:, rows:, :, fixed] = known[at][:, rows:, :, fixed]
+    return full

@@ -1,0 +1,193 @@
+"""The published code's own files: names of families, 4 x 5 views, duplicates, and interrupted conversions to them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError, PublishedFormatError
+from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.schema import PROVENANCE
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.observe import fixed_channels, observe
+from icrl4aht_data.overcooked.state import columns, record_size
+from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.published_views import complete_views
+from tests.helpers.published_files import KEPT
+from tests.helpers.random_releases import random_release
+
+CRAMPED = [layout for layout in LAYOUTS.values() if layout.height < 5]
+
+
+def relabel(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:
+    """Copy published files with changed index lines."""
+    shutil.copytree(source, target)
+    path = target / "histories_index.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for number, change in changes.items():
+        lines[number].update(change)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return target
+
+
+@pytest.mark.parametrize(
+    ("family", "kind", "expected"),
+    [
+        ("ippo", "rl", ("rl", "ippo")),
+        ("fcp", "rl", ("rl", "fcp")),
+        ("BRDiv", "rl", ("rl", "brdiv")),
+        ("utility_greedy", "heuristic", ("H4", "utility_greedy")),
+        ("recipe_aware", "heuristic", ("H1", "recipe_aware_button")),
+        ("H2", "heuristic", ("H2", "territory")),
+        ("rl", "fcp", ("rl", "fcp")),
+        ("H2", "some_variant", ("H2", "some_variant")),
+    ],
+)
+def test_names_of_the_published_code(published_folder, tmp_path, family, kind, expected):
+    names = {"teammate_family": family, "teammate_kind": kind}
+    files = relabel(published_folder[0], tmp_path / "files", {2: names})
+    from_published(files, tmp_path / "out", kept_steps=KEPT)
+    (entry,) = load_icrl4aht(tmp_path / "out", layout="coord_simple").entries
+    assert (entry.teammate_family, entry.teammate_kind) == expected
+    notes = read_provenance(tmp_path / "out" / PROVENANCE)[entry.task_id].other
+    assert notes == ({"published": names} if (family, kind) != expected else {})
+    assert verify_release(tmp_path / "out", level="deep").ok
+
+
+def test_other_names_are_mapped_by_hand(published_folder, tmp_path):
+    names = {"teammate_family": "my_pbt", "teammate_kind": "rl"}
+    files = relabel(published_folder[0], tmp_path / "files", {2: names})
+    command = ["convert", str(files), "--kept-steps", str(KEPT), "--out", str(tmp_path / "out")]
+    error = CliRunner().invoke(cli, command).exception
+    assert isinstance(error, PublishedFormatError) and "line 3" in str(error)
+    assert "unknown teammate_family 'my_pbt'" in str(error) and "--family-map my_pbt=NEW" in str(error)
+    done = CliRunner().invoke(cli, [*command, "--family-map", "my_pbt=comedi"], catch_exceptions=False)
+    assert done.exit_code == 0
+    (entry,) = load_icrl4aht(tmp_path / "out", layout="coord_simple").entries
+    assert (entry.teammate_family, entry.teammate_kind) == ("rl", "comedi")
+    for wrong, message in {
+        "my_pbt": "expected OLD=NEW",
+        "my_pbt=H9": "unknown family or kind of teammates 'H9'",
+    }.items():
+        assert message in str(CliRunner().invoke(cli, [*command, "--family-map", wrong]).exception)
+
+
+def test_a_kind_that_contradicts_the_family(published_folder, tmp_path):
+    names = {"teammate_family": "ippo", "teammate_kind": "heuristic"}
+    files = relabel(published_folder[0], tmp_path / "files", {2: names})
+    with pytest.raises(PublishedFormatError, match="line 3: teammate_kind 'heuristic', but teammate_family 'ippo'"):
+        from_published(files, tmp_path / "out", kept_steps=KEPT)
+
+
+@pytest.fixture(scope="module")
+def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
+    """Files with 4 x 5 views of cramped_up, what was played, and the complete views. Read only."""
+    folder = tmp_path_factory.mktemp("short")
+    written = random_release(folder / "release", layouts=("cramped_up",), teammates=1, streams=2)
+    dataset = load_icrl4aht(folder / "release", obs="uint8")
+    to_published(dataset, folder / "files", states=False)
+    complete = np.stack([history.obs[:] for history in dataset])
+    with h5py.File(folder / "files" / "histories.h5", "r+") as file:
+        for name, group in file.items():
+            del group["obs"]
+            group["obs"] = complete[int(name)][:, :4].astype("f4")
+    path = folder / "files" / "histories_index.jsonl"
+    path.write_text(path.read_text().replace("[5, 5, 35]", "[4, 5, 35]"))
+    (folder / "files" / "files.sha256").unlink()
+    return folder / "files", written, complete
+
+
+def test_short_views_are_completed(short_views, tmp_path):
+    files, written, complete = short_views
+    assert from_published(files, tmp_path / "out", kept_steps=20) == "observations"
+    dataset = load_icrl4aht(tmp_path / "out", obs="uint8")
+    found = np.stack([history.obs[:] for history in dataset])
+    assert found.shape == complete.shape == (2, 120, 5, 5, 35)
+    np.testing.assert_array_equal(found[:, :, :4], complete[:, :, :4])
+    fixed = fixed_channels(get_layout("cramped_up"))
+    np.testing.assert_array_equal(found[..., fixed], complete[..., fixed])
+    outside = ~complete[:, :, 4, :, fixed].any(axis=(-2, -1))  # the ego is in the lower row
+    assert 0.1 < outside.mean() < 0.9
+    assert not found[:, :, 4][outside].any() and not complete[:, :, 4][outside].any()
+    np.testing.assert_array_equal(dataset[1].actions[:], written[1]["actions"])
+    (of_task,) = read_provenance(tmp_path / "out" / PROVENANCE).values()
+    assert of_task.other["published"]["obs_shape"] == [4, 5, 35]
+    assert "padded to 5 x 5" in of_task.other["published"]["padding"]
+    assert verify_release(tmp_path / "out", level="deep").ok
+
+
+@pytest.mark.parametrize("layout", CRAMPED, ids=lambda layout: layout.name)
+def test_every_cell_of_a_cramped_map_is_told_by_its_short_view(layout):
+    records = np.zeros((len(layout.rooms[0]), record_size(layout)), np.uint8)
+    records[:, columns(layout).positions] = layout.rooms[0][:, None]
+    views = np.asarray(observe(layout, records, 0))
+    views[..., : fixed_channels(layout).start] = 0
+    assert len({view[:4].tobytes() for view in views}) == len(views)
+    np.testing.assert_array_equal(complete_views(layout, views[:, :4]), views)
+
+
+def test_short_views_of_nothing_are_refused(short_views, tmp_path):
+    shutil.copytree(short_views[0], tmp_path / "files")
+    with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+        stored: Any = file["/1/obs"]
+        stored[7] = 0
+    with pytest.raises(PublishedFormatError, match="group /1: obs: step 7 does not show cramped_up from any cell"):
+        from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
+
+
+def test_duplicates_are_refused(published_folder, tmp_path):
+    cases = {
+        "line 2: group '0' is already that of line 1": {1: {"h5_group": "0"}},
+        "line 2: stream 10 of task 'task_a' is already that of line 1": {1: {"env_idx": 10}},
+        "line 2: field 'env_idx'": {1: {"env_idx": -1}},
+    }
+    for number, (message, changes) in enumerate(cases.items()):
+        files = relabel(published_folder[0], tmp_path / str(number), changes)
+        with pytest.raises(PublishedFormatError, match=message):
+            from_published(files, tmp_path / "out", kept_steps=KEPT)
+
+
+@pytest.mark.parametrize("link", [True, False])
+def test_a_history_twice_is_refused(lite, tmp_path, link):
+    to_published(load_icrl4aht(lite[0]), tmp_path / "files")
+    with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+        del file["/1"]
+        if link:
+            file["/1"] = file["/0"]
+        else:
+            file.copy("/0", "/1")
+    with pytest.raises(PublishedFormatError, match="group /1: has the content of group /0, of the same task"):
+        from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_rerun_of_an_interrupted_conversion(lite, tmp_path):
+    dataset, out = load_icrl4aht(lite[0]), tmp_path / "out"
+    to_published(dataset, out)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    to_published(dataset, out)  # interrupted after its end
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    with pytest.raises(OptionError, match="exists with other files; give another folder, or replace it by --overwrite"):
+        to_published(dataset.filter(layout="demo_wide"), out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    shutil.rmtree(out)
+    partial = tmp_path / ".out.partial"  # interrupted in the middle, by this version or by one without locks
+    partial.mkdir()
+    (partial / "histories.h5").write_bytes(before["histories.h5"][:1000])
+    to_published(dataset, out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    to_published(dataset.filter(layout="demo_wide"), out, overwrite=True)
+    assert (out / "histories_index.jsonl").read_bytes() != before["histories_index.jsonl"]
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(OptionError, match=r"has notes\.txt, which its files\.sha256 does not list"):
+        to_published(dataset, out, overwrite=True)
