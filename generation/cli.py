@@ -186,7 +186,7 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
     from generation.planning.plan import estimate_cost
     from generation.profiles import load_profile
 
-    with bars(edges=True) as show:
+    with bars() as show:
         profile = load_profile(profile_name).with_ego(ego)
         cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, f": {what}"))
     if as_json:

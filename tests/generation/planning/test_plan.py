@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from functools import cache
 from typing import Any, cast
@@ -15,6 +16,7 @@ from generation.cli import cli
 from generation.planning import plan
 from generation.profiles import load_profile
 from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.utils.progress import LineProgress
 from tests.helpers.tiny import LEARNED, artefact
 
 
@@ -40,11 +42,12 @@ def test_the_papers_numbers(measured):
     assert (found.tasks, found.environment_steps) == (640, 640 * steps)
     assert found.kept_transitions == 640 * 128 * 146 * 100
     population = 457 * 256 * 256 * 10
-    assert (found.populations, found.teammate_steps) == (32, 32 * population)
-    hours, teammate_hours = (steps / 100_000 + 36) / 3600, (population / 50_000 + 36) / 3600
-    assert found.teammate_hours_on_one == pytest.approx(32 * teammate_hours, abs=0.01)
-    assert found.hours_on_one == pytest.approx(640 * hours + 32 * teammate_hours, abs=0.01)
-    assert found.hours_on_devices == pytest.approx(40 * hours + 32 * teammate_hours, abs=0.01)
+    more = 457 * 256 * 256  # CoMeDi's first policy, which is no member
+    assert (found.populations, found.teammate_steps) == (32, 32 * population + 8 * more)
+    hours, teammate_hours = (steps / 100_000 + 36) / 3600, (found.teammate_steps / 50_000 + 32 * 36) / 3600
+    assert found.teammate_hours_on_one == pytest.approx(teammate_hours, abs=0.01)
+    assert found.hours_on_one == pytest.approx(640 * hours + teammate_hours, abs=0.01)
+    assert found.hours_on_devices == pytest.approx(40 * hours + teammate_hours, abs=0.01)
     assert 1 < found.lite_bytes / found.kept_transitions < 3 < found.full_bytes / found.kept_transitions < 12
 
 
@@ -61,6 +64,19 @@ def test_the_command(measured):
         assert expected in result.output
     found = json.loads(CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--json"]).output)
     assert (found["profile"], found["tasks"], found["devices"]) == ("smoke", 2, 8)
+
+
+def test_a_long_measurement_prints_lines_on_stderr(measured, monkeypatch):
+    def slow(config, make):
+        time.sleep(0.2)
+        return plan.LearnerSpeed(100_000.0, 36.0)
+
+    monkeypatch.setitem(LineProgress.__init__.__kwdefaults__, "interval", 0.05)
+    monkeypatch.setattr(plan, "calibrate", slow)
+    result = CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--json"])
+    assert json.loads(result.stdout)["tasks"] == 2
+    line = "planning: measuring how fast egos learn: 0 of 3 (0 %) after 0 s, time left unknown"
+    assert line in result.stderr.splitlines()
 
 
 def test_the_command_counts_learned_teammates(measured):
