@@ -219,8 +219,9 @@ class Selection:
         columns: dict[str, Any] = {}
         for name, hint in ENTRY_HINTS.items():
             if hint is str:
-                codes = pandas.Categorical.from_codes(self.column_codes(name), self.index.values(name))
-                columns[name] = codes.remove_unused_categories()
+                names = pandas.Index(self.index.values(name))
+                named = pandas.Categorical.from_codes(self.column_codes(name), names)
+                columns[name] = named.remove_unused_categories()
             elif hint == int | None:
                 numbers = self.column(name)
                 columns[name] = pandas.arrays.IntegerArray(numbers, numbers == -1)

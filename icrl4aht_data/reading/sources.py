@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.cached_arrays import cache_room, cached_arrays, new_mapped_array
-from icrl4aht_data.utils.memory import free_memory
+from icrl4aht_data.utils.memory import free_memory, gigabytes
 from icrl4aht_data.utils.threads import in_slices
 
 CacheMode = Literal["auto", "ram", "mmap", "stream"]
@@ -82,17 +82,13 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
         return CacheChoice(cache, "as the option says")
     memory = free_memory()
     if size <= memory // 2:
-        return CacheChoice("ram", f"{_gigabytes(size)} decoded, {_gigabytes(memory)} of memory free")
+        return CacheChoice("ram", f"{gigabytes(size)} decoded, {gigabytes(memory)} of memory free")
     room = cache_room()
     if size <= room:
         return CacheChoice(
-            "mmap", f"{_gigabytes(size)} decoded, more than half of the {_gigabytes(memory)} of memory free"
+            "mmap", f"{gigabytes(size)} decoded, more than half of the {gigabytes(memory)} of memory free"
         )
-    return CacheChoice("stream", f"{_gigabytes(size)} decoded, room for {_gigabytes(room)} in the cache folder")
-
-
-def _gigabytes(size: int) -> str:
-    return f"{size / 1e9:.3g} GB"
+    return CacheChoice("stream", f"{gigabytes(size)} decoded, room for {gigabytes(room)} in the cache folder")
 
 
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:

@@ -117,6 +117,13 @@ def test_filter_by_what_the_labels_earn(measured):
             load_icrl4aht(measured, min_expert_return=wrong)  # type: ignore[arg-type]
 
 
+def test_a_history_names_what_its_labels_earn(measured):
+    dataset = load_icrl4aht(measured)
+    assert "labels 9.5)" in repr(dataset[0])
+    assert "labels -30.0, source search)" in repr(dataset[4])
+    assert "labels" not in repr(dataset[6])
+
+
 def test_a_release_without_returns_refuses_the_filter(lite):
     with pytest.raises(NotStoredError, match=r"12 of 12 histories .*Leave out min_expert_return$"):
         load_icrl4aht(lite[0], min_expert_return=0.0)
