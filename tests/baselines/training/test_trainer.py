@@ -10,7 +10,6 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from baselines.methods.registry import get_method
 from baselines.training.histories import hold_out, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS
-from baselines.training.stopping import TrainingStopped
+from baselines.training.stopping import StopSignals, TrainingStopped
 from baselines.training.trainer import (
     Trainer,
     TrainingData,
@@ -161,14 +160,10 @@ class TestResume:
             train(method, TrainingData(Rows(), {}), other, through[0], {})
 
 
-def send(*numbers: int) -> Callable[[int, float], None]:
-    """Return a progress callback that sends signals to this process at step 4, which is logged but not a checkpoint."""
-
-    def done(step: int, loss: float) -> None:
-        for number in numbers if step == 4 else ():
-            os.kill(os.getpid(), number)
-
-    return done
+def terminate_at_4(step: int, loss: float | None) -> None:
+    """Progress callback that stops the training at a step that is logged but not a checkpoint."""
+    if step == 4:
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 class TestStopping:
@@ -177,30 +172,31 @@ class TestStopping:
             trained(tmp_path, die_at=5, save_minutes=1e-9)
         assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without, step 3 alone
 
-    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-    def test_a_signal_saves_and_the_run_resumes_to_the_same_bits(self, through, tmp_path, number, code):
-        with pytest.raises(
-            TrainingStopped, match=f"stopped by {number.name} after step 4 of 7.* resumes it"
-        ) as stopped:
-            trained(tmp_path, done=send(number))
-        assert stopped.value.code == code
+    def test_a_signal_saves_and_the_run_resumes_to_the_same_bits(self, through, tmp_path):
+        with pytest.raises(TrainingStopped, match=r"stopped by SIGTERM after step 4 of 7.* resumes it") as stopped:
+            trained(tmp_path, done=terminate_at_4)
+        assert stopped.value.code == 143
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 4
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
         assert_same(trained(tmp_path), through[1])
         for name in ("metrics.jsonl", "config.json"):
             assert (tmp_path / name).read_bytes() == (through[0] / name).read_bytes()
 
-    def test_a_second_signal_does_not_wait(self, tmp_path):
+    def test_a_second_signal_does_not_wait(self):
         before = signal.getsignal(signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path, done=send(signal.SIGINT, signal.SIGINT))
-        assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
+        with pytest.raises(KeyboardInterrupt), StopSignals() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert TrainingStopped(stop.received, "").code == 130
+            os.kill(os.getpid(), signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is before
-        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
-    def test_signals_cannot_be_noted_in_another_thread(self, through, tmp_path):
-        """There the training runs as ever."""
+    def test_signals_are_not_noted_in_another_thread(self):
+        def other_thread() -> Any:
+            with StopSignals():
+                return signal.getsignal(signal.SIGINT)
+
         with ThreadPoolExecutor(1) as pool:
-            assert_same(pool.submit(trained, tmp_path).result(), through[1])
+            assert pool.submit(other_thread).result() is signal.getsignal(signal.SIGINT)
 
     def test_processes_agree(self, monkeypatch):
         def agreed(*every_process: tuple[int, int]) -> tuple[bool, int]:
