@@ -146,7 +146,7 @@ def check_experts(index: Index, report: Report) -> None:
     """
     try:
         provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
-    except Icrl4ahtError:  # reported by `check_index`
+    except Icrl4ahtError:  # reported by `check_provenance`
         return
     for task_id, of_task in provenance.items():
         if of_task.expert is None:
