@@ -37,11 +37,11 @@ def stored(tmp_path_factory) -> Path:
 
 
 def row_of(data: bytes, version: int = 3) -> np.void:
-    row = np.zeros((), CHUNK_DTYPES[version])
+    row = np.zeros(1, CHUNK_DTYPES[version])[0]
     row["size"], row["rows"], row["crc32"] = len(data), 1, zlib.crc32(data)
     if version == 3:
         row["hash"] = np.frombuffer(chunk_hash(data), np.uint8)
-    return row[()]
+    return row
 
 
 def actions_row(root: Path) -> tuple[np.void, int]:
