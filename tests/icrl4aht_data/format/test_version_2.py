@@ -98,6 +98,7 @@ def test_chunk_tables_have_the_version_of_the_release(lite, old, tmp_path, versi
     """So that nobody can pass off tables without hashes as those of a release that has them."""
     root = shutil.copytree(lite[0] if version == 3 else old, tmp_path / "release")
     shutil.copyfile(chunk_table_path(old if version == 3 else lite[0], SHARD), chunk_table_path(root, SHARD))
+    write_manifest(root)
     with pytest.raises(ChunkTableError, match=f"the chunk table is not of format version {version}; fetch meta/ again"):
         load_icrl4aht(root)[0].actions[:]
     assert any("not of format version" in finding.problem for finding in verify_release(root).findings)
@@ -113,5 +114,6 @@ def test_versions_of_shards_are_compared(lite, old, tmp_path):
 def test_the_info_may_not_say_another_version(old, tmp_path):
     root = shutil.copytree(old, tmp_path / "release")
     (root / INFO).write_text((root / INFO).read_text().replace('"format_version": 2', '"format_version": 3'))
+    write_manifest(root)
     with pytest.raises(ChunkTableError, match="not of format version 3"):
         load_icrl4aht(root)[0].actions[:]
