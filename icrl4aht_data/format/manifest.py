@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
-from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
+from icrl4aht_data.format.schema import EXPERTS, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
 from icrl4aht_data.utils.files import atomic_write, plain_size, read_text, wrap_read_errors
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import LARGEST, is_inside, resolve_inside
@@ -30,7 +30,7 @@ _KNOWN = re.compile(
             r"meta/(info\.json|histories\.jsonl|tasks\.jsonl|provenance\.json|source_card\.md)",
             rf"data/{_NAME}/{_NAME}/{_NAME}\.h5",
             rf"meta/chunks/{_NAME}/{_NAME}/{_NAME}\.npy",
-            rf"({TEAMMATES}|experts)/[0-9a-f]{{64}}/(policy\.json|policy\.safetensors|README\.md)",
+            rf"({TEAMMATES}|{EXPERTS})/[0-9a-f]{{64}}/(policy\.json|policy\.safetensors|README\.md)",
             rf"figures/{_NAME}\.(png|svg)",
             rf"index/{_NAME}/{_NAME}\.parquet",
         )
