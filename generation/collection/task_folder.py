@@ -34,7 +34,7 @@ from generation.learners.network import ActorCritic
 from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import DiskFullError
+from icrl4aht_data.errors import DiskFullError, IndexFormatError
 from icrl4aht_data.utils.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
