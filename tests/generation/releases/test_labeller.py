@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -138,7 +139,8 @@ def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
     @jax.jit
     def step(state, hidden, memory, key):
         obs = observe(chosen.layout, state.record, EGO)[None]
-        hidden, logits, _ = network.apply(params, hidden, obs, np.zeros((1, LABEL_EPISODES), bool))
+        result: Any = network.apply(params, hidden, obs, np.zeros((1, LABEL_EPISODES), bool))
+        hidden, logits, _ = result
         keys = jax.random.split(key, LABEL_EPISODES)
         action, memory = jax.vmap(mate.act, (None, 0, 0, 0))(mate.params, memory, state.record, keys)
         result = env.step(state, jnp.stack([logits[0].argmax(-1), action], axis=-1))
@@ -161,7 +163,8 @@ def test_index_provenance_and_card_state_the_labeller(built):
     found = measured(artefact(built / "a"))
     greedy, sampled = np.mean(found["greedy"], axis=1), np.mean(found["sampled"], axis=1)
     number = choose_checkpoint(np.array(found["greedy"]))
-    for entry in load_icrl4aht(root).entries:
+    entry, *others = load_icrl4aht(root).entries
+    for entry in (entry, *others):
         assert (entry.expert_return, entry.expert_return_sampled) == (greedy[number], sampled[number])
         assert entry.expert_step == 3_200 * (number + 1)
     (of_task,) = read_provenance(root / "meta/provenance.json").values()
