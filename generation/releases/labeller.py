@@ -23,6 +23,7 @@ from generation.collection.task import TEAMMATE_NOISE
 from generation.collection.task_folder import LABELLER_RETURNS, METADATA, checkpoint_path
 from generation.env import Environment
 from generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
+from generation.learners.config import Widths
 from generation.learners.network import ActorCritic
 from generation.learners.resume import software_versions
 from generation.learners.rollout import init_rollout, network_player, policy_player, roll_out
@@ -138,20 +139,20 @@ def _measure(checkpoints: list[Path], task: Task, suite: Path) -> dict[str, np.n
     measured: dict[str, list[np.ndarray]] = {"greedy": [], "sampled": []}
     for path in checkpoints:
         network, params, _ = load_policy(path)
-        play = _compiled(task.layout, network, teammate._replace(params=()))
+        play = _compiled(task.layout, network.widths, teammate._replace(params=()))
         for way, returns in measured.items():
             returns.append(np.asarray(play(params, way == "greedy", teammate.params, key), np.float64))
     return {way: np.stack(returns) for way, returns in measured.items()}
 
 
 @lru_cache(maxsize=8)
-def _compiled(layout: Layout, network: ActorCritic, teammate: Policy) -> Callable[..., jax.Array]:
+def _compiled(layout: Layout, widths: Widths, teammate: Policy) -> Callable[..., jax.Array]:
     """A function of the ego's parameters, whether it acts greedily, the teammate's parameters and a key.
 
     It returns the returns, float32 (LABEL_EPISODES,), of the first `KEPT_STEPS` steps of episodes, which are the same
     ones for all egos. One compilation serves all teammates of one family on one layout.
     """
-    env, n = Environment(layout, KEPT_STEPS), LABEL_EPISODES
+    env, network, n = Environment(layout, KEPT_STEPS), ActorCritic(widths), LABEL_EPISODES
 
     @jax.jit
     def play(params: Any, greedy: Any, teammate_params: Any, key: jax.Array) -> jax.Array:

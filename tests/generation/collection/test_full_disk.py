@@ -6,9 +6,9 @@ import errno
 import json
 import os
 import shutil
-from collections import namedtuple
 from io import StringIO
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -21,13 +21,19 @@ from generation.collection.options import CollectOptions
 from generation.collection.record import array_shapes
 from generation.collection.run import collect_tasks
 from generation.collection.task import run_task
-from generation.collection.task_folder import ArtefactWriter, DiskFullError, partial_folder
-from generation.learners.resume import RunLog
+from generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
+from generation.learners.resume import RunLog, StateFile
 from generation.profiles import load_profile
 from tests.helpers.tiny import artefact, start
 from tests.robustness.limits import can_mount, file_size_limit
 
-Usage = namedtuple("Usage", "total used free")
+
+class Usage(NamedTuple):
+    """Sizes of a disk in bytes."""
+
+    total: int
+    used: int
+    free: int
 
 
 @pytest.fixture
@@ -65,6 +71,16 @@ def test_a_limit_that_only_the_allocation_meets_leaves_nothing(task, tmp_path):
     with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
         run_task(*task, tmp_path / "task", never)
     assert not partial_folder(tmp_path / "task").exists()
+
+
+def test_a_disk_that_fills_up_keeps_what_can_be_resumed(task, tmp_path):
+    def fill(update, metrics):
+        if update == 6:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(DiskFullError, match="task: the disk is full: this task needs "):
+        run_task(*task, tmp_path / "task", fill, save_seconds=0)
+    assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 6
 
 
 def test_a_log_on_a_full_disk_is_an_error_once(tmp_path):

@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -138,7 +139,8 @@ def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
     @jax.jit
     def step(state, hidden, memory, key):
         obs = observe(chosen.layout, state.record, EGO)[None]
-        hidden, logits, _ = network.apply(params, hidden, obs, np.zeros((1, LABEL_EPISODES), bool))
+        result: Any = network.apply(params, hidden, obs, np.zeros((1, LABEL_EPISODES), bool))
+        hidden, logits, _ = result
         keys = jax.random.split(key, LABEL_EPISODES)
         action, memory = jax.vmap(mate.act, (None, 0, 0, 0))(mate.params, memory, state.record, keys)
         result = env.step(state, jnp.stack([logits[0].argmax(-1), action], axis=-1))
@@ -161,9 +163,10 @@ def test_index_provenance_and_card_state_the_labeller(built):
     found = measured(artefact(built / "a"))
     greedy, sampled = np.mean(found["greedy"], axis=1), np.mean(found["sampled"], axis=1)
     number = choose_checkpoint(np.array(found["greedy"]))
+    step = 3_200 * (number + 1)
     for entry in load_icrl4aht(root).entries:
         assert (entry.expert_return, entry.expert_return_sampled) == (greedy[number], sampled[number])
-        assert entry.expert_step == 3_200 * (number + 1)
+        assert entry.expert_step == step
     (of_task,) = read_provenance(root / "meta/provenance.json").values()
     expert = of_task.expert
     assert expert is not None
@@ -172,7 +175,7 @@ def test_index_provenance_and_card_state_the_labeller(built):
     assert expert.policy_sha256 == file_hash(artefact(built / "a") / f"checkpoints/c{number}/policy.safetensors")
     card = (root / "README.md").read_text()
     assert "## Labels" in card
-    assert f"| demo_wide | train | utility_greedy/t0 | {entry.expert_step:,} | {greedy[number]:.1f} |" in card
+    assert f"| demo_wide | train | utility_greedy/t0 | {step:,} | {greedy[number]:.1f} |" in card
 
 
 def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):

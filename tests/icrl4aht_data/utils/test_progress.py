@@ -135,6 +135,7 @@ def test_bars_of_commands_have_lines_on_stderr(monkeypatch, capsys):
     monkeypatch.setitem(LineProgress.__init__.__kwdefaults__, "interval", 0.02)
     with options.bars(of_bytes=True) as show:
         show("download", 3_000_000, 10_000_000)
+        printed = ""
         for _ in range(500):
             time.sleep(0.01)
             if "\n" in (printed := capsys.readouterr().err):
