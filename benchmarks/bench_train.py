@@ -78,6 +78,7 @@ def _window(group: Any, start: int, length: int) -> dict[str, np.ndarray]:
         "target_actions": actions[1:],
         "dones": group["dones"][start : start + length].astype(bool),
         "attention_mask": np.ones(length, bool),
+        "is_first": np.arange(start, start + length) == 0,
     }
 
 
