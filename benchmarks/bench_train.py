@@ -79,7 +79,7 @@ def _window(group: Any, start: int, length: int) -> dict[str, np.ndarray]:
         "target_actions": actions[1:],
         "dones": group["dones"][start : start + length].astype(bool),
         "attention_mask": np.ones(length, bool),
-        "is_first": start + np.arange(length) == 0,
+        "is_first": np.arange(start, start + length) == 0,
     }
 
 

@@ -204,8 +204,6 @@ def filter_options(command: Any) -> Any:
         click.option(
             "--teammate-kind", multiple=True, metavar="KIND", help="Only this kind, such as utility_greedy or fcp."
         ),
-        click.option("--algorithm", multiple=True, metavar="KIND", help="The same as --teammate-kind."),
-        click.option("--source", multiple=True, metavar="NAME", help="Only histories made this way, such as ppo."),
     ]
     for option in reversed(options):
         command = option(command)
