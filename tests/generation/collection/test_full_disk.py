@@ -23,9 +23,12 @@ from generation.collection.run import collect_tasks
 from generation.collection.task import run_task
 from generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
 from generation.learners.resume import RunLog, StateFile
-from generation.profiles import load_profile
+from generation.profiles import Profile, load_profile
+from icrl4aht_data.benchmark.tasks import Task
 from tests.helpers.tiny import artefact, start
 from tests.robustness.limits import can_mount, file_size_limit
+
+Given = tuple[Task, Profile]
 
 
 class Usage(NamedTuple):
@@ -46,7 +49,7 @@ def never(update, metrics):
     raise AssertionError("the task was started")
 
 
-def test_free_space_is_checked_before_the_work(task, tmp_path, monkeypatch):
+def test_free_space_is_checked_before_the_work(task: Given, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 5_000))
     folder = tmp_path / "task"
     message = rf"^{folder}: the disk is full: this task needs [\d,]{{6,}} bytes, 5,000 are free; .* another --out$"
@@ -55,7 +58,7 @@ def test_free_space_is_checked_before_the_work(task, tmp_path, monkeypatch):
     assert not [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")]
 
 
-def test_arrays_are_allocated_not_sparse(task, tmp_path):
+def test_arrays_are_allocated_not_sparse(task: Given, tmp_path):
     writer = ArtefactWriter(tmp_path, task[0], task[1].ego, 0)
     writer.close()
     for name, (shape, dtype) in array_shapes(task[0].layout, task[1].ego).items():
@@ -67,13 +70,13 @@ def test_arrays_are_allocated_not_sparse(task, tmp_path):
         assert path.read_bytes() == (tmp_path / "saved.npy").read_bytes()
 
 
-def test_a_limit_that_only_the_allocation_meets_leaves_nothing(task, tmp_path):
+def test_a_limit_that_only_the_allocation_meets_leaves_nothing(task: Given, tmp_path):
     with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
         run_task(*task, tmp_path / "task", never)
     assert not partial_folder(tmp_path / "task").exists()
 
 
-def test_a_disk_that_fills_up_keeps_what_can_be_resumed(task, tmp_path):
+def test_a_disk_that_fills_up_keeps_what_can_be_resumed(task: Given, tmp_path):
     def fill(update, metrics):
         if update == 6:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -130,7 +133,8 @@ from rich.console import Console
 from generation.collection.job import CollectionError
 from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
-from generation.profiles import load_profile
+from generation.profiles import Profile, load_profile
+from icrl4aht_data.benchmark.tasks import Task
 from tests.robustness.limits import small_disk
 
 profile = load_profile(sys.argv[1])
