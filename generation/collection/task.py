@@ -152,8 +152,8 @@ def _readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, DiskFullError) as error:
-        if isinstance(error, OSError) and error.errno not in FULL_DISK:
+    except OSError as error:
+        if not isinstance(error, DiskFullError) and error.errno not in FULL_DISK:
             raise
         shown = disk_full(partial, needed)
         if not (partial / LEARNER).exists():

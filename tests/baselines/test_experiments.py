@@ -35,6 +35,7 @@ from generation.learners.network import ActorCritic
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
+from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.random_releases import random_release
@@ -306,6 +307,7 @@ def test_teammates_that_were_trained_with_are_refused(suite, tmp_path):
     (task,) = read_tasks(suite / "manifests" / "layout_heldout.jsonl")
     met = make_task("layout", "train", "cramped_up", task.teammate, 0)
     write_tasks(tmp_path / "meta" / "tasks.jsonl", [met])
+    write_manifest(tmp_path)
     with pytest.raises(OptionError, match=f"has the teammate of {met.task_id} in .*expected teammates that are not"):
         held_out_tasks(suite, "cramped_up", str(tmp_path))
 

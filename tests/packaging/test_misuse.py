@@ -50,11 +50,11 @@ reader: lst | No such command 'lst'. Did you mean 'list'?
 reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 reader: list --split tran | unknown split 'tran'; valid: train, test, heldout. Did you mean 'train'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
-reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, lbrdiv, fcp, brdiv
+reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, fcp
 reader: verify --deeep | No such option
 reader: verify --from x | --from is the source of a repair: give --repair with it
 reader: show --history -1 | -1 is not in the range x>=0
-reader: show --history 184 | this selection has no history [184], ids are within 0..183
+reader: show --history 160 | this selection has no history [160], ids are within 0..159
 reader: show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 reader: show --plot none/curves.png | no folder none: make it first, or give another path
 reader: show --plot empty | 'empty' is a directory

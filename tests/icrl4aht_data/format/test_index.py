@@ -203,7 +203,7 @@ def test_processes_may_build_at_the_same_time(long, folder):
         ({"T": 0}, r"Expected `int` >= 1 - at `\$\.T`"),
         ({"episodes": 99999}, "99999 episodes in"),
         ({"has_teammate_actions": False}, "has_teammate_actions true"),
-        ({"layout": "test_wide"}, "obs_shape|unknown layout of"),
+        ({"layout": "demo_wide"}, "obs_shape|unknown layout of"),
         ({"seed": 2**63}, r"Expected `int` <= 9223372036854775807 - at `\$\.seed`"),
         ({"env_idx": True}, r"Expected `int`, got `bool` - at `\$\.env_idx`"),
         ({"score": "high"}, r"Expected `float`, got `str` - at `\$\.score`"),

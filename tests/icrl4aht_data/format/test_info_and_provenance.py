@@ -28,12 +28,12 @@ def test_unknown_fields_of_a_provenance_are_kept():
 
 
 def test_what_is_known_of_the_expert_is_kept():
-    labels = {"policy_sha256": "ab", "action": "greedy", "step": 7, "return_greedy": 0.0, "return_sampled": 16.9}
+    labels = {"policy_sha256": "ab" * 32, "action": "greedy", "step": 7, "return_greedy": 0.0, "return_sampled": 16.9}
     note = {"xla_threads": 2, "expert": labels | {"episodes": 200, "last_return_greedy": -1.0}}
     found = Provenance.from_json(note)
     assert found.to_json() == note
     assert found.entry_fields() == {"expert_return": 0.0, "expert_return_sampled": 16.9, "expert_step": 7}
-    old = {"expert": {"policy_sha256": "ab", "action": "greedy"}}
+    old = {"expert": {"policy_sha256": "ab" * 32, "action": "greedy"}}
     assert Provenance.from_json(old).to_json() == old
     assert set(Provenance.from_json(old).entry_fields().values()) == {None}
 
@@ -44,8 +44,8 @@ def test_what_is_known_of_the_expert_is_kept():
         ({"seed": "3"}, r"Expected `int \| null`, got `str` - at `\$\.seed`"),
         ({"ego": {"total_steps": 1}}, "missing required field `environments`"),
         ({"streams_recorded": -1}, "Expected `int` >= 0"),
-        ({"xla_threads": -1}, "Expected `int` >= 0"),
-        ({"expert": {"policy_sha256": "", "action": "", "return_greedy": 1e300}}, "Expected `float` <"),
+        ({"xla_threads": 0}, "Expected `int` >= 1"),
+        ({"expert": {"policy_sha256": "0" * 64, "action": "", "return_greedy": 1e300}}, "Expected `float` <"),
         ({"filter": {"before": {}, "after": {}}}, "missing required field `streams`"),
         ([], "an object of objects"),
     ],
