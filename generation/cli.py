@@ -184,10 +184,9 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
     Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
     """
     from generation.planning.plan import estimate_cost
-    from generation.profiles import load_profile
 
     with bars() as show:
-        profile = load_profile(profile_name).with_ego(ego)
+        profile = _profile_with_threads(profile_name, None).with_ego(ego)
         cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, f": {what}"))
     if as_json:
         click.echo(json.dumps(cost.to_json(), indent=2))
@@ -233,10 +232,9 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
     """
     from generation.planning.plan import task_learner
     from generation.planning.speed import learner_speed
-    from generation.profiles import load_profile
 
     name = get_layout(layout).name
-    profile = load_profile(profile_name).with_ego(ego)
+    profile = _profile_with_threads(profile_name, None).with_ego(ego)
     measured = learner_speed(task_learner(replace(profile, layouts=(name,)), profile.ego))
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
 

@@ -28,7 +28,7 @@ from baselines.training.options import SAVE_MINUTES, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
 from baselines.training.stopping import StopSignals, TrainingStopped
 from baselines.training.tensorboard import TensorBoardLog, check_installed
-from generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock
+from generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock, xla_threads
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.sampling.batches import Batches
 
@@ -216,7 +216,8 @@ def train(
         The state after the last step.
 
     Raises:
-        OptionError: if the folder holds a run of other settings, or tensorboardX is required and not installed.
+        OptionError: if the folder holds a run of other settings, or one with another number of XLA threads, which would
+            go on to other bits; if tensorboardX is required and not installed.
         BusyError: if another process trains in the folder.
         TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
     """
@@ -229,7 +230,7 @@ def train(
         if writes:
             stack.enter_context(run_lock(folder))
         open_run(folder, config)
-        checkpoints = Checkpoints(folder / CHECKPOINTS, config)
+        checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
         state = trainer.init() if checkpoints.latest is None else checkpoints.load(trainer.state_like())[0]
         first = int(state.step)
         log = stack.enter_context(RunLog(folder, lambda line: line["step"] <= first))

@@ -221,7 +221,7 @@ class ArtefactWriter:
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Keep the ego after so many updates, if it is one of `checkpoint_updates`; on the disk when this returns.
 
-        Call before the state after these updates is saved, so that a resumed task never lacks a checkpoint.
+        Call before the state after these updates is saved, so that a resumed task has all checkpoints.
         """
         moments = checkpoint_updates(self._config)
         if updates in moments:

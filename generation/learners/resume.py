@@ -55,8 +55,8 @@ def xla_threads() -> int | None:
     if jax.default_backend() != "cpu":
         return None
     for name in _XLA_THREADS:
-        if os.environ.get(name, "").isdecimal():
-            return max(1, int(os.environ[name]))
+        with suppress(ValueError):  # XLA ignores what is no number
+            return max(1, int(os.environ.get(name, "")))
     return len(os.sched_getaffinity(0))
 
 
@@ -76,7 +76,7 @@ def limit_xla_threads(threads: int) -> None:
 
 
 def software_versions() -> dict[str, str | int | None]:
-    """What must agree for a resumed training to reach the bits of an uninterrupted one, apart from its settings."""
+    """Versions and threads that a resumed training needs to reach the bits of an uninterrupted one."""
     return {
         "jax": jax.__version__,
         "platform": jax.default_backend(),

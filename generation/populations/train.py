@@ -108,6 +108,7 @@ class PopulationRun:
             "layout": self.layout.name,
             "algorithm": self.algorithm,
             "members": self.members,
+            "policies": self.members + (self.algorithm == "comedi"),
             "config": asdict(self.config),
             "seed": self.seed,
             "code_version": version("icrl4aht-data"),
@@ -348,6 +349,15 @@ class SuiteCheckpoint:
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
     """Returns whether a suite has this population and it is finished."""
     return (suite / layout / algorithm / POPULATION).is_file()
+
+
+def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
+    """Number of XLA threads that trained a suite's population; None if the suite does not say."""
+    try:
+        content = json.loads((suite / layout / algorithm / POPULATION).read_text(encoding="utf-8"))
+        return content["software"]["xla_threads"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:

@@ -16,6 +16,7 @@ from generation.collection.task import TEAMMATE_NOISE
 from generation.collection.task_folder import FILTER_CURVES, METADATA
 from generation.learners.checkpoint import load_policy
 from generation.populations.select import THRESHOLD
+from generation.populations.train import population_threads
 from generation.profiles import Profile
 from generation.releases.labeller import choose_labeller
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
@@ -79,6 +80,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         train=profile.teammates.train,
         total_steps=profile.teammates.ppo.total_steps,
         threshold=THRESHOLD,
+        xla_threads=population_threads(suite, task.layout.name, task.teammate_kind),
     )
     provenance = Provenance(
         profile=metadata["profile"],

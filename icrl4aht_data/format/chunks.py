@@ -132,7 +132,7 @@ def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
         itemsize: bytes of one element; 1 where the shuffle filter was not used.
 
     Raises:
-        ValueError: if the data does not inflate to exactly `size` bytes, or goes on behind the end of the stream.
+        ValueError: if the data does not inflate to exactly `size` bytes, or continues after the end of the stream.
     """
     inflater = zlib.decompressobj()
     try:

@@ -83,6 +83,8 @@ class TeammateSuite:
         train: training teammates wanted per population.
         total_steps: environment steps of each member's training.
         threshold: self-play return that a checkpoint has to exceed.
+        xla_threads: threads of one operation on the CPU that trained them; None on other platforms and where it was not
+            recorded.
     """
 
     algorithms: dict[str, list[str]] | list[str]
@@ -91,6 +93,7 @@ class TeammateSuite:
     train: int
     total_steps: int
     threshold: float
+    xla_threads: Annotated[int, Meta(ge=1)] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +150,8 @@ class Provenance:
         content = {name: value for name, value in asdict(self).items() if name != "other" and value is not None}
         if self.expert is not None:
             content["expert"] = self.expert.to_json()
-        if self.suite is not None and self.suite.layouts is None:
-            del content["suite"]["layouts"]
+        if self.suite is not None:
+            content["suite"] = {name: value for name, value in content["suite"].items() if value is not None}
         return content | self.other
 
     @classmethod

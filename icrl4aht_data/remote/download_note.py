@@ -19,7 +19,7 @@ from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_
 
 @dataclass(frozen=True)
 class DownloadNote:
-    """What this user has downloaded into a folder.
+    """Note of a download into a folder, kept outside it.
 
     Args:
         folder: the folder, resolved.

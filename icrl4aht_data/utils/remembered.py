@@ -29,7 +29,7 @@ _COARSE_TICK_NS = 2 * 10**9  # the tick of file systems whose times have no part
 _SMALL = 2**20  # bytes; hashing fewer is faster than looking up their hash
 
 Signature = list[int]
-"""What differs after a change of a file: size, mtime, ctime and inode."""
+"""Properties of a file that differ after a change: size, mtime, ctime and inode."""
 
 
 def remembered_hash(path: Path) -> str:
@@ -109,7 +109,7 @@ def _unsettled_ns(signature: Signature) -> int:
 
 @cache
 def _boot_id() -> str:
-    """What changes when the machine restarts; empty where the system does not say."""
+    """Identifier of the time since the machine started; empty where the system does not say."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""

@@ -384,7 +384,7 @@ def _provenance(release: CardContent) -> list[str]:
         "code_version": "icrl4aht-data",
         "jax_version": "JAX",
         "platform": "platform",
-        "xla_threads": "XLA threads",
+        "xla_threads": "XLA threads of the egos",
     }
     found = {label: ", ".join(map(str, release.distinct(name))) for name, label in labels.items()}
     if versions := [f"{label} {values}" for label, values in found.items() if values]:

@@ -2,7 +2,7 @@
 
 There, a view has only as many rows as the map: 4 x 5 cells on the cramped layouts. It shows the rows from two above the
 agent to one below it; the row two below is missing. Where that row is outside of the map it is 0, as everything outside
-is. Where it is on the map its fixed cells are known (walls, pots, piles), what lies on them was not recorded and is 0.
+is. Where it is on the map its fixed cells are known (walls, pots, piles); items on them were not recorded and are 0.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ _ROWS = {
     "filtered_transitions": "Filtered transitions",
     "history_length": "History length",
     "teammates": "Num. teammates",
-    "independent_teammates": "of these, not checkpoints of one policy",
+    "independent_teammates": "Checkpoints of one policy counted once",
     "steps_per_episode": "Steps per episode",
     "obs_shape": "Obs. shape",
     "actions": "Num. actions",

@@ -100,7 +100,7 @@ def write(tmp_path_factory):
 
 
 class Kind(NamedTuple):
-    """What results can be of."""
+    """Kinds of results."""
 
     tasks: str
     instances: int
