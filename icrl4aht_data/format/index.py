@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,7 +70,7 @@ class Index:
             name = ALIASES.get(given, given)
             if name not in QUERY_FIELDS:
                 raise unknown("filter", given, (*QUERY_FIELDS, *ALIASES))
-            names = [value] if isinstance(value, str) else value
+            names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
             codes = [self._code(name, one, given) for one in names]
             matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], codes)
         if not matching.any():
@@ -88,7 +88,7 @@ class Index:
             name, value: of `QUERY_FIELDS`, and the wanted value.
             given: the field's name in messages.
         """
-        canonical = get_layout(value).name if name == "layout" else value
+        canonical = get_layout(str(value)).name if name == "layout" else value
         code = self.entries.code(name, canonical) if isinstance(canonical, str) else None
         if code is None and name != "layout" and canonical not in _KNOWN_VALUES.get(name, ()):
             raise unknown(given, value, _KNOWN_VALUES.get(name) or self.values(name))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, overload
 import numpy as np
 
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
-from icrl4aht_data.format.index import Index
+from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -190,8 +189,9 @@ class Selection:
         Raises:
             UnknownNameError: if there is no such field; names the nearest one.
         """
-        if name not in ENTRY_HINTS:
-            raise unknown("column", name, ENTRY_HINTS)
+        name = ALIASES.get(name, name) if isinstance(name, str) else name
+        if not isinstance(name, str) or name not in ENTRY_HINTS:
+            raise unknown("column", name, (*ENTRY_HINTS, *ALIASES))
         if name == "history_id":
             return self.ids.astype(np.int64)
         if name == "obs_shape":
@@ -346,13 +346,24 @@ class Selection:
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
         """Return the histories of this selection with these ids, in this order.
 
+        Args:
+            ids: history ids; or bool (H,), such as `ds.column("layout") == "demo_wide"`, True for those to keep.
+
         Raises:
             EmptySelectionError: if no id is given.
             UnknownNameError: for an id that this selection does not have.
+            OptionError: for anything but integers, and for a bool array of another length.
         """
-        if not len(ids):
+        given = np.asarray(ids)
+        if given.dtype == bool and given.ndim == 1:
+            if len(given) != len(self):
+                raise OptionError(f"select: expected a bool for each of {len(self)} histories, found {len(given)}")
+            given = self.ids[given]
+        if not given.size:
             raise EmptySelectionError(f"{self.root}: select was given no history id")
-        chosen = np.array([operator.index(i) for i in ids])
+        if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
+            raise OptionError(f"select: expected a list of history ids, found {given.dtype} of shape {given.shape}")
+        chosen = given.astype(np.int64)
         absent = chosen[~np.isin(chosen, self.ids)]
         if len(absent):
             within = f"{self.ids.min()}..{self.ids.max()}"

@@ -96,7 +96,12 @@ class ADSampler(Sampler[ADBatch]):
         }
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the windows of batch i: history ids and first steps, int64 (B,) each."""
+        """Return the windows of batch i: history ids and first steps, int64 (B,) each.
+
+        Raises:
+            OptionError: if the batch is larger than the free memory.
+        """
+        self._check_memory()
         position, starts, _ = self._draw(i)
         return self.dataset.ids[position].astype(np.int64), starts
 

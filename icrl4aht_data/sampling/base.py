@@ -117,7 +117,10 @@ class Sampler(Generic[B]):
             OptionError: if it is larger than the free memory.
         """
         self._check_memory()
-        return self.batch_type(**{name: np.empty(spec.shape, spec.dtype) for name, spec in self.specs.items()})
+        try:
+            return self.batch_type(**{name: np.empty(spec.shape, spec.dtype) for name, spec in self.specs.items()})
+        except MemoryError as error:  # a limit of the process, or memory that was taken meanwhile
+            raise self._too_large() from error
 
     def batches(
         self, start: int = 0, stop: int | None = None, *, prefetch: int = 2, device: Any = None, reuse: bool = False
@@ -155,16 +158,19 @@ class Sampler(Generic[B]):
         """Check that a batch fits into memory.
 
         Raises:
-            OptionError: names the sizes, and the options that change them.
+            OptionError: see `_too_large`.
         """
-        if fits(self._bytes):
-            return
+        if not fits(self._bytes):
+            raise self._too_large()
+
+    def _too_large(self) -> OptionError:
+        """The error for batches that do not fit into memory; names the sizes, and the options that change them."""
         free, rows = free_memory(), self.local_size
         name, spec = max(self.specs.items(), key=lambda item: array_bytes(item[1].shape, item[1].dtype))
         most = free * rows // self._bytes // 2 * self.process_count  # half of it: the next batch is made meanwhile
         advice = f"take batch_size = {most} or less" if most else f"take a smaller {self.length_option}"
         lighter = ', or obs = "uint8" or "state"' if self.dataset.obs == "float32" else ""
-        raise OptionError(
+        return OptionError(
             f"batch_size = {self.batch_size}, {self.length_option} = {self.length}: a batch takes "
             f"{gigabytes(self._bytes)} of memory ({name} {spec.dtype} {spec.shape} "
             f"{gigabytes(array_bytes(spec.shape, spec.dtype))}), but {gigabytes(free)} are free: {advice}{lighter}"

@@ -149,11 +149,14 @@ def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
         free = ""
         with suppress(OSError):
             free = f", {shutil.disk_usage(folder).free:,} bytes are free"
-        reason = f"has no room for arrays of {size:,} bytes ({error.strerror}{free})"
+        reason = f"has no room for arrays of {size:,} bytes ({error.strerror}{free}); free some space there"
+    elif os.path.lexists(folder) and not folder.is_dir():
+        reason = "is a file, expected a folder; move it away"
     else:
-        reason = f"cannot be used: {error.strerror or error}"
+        where = f" ({error.filename})" if error.filename not in (None, str(folder)) else ""
+        reason = f"cannot be used: {error.strerror or error}{where}; check its permissions and content"
     return CacheError(
-        f"{folder}: the cache folder {reason}; free some space there, set {CACHE_VARIABLES[0]} to another folder, or "
+        f"{folder}: the cache folder {reason}, set {CACHE_VARIABLES[0]} to another folder, or "
         f'take cache="ram" or cache="stream"'
     )
 
@@ -172,7 +175,7 @@ def _cached_sets(folder: Path) -> list[tuple[Path, int]]:
     found = []
     for path in folder.iterdir():
         if _KEY.fullmatch(path.name) and path.is_dir():
-            with suppress(FileNotFoundError):
+            with suppress(OSError):  # removed meanwhile, or damaged: then it is no finished set
                 size = sum(file.stat().st_size for file in path.glob("*.npy"))
                 found.append((path.stat().st_mtime_ns, path, size))
     return [(path, size) for _, path, size in sorted(found)]

@@ -49,7 +49,7 @@ def gigabytes(size: int) -> str:
 
 
 def free_memory() -> int:
-    """Bytes that this process may still allocate: the machine's, or its control group's if those are fewer."""
+    """Bytes that this process may still allocate on this machine, in its control group, and by its own limit."""
     free = []
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
@@ -58,6 +58,13 @@ def free_memory() -> int:
     for limit, used in _CGROUPS:
         with suppress(OSError, ValueError):  # there is no such group, or its limit is "max"
             free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
+    with suppress(ImportError, OSError, ValueError):  # no such limits on this system
+        import resource
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit != resource.RLIM_INFINITY:
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+            free.append(limit - pages * resource.getpagesize())
     if free:
         return max(0, min(free))
     try:  # not Linux: half of the machine's memory

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from icrl4aht_data.errors import UnsafePathError
+from icrl4aht_data.errors import IndexFormatError, UnsafePathError
 
 LARGEST = 4 * 2**30
 """Most bytes of a release's file that is not a shard."""
@@ -54,6 +54,7 @@ def resolve_inside(folder: Path, name: str) -> Path:
 
     Raises:
         UnsafePathError: names the folder and the file.
+        IndexFormatError: if a folder on the way cannot be read.
     """
     path = folder / name
     if not is_inside(name):
@@ -68,6 +69,9 @@ def resolve_inside(folder: Path, name: str) -> Path:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return path
+    except PermissionError as error:
+        reason = f"cannot be read: {error.strerror}; check the permissions of its folder"
+        raise IndexFormatError(f"{path}: {reason}") from error
     except (OSError, RuntimeError) as error:  # circular links, or names that this disk does not accept
         raise UnsafePathError(f"{path}: cannot be followed: {error}") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):

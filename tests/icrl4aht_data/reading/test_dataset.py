@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import get_layout, load_icrl4aht
-from icrl4aht_data.errors import LabelsMissingError, OptionError, UnknownNameError
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.batches import assert_equal
 from tests.helpers.random_releases import random_release
@@ -40,6 +40,25 @@ def test_selections_of_a_selection(lite):
     assert wide[1:3].ids.tolist() == [7, 8]
     with pytest.raises(UnknownNameError, match=r"this selection has no history \[0\]"):
         wide.select([7, 0])
+
+
+def test_histories_are_selected_by_a_mask(lite):
+    dataset = load_icrl4aht(lite[0])
+    mask = dataset.column("layout") == "demo_wide"
+    assert dataset.select(mask).ids.tolist() == dataset.ids[mask].tolist()
+    with pytest.raises(EmptySelectionError):
+        dataset.select(np.zeros(len(dataset), bool))
+    with pytest.raises(OptionError, match=r"expected a bool for each of \d+ histories, found 3"):
+        dataset.select(mask[:3])
+    for wrong in ([1.5], [[0]], ["0"]):
+        with pytest.raises(OptionError, match="expected a list of history ids"):
+            dataset.select(wrong)
+
+
+@pytest.mark.parametrize("wanted", [{"algorithm": 3}, {"layout": 3}, {"split": [None]}])
+def test_filters_want_names(wanted):
+    with pytest.raises(UnknownNameError, match=r"unknown (algorithm|layout|split)"):
+        load_icrl4aht(**wanted)
 
 
 def test_positions_ids_and_iteration(lite):

@@ -119,7 +119,7 @@ def test_a_cache_folder_that_is_a_file(tmp_path, monkeypatch, below):
     path.touch()
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(path / "below" if below else path))
     assert module.cache_room() == 0
-    with pytest.raises(CacheError, match=r'plain.*: the cache folder cannot be used: .*ICRL4AHT_CACHE_DIR.*"stream"'):
+    with pytest.raises(CacheError, match=r'plain.*: the cache folder (is a file|cannot).*ICRL4AHT_CACHE_DIR.*"stream"'):
         cached_arrays(KEY, SIZE, build)
     assert path.read_bytes() == b""
 
@@ -132,7 +132,7 @@ def test_a_cache_folder_that_can_only_be_read(folder):
         with permissions_count():
             check(cached_arrays(KEY, SIZE, build))  # what it has can be used
             assert module.cache_room() == 0
-            with pytest.raises(CacheError, match="the cache folder cannot be used: Permission denied; free some space"):
+            with pytest.raises(CacheError, match=r"the cache folder cannot be used: Permission denied \(.*check its permissions"):
                 cached_arrays(f"histories-{1:032x}", SIZE, build)
     finally:
         folder.chmod(0o755)
