@@ -299,14 +299,20 @@ def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return returns[..., :window].mean(axis=-1), returns[..., -window:].mean(axis=-1)
 
 
-def are_labels_weak(expert_return: float | None, return_end: float) -> bool:
+def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
     """Whether expert actions come from a policy that earns less than half of what the ego earned at a history's end.
 
+    Where the end is negative, labels are weak if they earn less than one and a half times it.
+
     Args:
-        expert_return: the policy's greedy return; None, which is not weak, where it was not measured.
-        return_end: mean return of the history's last episodes.
+        expert_return: the policy's greedy return, a number or float64 (N,); None or NaN where it was not measured, which
+            is not weak.
+        return_end: mean return of the history's last episodes, of the same shape.
+
+    Returns:
+        bool, or bool (N,).
     """
-    return expert_return is not None and expert_return < return_end - abs(return_end) / 2
+    return False if expert_return is None else expert_return < return_end - abs(return_end) / 2
 
 
 def stream_score(returns: np.ndarray) -> np.ndarray:

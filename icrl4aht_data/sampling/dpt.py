@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, Unpack
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, OptionError, WeakLabelsWarning, unknown
+from icrl4aht_data.format.schema import are_labels_weak
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
@@ -221,13 +222,12 @@ _NAMED = 5  # tasks that a warning names
 def _warn_of_weak_labels(dataset: Selection) -> None:
     """Warn of tasks whose labels come from a policy that earns less than half of what their histories earn at the end.
 
-    The end is the mean of `return_end` over a task's selected histories. Where it is negative, labels are weak if they
-    earn less than one and a half times it.
+    The end is the mean of `return_end` over a task's selected histories, see `schema.are_labels_weak`.
     """
     codes, first, task = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     ends = np.bincount(task, dataset.column("return_end")) / np.bincount(task)
     greedy, sampled = (dataset.column(name)[first] for name in ("expert_return", "expert_return_sampled"))
-    weak = np.flatnonzero(greedy < ends - np.abs(ends) / 2)  # False where the return is NaN, unknown
+    weak = np.flatnonzero(are_labels_weak(greedy, ends))
     if not len(weak):
         return
     names = dataset.index.values("task_id")

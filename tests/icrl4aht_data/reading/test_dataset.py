@@ -52,7 +52,7 @@ def test_histories_are_selected_by_a_mask(lite):
         dataset.select(mask[:3])
     for wrong in ([1.5], [[0]], ["0"]):
         with pytest.raises(OptionError, match="expected a list of history ids"):
-            dataset.select(wrong)
+            dataset.select(np.array(wrong))
 
 
 @pytest.mark.parametrize("wanted", [{"algorithm": 3}, {"layout": 3}, {"split": [None]}])

@@ -132,7 +132,7 @@ def test_a_cache_folder_that_can_only_be_read(folder):
         with permissions_count():
             check(cached_arrays(KEY, SIZE, build))  # what it has can be used
             assert module.cache_room() == 0
-            with pytest.raises(CacheError, match=r"the cache folder cannot be used: Permission denied \(.*check its permissions"):
+            with pytest.raises(CacheError, match=r"cannot be used: Permission denied \(.*check its permissions"):
                 cached_arrays(f"histories-{1:032x}", SIZE, build)
     finally:
         folder.chmod(0o755)
