@@ -305,8 +305,8 @@ def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
     Where the end is negative, labels are weak if they earn less than one and a half times it.
 
     Args:
-        expert_return: the policy's greedy return, a number or float64 (N,); None or NaN where it was not measured, which
-            is not weak.
+        expert_return: the policy's greedy return, a number or float64 (N,); None or NaN, which are not weak, where it
+            was not measured.
         return_end: mean return of the history's last episodes, of the same shape.
 
     Returns:
