@@ -4,7 +4,7 @@ An experiment is a list of entries; each entry is trained on each layout and eva
 
     OUT/<method>-<entry>/<layout>/run          run folder, as of `train`
     OUT/<method>-<entry>/<layout>/results      results, as of `evaluate`
-    OUT/report/                                report of all entries, with report.html
+    OUT/report/                                report of all entries, with report.html and a card of each model
 
 Everything resumes: finished parts are kept, stopped ones continue, and folders of other settings are refused.
 """
@@ -22,6 +22,7 @@ from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import get_protocol, limit_tasks
 from baselines.methods.options import SIZES, ModelOptions
 from baselines.methods.registry import get_method
+from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import REPORT_BEGINS, write_report
@@ -217,11 +218,13 @@ def run_experiment(
         _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
+    check_new_files(out / "report", overwrite=True, begins={card_name(run): CARD_BEGINS for run in runs})
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"
     options: dict[str, Any] = {"episodes": plan.gifs, "notes": notes, "suite": plan.suite, "progress": progress}
     report.append(write_page_with_episodes(runs, page, **options))
+    report += write_model_cards(runs, out / "report")
     return ExperimentOutcome(report, notes)
 
 

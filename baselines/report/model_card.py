@@ -23,14 +23,19 @@ def model_card(run: EvaluationRun) -> str:
 
     Args:
         run: results of a model that was trained here. A run that was merged from models of several layouts has one
-            card, with a row of the table of models for each, and settings for each that differ.
+            card, with a row of the table of models for each, and settings for each that differ. Several results of
+            one model are one row.
     """
-    sources = [(source, source.trained) for source in run.sources if source.trained]
-    trained = sources[0][1]
+    sources_of: dict[str, list[ResultSource]] = {}
+    for source in run.sources:
+        if source.trained:
+            sources_of.setdefault(source.trained["run_hash"], []).append(source)
+    models = list(sources_of.values())
+    trained = _trained(models[0])
     config, histories = trained["config"], trained["config"]["histories"]
     on_hub = _HUB.match(histories["root"])
-    seeds = list(dict.fromkeys(str(trained["config"]["train"]["seed"]) for _, trained in sources))
-    single = len(sources) == 1
+    seeds = list(dict.fromkeys(str(_trained(sources)["config"]["train"]["seed"]) for sources in models))
+    single = len(models) == 1
     limits = [
         f"{'It is one run' if single else 'Each model is one run'}, of seed {', '.join(seeds)}: the variation between "
         f"seeds is not known.",
@@ -43,28 +48,38 @@ def model_card(run: EvaluationRun) -> str:
         dataset=on_hub[1] if on_hub else "icrl4aht",
         data_version=histories["data_version"],
         code_version=config["package_version"],
-        models="\n".join(_model_row(run, source, trained) for source, trained in sources),
-        settings=_settings(sources),
+        models="\n".join(_model_row(run, sources) for sources in models),
+        settings=_settings(models),
         protocol=run.protocol,
         results="\n\n".join(table for _, table in track_tables(run)),
         limits="\n".join(f"* {limit}" for limit in limits),
     )
 
 
-def _model_row(run: EvaluationRun, source: ResultSource, trained: Mapping[str, Any]) -> str:
-    """Returns a row of the table of models: training data and seed, and the evaluation."""
+def _trained(sources: Sequence[ResultSource]) -> dict[str, Any]:
+    """Returns the content of run.json of one model's results."""
+    return sources[0].trained or {}
+
+
+def _layouts(sources: Sequence[ResultSource]) -> str:
+    return ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts))
+
+
+def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
+    """Returns a row of the table of models: training data and seed of one model, and its evaluation."""
+    trained = _trained(sources)
     histories = trained["config"]["histories"]
-    instances = instances_range(len(run.cells[cell]) for cell in source.tasks)
+    instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
     selection = (
         f"{histories['sizes']['train']} of {', '.join(histories['layouts'])}; the release's manifest has SHA-256 "
         f"`{trained['manifest_sha256']}`"
     )
     values = [
-        ", ".join(source.layouts),
+        _layouts(sources),
         selection,
-        describe_training(source.seen),
+        describe_training(sources[0].seen),
         str(trained["config"]["train"]["seed"]),
-        f"{source.conditions}, {instances} in a cell",
+        f"{sources[0].conditions}, {instances} in a cell",
     ]
     return f"| {' | '.join(values)} |"
 
@@ -84,15 +99,15 @@ def card_name(run: EvaluationRun) -> str:
     return f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md"
 
 
-def _settings(sources: Sequence[tuple[ResultSource, Mapping[str, Any]]]) -> str:
+def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
     """Returns the settings of models as lists, one for each set of equal settings."""
-    tested_on: dict[str, list[str]] = {}
-    for source, trained in sources:
-        listed = _bullets({**trained["config"]["model"], **trained["config"]["train"]})
-        tested_on.setdefault(listed, []).extend(source.layouts)
+    tested_on: dict[str, list[ResultSource]] = {}
+    for sources in models:
+        config = _trained(sources)["config"]
+        tested_on.setdefault(_bullets({**config["model"], **config["train"]}), []).extend(sources)
     if len(tested_on) == 1:
         return next(iter(tested_on))
-    return "\n\n".join(f"Tested on {', '.join(layouts)}:\n\n{listed}" for listed, layouts in tested_on.items())
+    return "\n\n".join(f"Tested on {_layouts(sources)}:\n\n{listed}" for listed, sources in tested_on.items())
 
 
 def _bullets(settings: Mapping[str, Any]) -> str:

@@ -46,6 +46,7 @@ _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
 _SHOWN_TRAINING = ("steps", "batch_size", "context", "learning_rate", "seed")
 _SHOWN_MODEL = ("layers", "width", "positions")
+_PAPER_CONDITIONS = f"Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
 _SWEEPS = {"K": "Context length", "size": "Model scale and training budget"}
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1d2129; max-width: 1250px; margin: 2em auto; padding: 0 1.2em }
@@ -138,7 +139,7 @@ def _introduction(runs: Sequence[EvaluationRun], notes: Sequence[str]) -> str:
     return f"""<h1>ICRL4AHT report</h1>
 <p>{count_text(len(runs), "run")}, package version {escape(version("icrl4aht-data"))}. Large: ours, mean ± std over the
 teammate instances of a cell; over the cells' means if several are averaged; without ± if there is only one. Small: the
-paper's number, which stands only beside results of its protocol <code>{PUBLISHED_PROTOCOL}</code>; the number of
+paper's number, which is shown only next to results of its protocol <code>{PUBLISHED_PROTOCOL}</code>; the number of
 instances if it is not the benchmark's; and the headroom-normalised score, (return − stay) / (oracle − stay), if the
 cell has headroom and all its instances were played. <b>Grey</b>: no reference ego earns more in this cell than one that
 only stays, so it says nothing about adaptation. A dash: not run. Every score has a tooltip with its instances, seeds,
@@ -190,11 +191,18 @@ def _protocol_section(protocol: str, runs: list[EvaluationRun], folder: Path) ->
 
 
 def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = None) -> str:
-    """Returns text with protocol, seeds, length and instances of the results of some runs, all or those of `cells`."""
+    """Returns text with protocol, seeds, length and instances of the results of some runs, all or those of `cells`.
+
+    If the conditions differ, it says which agents they are of.
+    """
     shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
-    texts = dict.fromkeys(run.source(cell).conditions for run, cell in shown)
+    labels: dict[str, dict[str, None]] = {}
+    for run, cell in shown:
+        labels.setdefault(run.source(cell).conditions, {})[run.label] = None
+    several = len(labels) > 1
+    texts = [f"{' and '.join(names)} under {text}" if several else f"under {text}" for text, names in labels.items()]
     instances = instances_range(len(run.cells[cell]) for run, cell in shown)
-    return f"Evaluated under {'; '.join(texts)}; {instances} in a cell"
+    return f"Evaluated {'; '.join(texts)}; {instances} in a cell"
 
 
 def _overlap_note(runs: Sequence[EvaluationRun]) -> str:
@@ -215,7 +223,7 @@ def _table_caption(table: PaperTable, rows: Sequence[TableRow], runs: Sequence[E
     shown = [run for run in runs if run.label in agents and not cells.isdisjoint(run.cells)]
     text = f"{_conditions(shown, cells)}." if shown else "Not run."
     if protocol == PUBLISHED_PROTOCOL:
-        text += f" Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
+        text += f" {_PAPER_CONDITIONS}"
     if table.group != "cell":
         text += " ± is the std over cells."
     return f"<p class=caption>{escape(text)}</p>"
@@ -250,7 +258,10 @@ def _score_cell(score: TableScore, agent: str) -> str:
     if measured and not with_headroom and score.mean is not None:
         lines.append("<small>no headroom</small>")
     kind = "flat" if measured and not with_headroom else "none" if score.mean is None else ""
-    return f'<td class="{kind}"{_tooltip(f"{agent}. {score.details}" if score.details else "")}>{"".join(lines)}</td>'
+    tooltip = f"{agent}. {score.details}" if score.details else ""
+    if score.mean is None and score.published:
+        tooltip = f"Not run. {_PAPER_CONDITIONS}"
+    return f'<td class="{kind}"{_tooltip(tooltip)}>{"".join(lines)}</td>'
 
 
 def _tooltip(text: str) -> str:

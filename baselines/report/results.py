@@ -74,13 +74,19 @@ class ResultSource(NamedTuple):
     seen: SeenInTraining | None = None
 
     @property
+    def acting(self) -> str:
+        """Way of acting of a trained model, see `agents.egos.ACTING`; empty for other agents."""
+        return self.settings.get("details", {}).get("acting", "")
+
+    @property
     def conditions(self) -> str:
-        """Text with protocol, seeds, episodes and steps of the evaluation."""
+        """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of acting."""
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
         listed = ", ".join(map(str, seeds))
         return (
             f"protocol {protocol['name']}, {count_text(len(seeds), 'seed')} ({listed}), "
             f"{count_text(protocol['episodes'], 'episode')} of {count_text(protocol['steps'], 'step')}"
+            + (f", {self.acting} acting" if self.acting else "")
         )
 
 
@@ -313,8 +319,9 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
 
 
 def _rules(run: EvaluationRun) -> tuple[Any, ...]:
-    """Returns what merged results must agree in: protocol with episodes and steps, and seeds."""
-    return run.sources[0].settings["protocol"], run.sources[0].settings["seeds"]
+    """Returns what merged results must agree in: protocol with episodes and steps, seeds, and way of acting."""
+    source = run.sources[0]
+    return source.settings["protocol"], source.settings["seeds"], source.acting
 
 
 def cell_order(cell: Cell) -> tuple[int, int, str]:

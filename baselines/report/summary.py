@@ -87,6 +87,7 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
                 "seeds": len(settings["seeds"]),
                 "steps": settings["protocol"]["steps"],
                 "overlap": " ".join(run.overlaps([cell])),
+                "acting": run.source(cell).acting,
                 "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
             }
         )

@@ -107,16 +107,24 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
     Raises:
         EmptySelectionError: for a value that no history has, or if no history has one of each filter's values.
     """
+    passing = np.ones(len(dataset), bool)
     for name, values in filters.items():
-        found = sorted(set(field_values(dataset, FILTERS[name]).tolist()))
+        column = field_values(dataset, FILTERS[name])
+        passing &= np.isin(column, values)
+        found = sorted(set(column.tolist()))
         for value in values:
             if value not in found:
                 raise EmptySelectionError(
                     f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
                     f"another layout or release"
                 )
-    fields: Any = {FILTERS[name]: values for name, values in filters.items()}
-    return dataset.filter(**fields) if filters else dataset
+    if not passing.any():
+        wanted = ", ".join(f"{name} = {' or '.join(values)}" for name, values in filters.items())
+        raise EmptySelectionError(
+            f"{wanted}: none of {dataset!r} has these together: leave one of them out, or choose another layout or "
+            f"release"
+        )
+    return dataset.select(dataset.ids[passing]) if filters else dataset
 
 
 def field_values(dataset: Dataset, field: str) -> np.ndarray:

@@ -83,11 +83,17 @@ def test_a_tiny_experiment_ends_in_a_report(release, tmp_path, monkeypatch):
     assert all(path.is_file() for path in done.report)
     lines = (tmp_path / "report" / "report.csv").read_text().splitlines()
     assert [line.split(",")[:6] for line in lines[1:]] == [["AD", "seeded", "demo_wide", "H4", "1", "2"]]
+    card = tmp_path / "report" / "AD-seeded.md"
+    assert card in done.report
+    assert "2 episodes of 5 steps, cached acting, 1 instance in a cell" in card.read_text()
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")}
     assert len(before) == 1
     assert read_result(next(iter(before))).settings["details"]["trained_on"] == config["trained_on"]
     run_experiment("tracks", plan, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")} == before
+    card.write_text("My notes.")
+    with pytest.raises(OptionError, match=r"AD-seeded\.md: is not a file as this command writes it"):
+        run_experiment("tracks", plan, tmp_path)
 
 
 def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_path, monkeypatch):

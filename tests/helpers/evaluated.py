@@ -24,16 +24,19 @@ def evaluated_run(
     tasks=None,
     trained_on=(),
     folder=None,
+    acting=None,
 ) -> EvaluationRun:
     """Every instance earns `value`, and 2 more in the second half.
 
     Args:
         tasks: by default the published test tasks of the layouts and families.
         trained_on: record of training data; None for results without one.
+        acting: way of acting of a trained model; None for other agents.
     """
     played = tasks or [task for task in TEST_TASKS if task.layout.name in layouts and task.teammate_family in families]
     details = {} if trained_on is None else {"trained_on": list(trained_on)}
     details |= {"variant": dict([variant])} if variant else {}
+    details |= {"acting": acting} if acting else {}
     shortened = dataclasses.replace(PROTOCOLS[protocol], episodes=40)
     settings = {"agent": agent, "seeds": [0], "protocol": dataclasses.asdict(shortened), "code_version": "0"}
     settings |= {"details": details} if details else {}

@@ -159,8 +159,13 @@ def test_the_page_says_what_each_number_is(write, kind):
     assert "Learned teammates are held out of training" not in text
     assert ("The paper's numbers belong to protocol" in text) == (kind.protocol == "seeded")
     scores = Cells(text.partition("Settings and hashes")[0]).found
-    assert all(tooltip for tooltip, shown in scores if re.match(r"\s*[+-]?\d", shown)), "every number has a tooltip"
+    assert all(tooltip for tooltip, shown in scores if re.match(r"\s*(–\s*paper|[+-]?\d)", shown)), (
+        "every number has a tooltip"
+    )
     assert ("normalised" in first[1]) == (is_test and kind.instances == 5)
+    not_run = {tooltip for tooltip, shown in scores if re.match(r"\s*–\s*paper", shown)}
+    paper = "Not run. Paper: protocol published, 5 instances, 100 episodes of 100 steps."
+    assert not_run == ({paper} if kind.protocol == "published" else set())
 
 
 @settings(max_examples=40)
@@ -258,6 +263,29 @@ def test_runs_under_different_rules_are_not_merged():
     short = evaluated_run("AD", ("coord_simple",))
     short.sources[0].settings["seeds"].append(1)
     assert [run.label for run in merge([evaluated_run("AD"), short])] == ["AD", "AD [runs/AD]"]
+
+
+def test_ways_of_acting_are_named_and_not_merged():
+    exact, cached = (
+        evaluated_run("AD", (layout,), acting=acting)
+        for layout, acting in (("demo_wide", "exact"), ("coord_simple", "cached"))
+    )
+    runs = merge([exact, cached, evaluated_run("random")])
+    assert [run.label for run in runs] == ["AD", "AD [runs/AD]", "random"]
+    assert "40 episodes of 100 steps, exact acting. " in score_cells(list(exact.cells), exact, {}).details
+    assert "40 episodes of 100 steps, exact acting, 5 instances in a cell." in markdown(runs)
+    assert [rows(run)[0]["acting"] for run in runs] == ["exact", "cached", ""]
+    assert len(merge([exact, evaluated_run("AD", ("coord_simple",), acting="exact")])) == 1
+
+
+def test_captions_say_which_agents_different_conditions_are_of(write):
+    short = evaluated_run("DPT")
+    short.sources[0].settings["protocol"]["episodes"] = 3
+    text = unescape(write([evaluated_run("AD"), evaluated_run("random"), short]))
+    assert (
+        "Evaluated AD and random under protocol seeded, 1 seed (0), 40 episodes of 100 steps; DPT under protocol "
+        "seeded, 1 seed (0), 3 episodes of 100 steps; 5 instances in a cell." in text
+    )
 
 
 def test_reference_egos_are_not_trained_and_other_agents_must_say_it():

@@ -15,7 +15,7 @@ from baselines.commands.cli import cli
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from baselines.report import episode_gifs as gifs
 from baselines.report.episode_gifs import EpisodeGif, restore_ego
-from baselines.report.model_card import write_model_cards
+from baselines.report.model_card import model_card, write_model_cards
 from baselines.report.page import write_page, write_page_with_episodes
 from baselines.report.results import TEST_LAYOUTS, EvaluationRun, merge, read_published
 from baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, score_cells, sweep_points
@@ -184,7 +184,7 @@ def test_trained_models_have_cards(tmp_path):
         histories["sizes"] = {"train": size}
         config = {"model": {"layers": layers}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
         found = evaluated_run("AD", (tested_on,), **options)
-        source = found.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12"})
+        source = found.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12", "run_hash": layout})
         return dataclasses.replace(found, sources=(source,))
 
     greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}
@@ -202,6 +202,15 @@ def test_trained_models_have_cards(tmp_path):
     assert "| H3 | 11.0 ± 0.0<br>" in card
     assert "It is one run, of seed 3" in card
     assert card.count("* † the agent was trained with teammates of this family") == 2, "at the table, among the limits"
+    assert "40 episodes of 100 steps, cached acting, 5" in model_card(
+        trained("demo_wide", "demo_wide", 1, acting="cached")
+    )
+    own = [make_task("teammate", "train", "demo_wide", TEST_TASKS[0].teammate, number) for number in (1, 2)]
+    (twice,) = merge([first, trained("demo_wide", "demo_wide", 14, trained_on=[greedy], tasks=own)])
+    card = model_card(twice)
+    assert card.count("| demo_wide | 14 of demo_wide;") == 1, "one model, evaluated on two sets of tasks"
+    assert "40 episodes of 100 steps, 2 to 5 instances in a cell |" in card
+    assert "It is one run, of seed 3" in card
     both = merge([first, trained("asymm_both", "asymm_right", 8, layers=2, trained_on=None)])
     (path,) = write_model_cards(both, tmp_path)
     card = path.read_text()

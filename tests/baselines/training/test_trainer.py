@@ -294,7 +294,11 @@ class TestHeldOut:
         )
         fails("source = dqn: none of .*; these have ppo: choose", source=("ppo", "dqn"))
         fails("teammate_family = H1: none of", teammate_family=("rl", "H1"))
-        fails("no history has teammate_family", teammate_family=("rl",), algorithm=("utility_greedy",))
+        fails(
+            "^teammate_family = rl, algorithm = utility_greedy: none of .* on asymm_both.* has these together",
+            teammate_family=("rl",),
+            algorithm=("utility_greedy",),
+        )
 
     def test_impossible_trainings(self, tmp_path, lite):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
