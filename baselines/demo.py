@@ -109,7 +109,7 @@ def run_demo(
 
 def _train_demo(folder: Path, model: ModelOptions, options: TrainOptions, console: Console) -> None:
     job = prepare("ad", model, options, HistoryOptions((DEMO_LAYOUT,)))
-    with bars(edges=True) as show:
+    with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
             show("AD", step, options.steps, "" if loss is None else f", loss {loss:.3f}")
@@ -121,8 +121,8 @@ def _train_demo(folder: Path, model: ModelOptions, options: TrainOptions, consol
 def _evaluate_demo(name: str, tasks: Sequence[Task], protocol: Protocol, results: Path) -> EvaluationRun:
     agent = find_agent(name)
     folder = results / agent.name
-    with bars(edges=True) as show:
-        played = counted(show, f"{agent.name}, episodes", len(tasks) * protocol.episodes)
+    with bars(edges=True, unit="episodes") as show:
+        played = counted(show, agent.name, len(tasks) * protocol.episodes)
         evaluate(agent.name, agent.make, tasks, protocol, out=folder, details=agent.details, played=played)
     note_results(folder, Path(name) if agent.details else None)
     return read_run(folder)

@@ -152,7 +152,7 @@ def evaluate_command(
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
     played = get_protocol(protocol, episodes)
-    with bars(edges=True) as show:
+    with bars(edges=True, unit="episodes") as show:
         evaluate(
             ego.name,
             ego.make,
@@ -162,7 +162,7 @@ def evaluate_command(
             suite=suite,
             out=out,
             details=ego.details,
-            played=counted(show, f"{ego.name}, {protocol}, episodes", len(chosen) * played.episodes * seeds),
+            played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
         )
     note_results(out, Path(agent) if ego.details else None, chosen if manifest else ())
     noun = "result" if len(chosen) == 1 else "results"
@@ -253,7 +253,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
-    with bars(edges=True) as show:
+    with bars(edges=True, unit="tasks") as show:
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
         _console.print(f"wrote {path}")
@@ -284,7 +284,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     name = get_layout(layout or trained.layouts[0]).name
     check_fits(trained, get_layout(name), run)
     tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
-    with bars(edges=True) as show:
+    with bars(edges=True, unit="episodes") as show:
         found = []
         for episode in measure_drift(trained.method, trained.params, trained.context, tasks, played):
             found.append(episode)
@@ -348,7 +348,8 @@ def train_command(
     """Train a model on learning histories.
 
     METHOD is ad, dpt, hybrid_ad or amago_offline. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
-    the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one.
+    the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second
+    Ctrl-C does not wait for it.
     """
     import jax
 
@@ -369,7 +370,7 @@ def train_command(
     sized: dict[str, Any] = {"layers": layers, "width": width}
     job = prepare(method, ModelOptions(**(sized | model)), options, choice)
     folder = out or Path("runs") / method
-    with bars(edges=True) as show:
+    with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
             show(method, step, options.steps, format_loss(loss))
@@ -471,7 +472,7 @@ def control_command(out: Path) -> None:
     """
     from baselines.control.control import format_checks, run_control
 
-    with bars(edges=True) as show:
+    with bars(edges=True, unit="steps") as show:
 
         def done(name: str, total: int, step: int, loss: float | None) -> None:
             show(name, step, total, format_loss(loss))

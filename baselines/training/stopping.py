@@ -26,8 +26,9 @@ class TrainingStopped(SystemExit):
 
 
 class StopSignals:
-    """Context in which SIGTERM and SIGINT are noted instead of ending the process; a second one has its usual effect.
+    """Context in which SIGTERM and SIGINT are noted instead of ending the process.
 
+    Further SIGTERMs are ignored, since schedulers and wrappers may send several; a second SIGINT has its usual effect.
     Outside the main thread, where Python accepts no handlers, nothing is noted.
 
     Attributes:
@@ -54,4 +55,5 @@ class StopSignals:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = self.received or number
-        signal.signal(number, self._before[number])
+        if number == signal.SIGINT:
+            signal.signal(number, self._before[number])

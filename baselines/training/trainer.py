@@ -198,7 +198,7 @@ def train(
 ) -> TrainState:
     """Train to the end, from the start or from the last checkpoint in the folder.
 
-    SIGTERM and SIGINT end the training after the running step, once its state is saved.
+    SIGTERM and SIGINT end the training after the running step, once its state is saved; a second SIGINT does not wait.
 
     Args:
         method: what to train.

@@ -216,7 +216,9 @@ def examples(*lines: str) -> str:
 
 
 @contextmanager
-def bars(quiet: bool = False, of_bytes: bool = False, edges: bool = False) -> Iterator[Callable[..., None]]:
+def bars(
+    quiet: bool = False, of_bytes: bool = False, edges: bool = False, unit: str = ""
+) -> Iterator[Callable[..., None]]:
     """Show progress bars on a terminal; yields a function `show(name, done, total, note="")`, one bar for each name.
 
     Where stderr is not a terminal, a plain line a minute is printed instead, see `LineProgress`.
@@ -225,6 +227,7 @@ def bars(quiet: bool = False, of_bytes: bool = False, edges: bool = False) -> It
         quiet: show nothing.
         of_bytes: the numbers are bytes: show sizes and speed.
         edges: print plain lines also at the start and at the end.
+        unit: what plain lines count, such as "steps".
     """
     console, running = Console(stderr=True), {}
     columns = (*Progress.get_default_columns(), *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()))
@@ -232,7 +235,7 @@ def bars(quiet: bool = False, of_bytes: bool = False, edges: bool = False) -> It
 
         def show(name: str, done: int, total: int | None, note: str = "") -> None:
             if name not in running:
-                running[name] = shown.add_task(name, total=total)
+                running[name] = shown.add_task(name, total=total, unit=unit)
             shown.update(running[name], completed=done, total=total, description=f"{name}{note}")
 
         yield show

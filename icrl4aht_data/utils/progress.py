@@ -20,8 +20,9 @@ class LineProgress(Progress):
     """Rich's progress bars, which print plain lines instead of bars if the console is not a terminal.
 
     A line says what is done, how far it is, how fast, and the time left; further fields of a bar in it are `unit` (what
-    is counted) and `note`. Invisible bars have no lines. Lines are written and flushed at once, by a thread of their
-    own, so that they also appear while a single step takes long.
+    is counted) and `note`. The speed is the mean since the first move of a bar: it falls while nothing moves, and what
+    a resumed run had finished before does not count. Invisible bars have no lines. Lines are written and flushed at
+    once, by a thread of their own, so that they also appear while a single step takes long.
 
     Args:
         columns: columns of a bar.
@@ -47,7 +48,7 @@ class LineProgress(Progress):
     ) -> None:
         self._has_lines = not quiet and not console.is_terminal
         self._edges, self._of_bytes, self._interval = edges, of_bytes, interval
-        self._moved: set[TaskID] = set()
+        self._first_moves: dict[TaskID, tuple[float, float]] = {}  # time, and what was completed then
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
         super().__init__(*columns, console=console, disable=quiet or not console.is_terminal, get_time=clock, **options)
@@ -68,7 +69,7 @@ class LineProgress(Progress):
             self._thread = None
         if self._edges:
             for task in self._with_lines():
-                if task.id in self._moved:
+                if task.id in self._first_moves:
                     self._print(self._last_line(task))
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
@@ -89,8 +90,8 @@ class LineProgress(Progress):
 
     def _after_move(self, task_id: TaskID) -> None:
         task = self._tasks[task_id]
-        if task.completed and task_id not in self._moved:
-            self._moved.add(task_id)
+        if task.completed and task_id not in self._first_moves:
+            self._first_moves[task_id] = self.get_time(), task.completed
             if self._edges and self._has_lines and task.visible:
                 self._print(f"{task.description}: started, {self._count(task.total)}{_unit(task)}")
 
@@ -109,10 +110,16 @@ class LineProgress(Progress):
     def _line(self, task: Task) -> str:
         share = f"{100 * task.completed / (task.total or 1):.0f} %"
         how_far = f"{self._count(task.completed)} of {self._count(task.total)}{_unit(task)} ({share})"
-        speed = task.speed or (task.completed / task.elapsed if task.elapsed else 0.0)
+        speed = self._speed(task)
         left = f"{_duration((task.remaining or 0.0) / speed)} left" if speed else "time left unknown"
         parts = [f"{how_far} after {_duration(task.elapsed or 0.0)}", *([self._rate(speed)] if speed else []), left]
         return f"{task.description}: {', '.join(parts)}{_note(task)}"
+
+    def _speed(self, task: Task) -> float:
+        """Mean speed since the first move; unlike Rich's, which is that of past moves, it falls while nothing moves."""
+        now = self.get_time()
+        since, before = self._first_moves.get(task.id, (now, task.completed))
+        return max(0.0, task.completed - before) / (now - since) if now > since else 0.0
 
     def _last_line(self, task: Task) -> str:
         stopped = "" if task.finished else "stopped at "

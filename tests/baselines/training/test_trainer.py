@@ -161,8 +161,10 @@ class TestResume:
 
 
 def terminate_at_4(step: int, loss: float | None) -> None:
-    """Progress callback that stops the training at a step that is logged but not a checkpoint."""
+    """Progress callback that stops the training at a step that is logged but not a checkpoint, by two SIGTERMs."""
     if step == 4:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL  # with it the next one would kill the tests
         os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -182,7 +184,7 @@ class TestStopping:
         for name in ("metrics.jsonl", "config.json"):
             assert (tmp_path / name).read_bytes() == (through[0] / name).read_bytes()
 
-    def test_a_second_signal_does_not_wait(self):
+    def test_a_second_sigint_does_not_wait(self):
         before = signal.getsignal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt), StopSignals() as stop:
             os.kill(os.getpid(), signal.SIGINT)

@@ -72,6 +72,38 @@ def test_rates_and_times_are_in_fitting_units(seconds, expected):
     assert output.getvalue() == f"x: {expected.replace('a hour', 'an hour')}\n"
 
 
+def test_the_speed_falls_while_nothing_moves():
+    clock, output = Clock(), io.StringIO()
+    with LineProgress(console=Console(file=output), clock=clock, interval=None) as bars:
+        bar = bars.add_task("x", total=1600)
+        for number in (200, 500, 800):
+            clock.wait(1)
+            bars.update(bar, completed=number)
+        for _ in range(2):
+            bars.print_lines()
+            clock.wait(10)
+    assert output.getvalue().splitlines() == [
+        "x: 800 of 1,600 (50 %) after 3 s, 300 a second, 3 s left",
+        "x: 800 of 1,600 (50 %) after 13 s, 50 a second, 16 s left",
+    ]
+
+
+def test_what_a_resumed_work_had_finished_is_no_speed():
+    clock, output = Clock(), io.StringIO()
+    with LineProgress(console=Console(file=output), clock=clock, interval=None) as bars:
+        bar = bars.add_task("x", total=1000)
+        clock.wait(5)
+        bars.update(bar, completed=900)
+        bars.print_lines()
+        clock.wait(10)
+        bars.update(bar, completed=910)
+        bars.print_lines()
+    assert output.getvalue().splitlines() == [
+        "x: 900 of 1,000 (90 %) after 5 s, time left unknown",
+        "x: 910 of 1,000 (91 %) after 15 s, 1.0 a second, 2 min left",
+    ]
+
+
 def test_nothing_is_known_before_the_first_step():
     clock, output = Clock(), io.StringIO()
     with LineProgress(console=Console(file=output), clock=clock, interval=None) as bars:
@@ -141,3 +173,13 @@ def test_bars_of_commands_have_lines_on_stderr(monkeypatch, capsys):
             if "\n" in (printed := capsys.readouterr().err):
                 break
     assert printed.startswith("download: 3.0 MB of 10.0 MB (30 %) after 0 s, ")
+
+
+def test_lines_of_commands_have_units(capsys):
+    with options.bars(edges=True, unit="steps") as show:
+        show("ad", 649, 100_000, ", loss 1.234")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "ad, loss 1.234: started, 100,000 steps",
+        "ad, loss 1.234: stopped at 649 of 100,000 steps after 0 s",
+    ]
