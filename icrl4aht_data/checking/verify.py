@@ -30,7 +30,7 @@ from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
-from icrl4aht_data.remote.addresses import without_credentials
+from icrl4aht_data.remote.addresses import check_credentials, without_credentials
 from icrl4aht_data.remote.download import chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
@@ -65,9 +65,11 @@ def verify_release(
     Raises:
         UnknownNameError: if `level` or a name in `wanted` does not exist.
         EmptySelectionError: if no history matches `wanted`.
+        OptionError: if the user name or password in an address has characters that are not percent-encoded.
     """
     if level not in get_args(Level):
         raise unknown("level", level, get_args(Level))
+    check_credentials(str(root))
     report = Report(without_credentials(str(MINI if root is None else root)), level)
     try:
         origin = open_root(MINI if root is None else root)

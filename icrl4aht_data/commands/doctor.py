@@ -26,7 +26,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.safe_hdf5 import OLDEST_HDF5
-from icrl4aht_data.remote.addresses import without_credentials
+from icrl4aht_data.remote.addresses import check_credentials, without_credentials
 from icrl4aht_data.remote.download import default_remote
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.remote.store import offline_switches
@@ -189,6 +189,11 @@ def _network(problems: list[Problem]) -> dict[str, Any]:
     if remote is not None and not is_address(remote):
         step = "set it to one such as hf://datasets/<org>/<repo>, https://... or s3://..., or unset it"
         problems.append(Problem(f"ICRL4AHT_REMOTE={remote!r}: expected an address", step))
+    try:
+        check_credentials(remote or "")
+    except OptionError as error:
+        problems.append(Problem(f"ICRL4AHT_REMOTE: {error}", "set it to such an address, or unset it"))
+        remote = "not shown"
     return {"offline": offline_switches(), "remote": remote and without_credentials(remote)}
 
 

@@ -13,11 +13,11 @@ from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 
-from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
+from icrl4aht_data.errors import ChunkTableError, IndexFormatError, OptionError, UnsafePathError
 from icrl4aht_data.format.schema import EXPERTS, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
 from icrl4aht_data.utils.files import atomic_write, plain_size, read_text, wrap_read_errors
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import LARGEST, is_inside, resolve_inside
+from icrl4aht_data.utils.paths import LARGEST, files_below, is_inside, resolve_inside
 from icrl4aht_data.utils.remembered import remembered_hash
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
@@ -166,3 +166,15 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
     with atomic_write(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")
+
+
+def check_only_files_of(folder: Path, manifest: Mapping[str, str]) -> None:
+    """Check that a folder, which need not exist, has files of a release only.
+
+    Raises:
+        OptionError: names a file that the manifest does not list.
+    """
+    for name in files_below(folder):
+        file = re.sub(r"(^|/)\.([^/]+)\.partial$", r"\1\2", name)  # of `atomic_write`, cut or still at work
+        if file != MANIFEST and file not in manifest:
+            raise OptionError(f"{folder / name}: not a file of this release: move it elsewhere, or give another folder")

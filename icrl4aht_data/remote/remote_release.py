@@ -30,7 +30,13 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import check_against_manifest, check_folder, parse_manifest, read_manifest
+from icrl4aht_data.format.manifest import (
+    check_against_manifest,
+    check_folder,
+    check_only_files_of,
+    parse_manifest,
+    read_manifest,
+)
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.remote.addresses import without_credentials
 from icrl4aht_data.remote.download_note import read_note
@@ -116,6 +122,7 @@ def open_root(root: str | Path, to: Path | None = None, retry: RetryPolicy | Non
         retry: policy for byte ranges.
 
     Raises:
+        OptionError: if `root` is no address, or `to` has files of something else.
         RootNotFoundError: if the address has no release.
         RemoteError: if the remote cannot be reached, or serves something else than its manifest lists.
         OfflineError: if network access is switched off and the index is not downloaded.
@@ -432,6 +439,8 @@ def _claim_folder(folder: Path, text: bytes, manifest: dict[str, str], url: str,
     """
     path = folder / MANIFEST
     if has_content(path, text):
+        if chosen:
+            check_only_files_of(folder, manifest)
         return
     with process_lock(lock_beside(folder)):
         note = read_note(folder)
@@ -443,6 +452,8 @@ def _claim_folder(folder: Path, text: bytes, manifest: dict[str, str], url: str,
                 f"{folder}: not empty, and not a release, so that nothing is written into it; give a new or an empty "
                 f"folder"
             )
+        if chosen:
+            check_only_files_of(folder, manifest)
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as partial:
             partial.write_bytes(text)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from urllib.parse import urljoin
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
-from icrl4aht_data.remote.addresses import address_of, check_redirect, without_credentials
+from icrl4aht_data.remote.addresses import address_of, check_credentials, check_redirect, without_credentials
 from icrl4aht_data.utils.forks import ForkSafeLock
 
 T = TypeVar("T")
@@ -32,6 +32,8 @@ _PERMANENT = (
     MemoryError,
     TypeError,
 )
+_PERMANENT_NAMES = {"TooManyRedirects", "InvalidURL"}  # classes of HTTP clients, which are imported when needed
+_ADDRESS_LOGS = ("fsspec", "fsspec.http", "fsspec.asyn", "s3fs", "aiohttp.client")  # loggers of messages with addresses
 _TIMEOUT = 30  # seconds without a byte, or until a connection
 _TOTAL_TIMEOUT = 300  # seconds for one request, against a server that sends a byte now and then
 _LOGGED_WAIT = 2.0  # seconds between attempts from which on the wait is logged
@@ -95,9 +97,13 @@ class Store:
 
     Attributes:
         url: the address without credentials, for messages and files.
+
+    Raises:
+        OptionError: if the user name or password has characters that are not percent-encoded.
     """
 
     def __init__(self, url: str, retry: RetryPolicy | None = None) -> None:
+        check_credentials(url)
         self._address = url
         self.url = without_credentials(url).rstrip("/")
         self.retry = retry or RetryPolicy()
@@ -239,6 +245,8 @@ def wrap_remote_errors(address: str, attempts: int = 1) -> Iterator[None]:
 def _open_filesystem(url: str) -> Any:
     import fsspec
 
+    for name in _ADDRESS_LOGS:
+        logging.getLogger(name).addFilter(_remove_credentials)  # added once, as it is the same function
     scheme = url.partition("://")[0]
     options: dict[str, Any] = {"skip_instance_cache": True, "use_listings_cache": False}
     if scheme in ("http", "https"):
@@ -257,11 +265,20 @@ def _open_filesystem(url: str) -> Any:
         remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
         raise OptionError(f"{without_credentials(url)}: {error}; {remedy}") from error
     except ValueError as error:
-        problem = without_credentials(f"{url}: not an address that fsspec opens: {error}")
+        problem = f"{without_credentials(url)}: not an address that fsspec opens: {without_credentials(str(error))}"
         raise OptionError(f"{problem}; expected hf://datasets/<org>/<repo>, https://... or s3://...") from None
     if scheme == "s3":
         files.retries = 1  # s3fs has retries of its own besides botocore's
     return files
+
+
+def _remove_credentials(record: logging.LogRecord) -> bool:
+    """Filter of a logger that takes credentials out of messages; of an exception only the message is kept."""
+    text = record.getMessage()
+    if record.exc_info and record.exc_info[1] is not None:
+        text, record.exc_info = f"{text} {_one_line(record.exc_info[1])}".strip(), None
+    record.msg, record.args = without_credentials(text), ()
+    return True
 
 
 def _redirect_guard() -> Any:
@@ -309,7 +326,10 @@ def _is_transient(error: BaseException) -> bool:
     status = http_status(error)
     if status is not None:
         return status in _TRANSIENT_STATUS
-    return isinstance(error, Exception) and not isinstance(_root_cause(error), _PERMANENT) and not _is_disk_error(error)
+    cause = _root_cause(error)
+    if isinstance(cause, _PERMANENT) or _PERMANENT_NAMES & {known.__name__ for known in type(cause).__mro__}:
+        return False
+    return isinstance(error, Exception) and not _is_disk_error(error)
 
 
 def _root_cause(error: BaseException) -> BaseException:

@@ -214,6 +214,11 @@ def test_a_folder_with_other_content_is_refused(lite, full, tmp_path):
         with pytest.raises(OptionError, match="holds another release or version"):
             plan_download(server.url, to=target)
         shutil.rmtree(target)
+        shutil.copytree(lite[0], target)
+        (target / "meta" / "my.txt").write_text("mine")
+        with pytest.raises(OptionError, match=r"my\.txt: not a file of this release: move it elsewhere"):
+            plan_download(server.url, to=target)
+        shutil.rmtree(target)
         target.mkdir()
         fetch_planned(plan_download(server.url, to=target))
         (target / MANIFEST).write_text("nonsense\n")
@@ -343,6 +348,21 @@ def test_a_redirect_to_another_path_of_the_host_is_followed(lite):
         assert_equal(batch(server.url), batch(lite[0]))
 
 
+@pytest.mark.parametrize(("target", "message"), [(f"/{MANIFEST}", "TooManyRedirects"), ("http:///x", "Invalid")])
+def test_redirects_that_lead_nowhere_are_not_retried(lite, target, message):
+    with http_server(lite[0]) as server:
+        server.faults.every(1, Redirect(target), method=None)
+        with pytest.raises(RemoteError, match=message) as caught:
+            load_icrl4aht(server.url)
+    assert "attempts" not in str(caught.value)
+
+
+def test_an_invalid_url_is_not_retried():
+    with pytest.raises(RemoteError, match=r"(?i)InvalidUrl") as caught:
+        Store("http:///x", QUICK).size("a")
+    assert "attempts" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("source", "target", "message"),
     [
@@ -356,7 +376,8 @@ def test_a_redirect_to_another_path_of_the_host_is_followed(lite):
         ("https://a.test/x", "https://user:secret@b.test/x", "another host"),
         ("https://a.test/x", "file:///etc/passwd", "expected http"),
         ("https://a.test/x", "https:///x", "expected http"),
-        ("http://a.test/x", "http://127.0.0.1:8080/x", "another host"),
+        ("http://a.test/x", "http://127.0.0.1:8080/x", "refused: that is an address of this machine"),
+        ("http://127.0.0.1/x", "http://127.0.0.1:8080/x", "another host"),
         ("http://a.test/x", "http://metadata.test/x", "this machine or of its local network"),
         ("http://a.test/x", "http://loop.test/x", "this machine or of its local network"),
         ("http://a.test/x", "http://mapped.test/x", "this machine or of its local network"),
@@ -365,12 +386,14 @@ def test_a_redirect_to_another_path_of_the_host_is_followed(lite):
 )
 def test_which_redirects_are_followed(source, target, message, monkeypatch):
     found = {"metadata.test": "169.254.169.254", "loop.test": "127.0.0.1", "mapped.test": "::ffff:127.0.0.1"}
+    allowed = f"allowed.test,{','.join(found)}"
+    found["127.0.0.1"] = "127.0.0.1"
 
     def look_up(host, port, **options):
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (found.get(host, "93.184.216.34"), 0))]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    monkeypatch.setenv(REDIRECT_VARIABLE, f"allowed.test,{','.join(found)}")
+    monkeypatch.setenv(REDIRECT_VARIABLE, allowed)
     if message is None:
         check_redirect(source, target)
         return
@@ -411,6 +434,50 @@ def test_texts_without_credentials(text, expected):
 SECRETS = ("hunter2", "t0ken")
 
 
+@pytest.mark.parametrize(
+    "address",
+    [
+        "http://user:hunter2/RET@127.0.0.1:9/x",
+        "http://user:1/hunter2@127.0.0.1:9/x",
+        "http://user:/hunter2@127.0.0.1:9/x",
+        "https://u:p@s/hunter2@h.test/x",
+        "https://u:hunter2?x@h.test/x",
+        "https://u:hunter2#x@h.test/x",
+        "https://u:p hunter2@h.test/x",
+        "https://u:p'hunter2@h.test/x",
+        "https://u:p<hunter2@h.test/x",
+        "https://h.test:80800/hunter2",
+        "s3://AKIA:ab/hunter2+ef@bucket/x",
+        "simplecache::https://u:p/hunter2@h.test/x",
+    ],
+)
+def test_credentials_that_are_not_encoded_are_refused_unseen(address, monkeypatch, caplog):
+    monkeypatch.setenv("ICRL4AHT_REMOTE", address)
+    attempts = [lambda: load_icrl4aht(address), lambda: verify_release(address), lambda: plan_download(address)]
+    for attempt in attempts:
+        with pytest.raises(OptionError, match="percent-encode the user name and password") as caught:
+            attempt()
+        assert "hunter2" not in " ".join(errors(caught.value))
+    output = CliRunner().invoke(cli, ["doctor", "--json"]).output
+    assert "percent-encode" in output and "hunter2" not in output + " ".join(caplog.messages)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "hf://datasets/you/icrl4aht@v0.4.0",
+        "https://h.test/icrl4aht@v1",
+        "http://127.0.0.1:8000/icrl4aht@v1",
+        "http://[::1]:8000/icrl4aht@v1",
+        "https://u:p%2F%40@h.test:8/x?mail=a:b@c",
+        "https://me@h.test/x",
+        "s3://bucket/x@1",
+    ],
+)
+def test_addresses_that_may_be_opened(address):
+    assert Store(address).url.startswith(address[:4])
+
+
 def guarded(folder: Path, seen: list[str]) -> Server:
     """A server of a folder's files that answers 401 without user, password and token."""
 
@@ -427,6 +494,8 @@ def guarded(folder: Path, seen: list[str]) -> Server:
 
 def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_path, monkeypatch, caplog):
     target, said = tmp_path / "mine", []
+    for name in ("fsspec.http", "aiohttp.client"):
+        caplog.set_level("DEBUG", logger=name)
     server = guarded(lite[0], [])
     url = f"{server.url.replace('http://', 'http://me:hunter2@')}?key=t0ken"
     monkeypatch.setenv("ICRL4AHT_REMOTE", url)
@@ -462,7 +531,9 @@ def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_pa
         server.close()
     with pytest.raises(OptionError) as caught:
         Store("nonsense://me:hunter2@x?t0ken").size("a")
-    said += [*errors(caught.value), *caplog.messages]
+    assert str(caught.value).startswith("nonsense://x: not an address that fsspec opens: ")
+    said += [*errors(caught.value), caplog.text]
+    assert "Retrieve file size for http://127.0.0.1" in caplog.text
     for path in tmp_path.rglob("*"):
         said.append(str(path.relative_to(tmp_path)))
         if path.is_file():
