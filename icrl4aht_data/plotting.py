@@ -19,6 +19,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.new_file import MARK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -165,5 +166,7 @@ def legend_below(figure: Figure) -> None:
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
     """Write a figure in the format that the path's suffix names; an existing file is replaced at once."""
+    kind = path.suffix.removeprefix(".")
+    key = {"png": "Software", "svg": "Creator", "pdf": "Creator"}.get(kind.lower())
     with atomic_write(path) as partial:
-        figure.savefig(partial, dpi=dpi, format=path.suffix.removeprefix("."))
+        figure.savefig(partial, dpi=dpi, format=kind, metadata={key: MARK} if key else None)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from baselines.agents.egos import get_agent
 from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from baselines.report.results import EvaluationRun, as_run
 from baselines.report.summary import headroom_markdown
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -16,7 +16,10 @@ from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
 
-HEADROOM_BEGINS = {"headroom.json": b'{\n "', "headroom.md": b"# Headroom: what an ego can change\n"}
+HEADROOM_BEGINS: dict[str, bytes | tuple[bytes, ...]] = {
+    "headroom.json": tuple(f'{{\n "{name}": {{\n  "'.encode() for name in PROTOCOLS),
+    "headroom.md": b"# Headroom: what an ego can change\n",
+}
 """Files with the headroom -> their first bytes, by which they are recognised before they are replaced."""
 
 

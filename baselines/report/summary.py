@@ -29,8 +29,13 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, headroom_table, read_headroom
 from icrl4aht_data.utils.templates import markdown_table
 
-REPORT_BEGINS = {"report.md": b"# Returns per layout", "report.csv": b"agent,protocol,layout,", "curves.png": None}
-"""Files of a report -> their first bytes, by which they are recognised before they are replaced; None: any picture."""
+REPORT_BEGINS = {
+    "report.md": b"# Returns per layout and teammate family\n",
+    "report.csv": b"agent,protocol,layout,family,instances,episodes,mean,std,",
+    "curves.png": None,
+}
+"""Files of a report -> their first bytes, by which they are recognised before they are replaced; None: those of a
+picture that this package drew."""
 
 _RESAMPLES = 10_000
 _PAPER_AGENTS = ("random", "AD", "DPT")

@@ -15,12 +15,11 @@ from generation.populations.build import build_suite
 from generation.populations.select import THRESHOLD, make_tasks
 from generation.profiles import Profile
 from generation.progress import progress_bars
-from generation.releases.package import package_release
+from generation.releases.package import check_release_folder, package_release
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.utils.locks import process_lock
-from icrl4aht_data.writing.release_folder import check_target
 from icrl4aht_data.writing.statistics import print_statistics
 
 SUITE = "suite"
@@ -55,9 +54,10 @@ def build_releases(
 
     Raises:
         CollectionError: if a task could not be collected; nothing is packed then.
+        OptionError: if something but a release of this profile is at out/<kind>.
     """
     for kind in kinds:
-        check_target(out / kind, overwrite=True)  # before the long work, not after it
+        check_release_folder(out / kind, profile)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
     tasks = train_teammates(profile, suite, seed, console) if tasks is None else list(tasks)
     collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)

@@ -22,12 +22,13 @@ from generation.releases.labeller import choose_labeller
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
-from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
-from icrl4aht_data.format.schema import Kind, episode_ends
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import atomic_folder
+from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 
 
 def package_release(
@@ -45,13 +46,17 @@ def package_release(
 
     Args:
         artefacts: folder of the tasks' finished artefacts.
-        target: the release folder; a release there is replaced atomically.
+        target: the release folder; a release of this profile there is replaced atomically.
         tasks: the tasks, in the release's order.
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
         advance: called after each task with 0, when its labeller is chosen, and with 1, when it is written.
+
+    Raises:
+        OptionError: if something else is at `target`, see `check_release_folder`.
     """
+    check_release_folder(target, profile)
     new = []
     for task in tasks:
         new.append(_new_task(artefacts / task.task_id, task, profile, suite))
@@ -59,6 +64,24 @@ def package_release(
     return write_release(
         target, kind, new, data_version=profile.data_version, overwrite=True, done=lambda task: advance(1)
     )
+
+
+def check_release_folder(target: Path, profile: Profile) -> None:
+    """Check that nothing is at `target` but an unchanged release that was made with this profile.
+
+    Raises:
+        OptionError: if there is something else.
+    """
+    if not check_target(target, overwrite=True):
+        return
+    path = target / PROVENANCE
+    profiles = {of_task.profile for of_task in read_provenance(path).values()} if path.is_file() else set()
+    if profiles != {profile.name}:
+        made = ", ".join(sorted(map(str, profiles - {None}))) or "no known profile"
+        raise OptionError(
+            f"{target}: has files made with {made}, not with profile {profile.name}, and is not replaced; move it "
+            f"away, or give another --out"
+        )
 
 
 def bundle_release(release: Path) -> Path:

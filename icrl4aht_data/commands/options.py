@@ -180,7 +180,7 @@ def version_option(command: Any) -> Any:
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace what exists, if it is what such a command wrote and nothing else."
+    "--overwrite", is_flag=True, help="Replace what exists, if it carries this package's mark and nothing was added."
 )
 family_map_option = click.option(
     "--family-map",

@@ -20,6 +20,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, PLATE, WINDOW, Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, record_size, unpack
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.new_file import MARK
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -126,9 +127,9 @@ def save_episode(
         earned += reward
     colours, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
-    timing = {"duration": round(1000 / fps), "loop": 0}
+    other = {"duration": round(1000 / fps), "loop": 0, "comment": MARK.encode()}
     palette = bytes(colours.getpalette() or [])  # passed explicitly, it is written once instead of once per frame
-    _write(Path(path), first, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **timing)
+    _write(Path(path), first, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **other)
 
 
 def _pillow():

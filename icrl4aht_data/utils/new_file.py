@@ -1,4 +1,4 @@
-"""Files that commands write: one that exists is replaced only on demand, and only if it has the form of our own."""
+"""Files that commands write: one that exists is replaced only on demand, and only if it carries this package's mark."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from pathlib import Path
 
 from icrl4aht_data.errors import OptionError
 
+MARK = "icrl4aht-data"
+"""Text that pictures and tables of this package have as the name of the program that made them."""
+
 _FORMS: dict[str, tuple[bytes, bytes]] = {
-    ".png": (b"\x89PNG\r\n\x1a\n", b"Matplotlib"),
-    ".gif": (b"GIF8", b""),
-    ".pdf": (b"%PDF-", b"Matplotlib"),
-    ".svg": (b"<?xml ", b"Matplotlib"),
-    ".parquet": (b"PAR1", b"history_id"),
+    ".png": (b"\x89PNG\r\n\x1a\n", b"tEXtSoftware\0" + MARK.encode()),
+    ".gif": (b"GIF8", b"!\xfe" + bytes([len(MARK)]) + MARK.encode() + b"\0"),
+    ".pdf": (b"%PDF-", b"/Creator (" + MARK.encode() + b")"),
+    ".svg": (b"<?xml ", b"<dc:title>" + MARK.encode() + b"</dc:title>"),
+    ".parquet": (b"PAR1", MARK.encode() + b"\x18\x05index"),
     ".html": (b"<!doctype html>\n", b"<title>ICRL4AHT report</title>"),
     ".htm": (b"<!doctype html>\n", b"<title>ICRL4AHT report</title>"),
 }
@@ -22,13 +25,13 @@ _FORMS: dict[str, tuple[bytes, bytes]] = {
 _ENDS = 2**16  # bytes at either end of a file that are searched
 
 
-def check_new_file(path: Path, overwrite: bool, begins: bytes | None = None) -> None:
+def check_new_file(path: Path, overwrite: bool, begins: bytes | tuple[bytes, ...] | None = None) -> None:
     """Check that a command may write a file: nothing is there, or with `overwrite` a file of the form that is written.
 
     Args:
         path: the file to write.
         overwrite: whether to replace a file of that form.
-        begins: first bytes of such a file; by default those that the path's suffix implies.
+        begins: first bytes of such a file, or several possible ones; by default those that the path's suffix implies.
 
     Raises:
         OptionError: if the file may not be written.
@@ -47,7 +50,7 @@ def check_new_file(path: Path, overwrite: bool, begins: bytes | None = None) -> 
         )
 
 
-def check_new_files(folder: Path, overwrite: bool, begins: Mapping[str, bytes | None]) -> None:
+def check_new_files(folder: Path, overwrite: bool, begins: Mapping[str, bytes | tuple[bytes, ...] | None]) -> None:
     """Check that a command may write files into a folder, which is missing or empty, or has such files to overwrite.
 
     Args:
@@ -66,7 +69,7 @@ def check_new_files(folder: Path, overwrite: bool, begins: Mapping[str, bytes | 
         check_new_file(folder / name, overwrite, first)
 
 
-def _has_form(path: Path, first: bytes, mark: bytes) -> bool:
+def _has_form(path: Path, first: bytes | tuple[bytes, ...], mark: bytes) -> bool:
     if not path.is_file() or path.is_symlink():
         return False
     with path.open("rb") as stream:

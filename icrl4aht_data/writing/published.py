@@ -218,7 +218,7 @@ def _check_content(history: _PublishedHistory, seen: dict[bytes, _PublishedHisto
 def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenance:
     """Return provenance that says what the conversion changed: names of teammates, and rows of views."""
     notes = dict(history.line.get("published", {}))
-    if history.short:
+    if history.short and history.kind == OBSERVATIONS:
         layout = get_layout(history.line["layout"])
         notes |= {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=layout.height)}
     return replace(provenance, other={**provenance.other, "published": notes}) if notes else provenance
@@ -323,13 +323,10 @@ class _PublishedHistory:
         Raises:
             PublishedFormatError: names the array, and the expected and found values.
         """
-        field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
-        rows = steps if field.axis == "T" else steps // self.kept_steps
-        shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
-        expected = (rows, *shape)
-        with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
-            found = read_dataset(member(self.file, f"{self.line['h5_group']}/{name}"), expected)
-        array = self._compact(name, found)
+        layout, steps = get_layout(self.line["layout"]), self.line["T"]
+        if name == "obs" and self.short and self.kind != OBSERVATIONS:  # states show the rows that were not recorded
+            return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
+        array = self._read_recorded(name)
         if name == "obs" and self.short:
             try:
                 return complete_views(layout, array)
@@ -343,10 +340,19 @@ class _PublishedHistory:
                 f"steps, the first at {np.flatnonzero(array)[:3].tolist()}; give the episodes' length with --kept-steps"
             )
         if name == "state":
-            obs = self.read("obs")
-            if not np.array_equal(obs, fast_observe(layout, array, np.empty_like(obs))):
+            obs, shown = self._read_recorded("obs"), np.empty((steps, *layout.obs_shape), np.uint8)
+            if not np.array_equal(obs, fast_observe(layout, array, shown)[:, : obs.shape[1]]):
                 raise PublishedFormatError(f"{self.where}: obs is not what state shows")
         return array
+
+    def _read_recorded(self, name: str) -> np.ndarray:
+        """Return one array in the field's compact dtype; views have the rows that were recorded."""
+        field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
+        rows = steps if field.axis == "T" else steps // self.kept_steps
+        shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
+        with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
+            found = read_dataset(member(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
+        return self._compact(name, found)
 
     def _compact(self, name: str, found: np.ndarray) -> np.ndarray:
         """Convert values to the field's compact dtype, if they are integers in its range."""

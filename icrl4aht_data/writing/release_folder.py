@@ -6,6 +6,7 @@ A folder is proved by its manifest: it lists every file of the folder, and each 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -31,6 +32,8 @@ PUBLISHED_FILES = (HISTORIES_H5, HISTORIES_INDEX, "tasks.jsonl", "provenance.jso
 
 LISTING = "files.sha256"
 """Their hashes, in sha256sum's format."""
+
+_PARTIAL = re.compile(r"^(.*/)?\.([^/]+)\.partial$")  # files of `atomic_write`, which a killed writer leaves
 
 Snapshot = dict[str, tuple[int, int, int]]
 """File of a folder -> its inode, size and time of change in nanoseconds."""
@@ -68,11 +71,11 @@ def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path],
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
     lock = lock_beside(target)
-    for leftover in (new, old):
-        if not lock.exists() and not _was_left_by_a_writer(leftover):  # a killed writer leaves its lock, usually
-            raise OptionError(f"{leftover}: was not left by this package; move it away, or give another folder")
     try:
         with process_lock(lock, wait=False):
+            for leftover in (new, old):
+                if not _was_left_by_a_writer(leftover):
+                    raise OptionError(f"{leftover}: was not left by this package; move it away, or give another folder")
             try:
                 if old.exists() and not target.exists():  # a writer was killed between the two renames below
                     old.rename(target)
@@ -161,7 +164,10 @@ def _was_left_by_a_writer(folder: Path) -> bool:
     own = {*PUBLISHED_FILES, LISTING, MANIFEST}
     if not os.path.lexists(folder):
         return True
-    return folder.is_dir() and all(name in own or is_known_file(name) for name in files_below(folder))
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    names = [_PARTIAL.sub(r"\1\2", name) for name in files_below(folder)]
+    return all(name in own or is_known_file(name) for name in names)
 
 
 def _snapshot(folder: Path) -> Snapshot:
@@ -173,6 +179,8 @@ def _foreign_content(folder: Path, present: Iterable[str]) -> str | None:
     """Return what of a folder this package did not write, in words; None if it wrote everything."""
     if not folder.is_dir():
         return "is not a folder"
+    if not {MANIFEST, LISTING} & set(present):
+        return f"is not a release: it has no {MANIFEST}"
     try:
         own, listed = (MANIFEST, read_manifest(folder)) if MANIFEST in present else (LISTING, _read_listing(folder))
     except Icrl4ahtError as error:

@@ -185,6 +185,18 @@ def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
     assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
 
 
+def test_a_release_of_another_profile_is_not_replaced(built, tmp_path, monkeypatch):
+    def never(*arguments):
+        raise AssertionError("tasks were collected")
+
+    monkeypatch.setattr(build, "collect_tasks", never)
+    shutil.copytree(built / "a" / "lite", tmp_path / "lite")
+    (tmp_path / "other.toml").write_text(TINY)
+    with pytest.raises(OptionError, match="made with tiny, not with profile other, and is not replaced; move it away"):
+        build.build_releases(load_profile(str(tmp_path / "other.toml")), tmp_path, ["lite"], Console(file=StringIO()))
+    assert verify_release(tmp_path / "lite").ok
+
+
 def test_nothing_but_lines_where_output_is_no_terminal(built):
     output = StringIO()
     build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output))

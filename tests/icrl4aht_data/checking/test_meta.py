@@ -137,7 +137,14 @@ def test_a_shard_with_a_hole_of_a_terabyte(damaged, with_info):
         (damaged / INFO).unlink()
     for level in ("quick", "full", "deep"):
         with time_limit(20):
-            assert any("bytes, found 1,000,000,000,000" in problem for problem in problems(damaged, level))
+            found = problems(damaged, level)
+            assert sum("bytes, found 1,000,000,000,000" in problem for problem in found) == 1, found
+
+
+def test_a_card_with_a_hole_of_a_terabyte(damaged):
+    os.truncate(damaged / "README.md", 10**12)
+    found = problems(damaged)
+    assert any("README.md: expected at most 4,294,967,296 bytes, found 1,000,000,000,000" in line for line in found)
 
 
 def test_version_2_has_no_strong_hashes(learned, tmp_path):

@@ -11,13 +11,16 @@ from PIL import Image
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import save_figure
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
 from icrl4aht_data.writing.parquet import to_parquet
 
 
 def write_gif(path: Path) -> None:
-    Image.new("P", (2, 2)).save(path)
+    dataset = load_icrl4aht(layout="demo_wide")
+    save_episode(path, get_layout("demo_wide"), dataset[0].state[:2])
 
 
 def write_index(path: Path) -> None:
@@ -53,9 +56,14 @@ def test_pictures_and_tables_of_others_are_not_replaced(tmp_path):
     import pyarrow.parquet as pq
 
     Image.new("RGB", (2, 2)).save(tmp_path / "photo.png")
-    pq.write_table(pa.table({"a": [1]}), tmp_path / "other.parquet")
+    Image.new("P", (2, 2)).save(tmp_path / "film.gif")
+    for suffix in ("png", "svg", "pdf"):
+        figure = Figure()
+        figure.text(0, 0, "icrl4aht-data")
+        figure.savefig(tmp_path / f"figure.{suffix}")
+    pq.write_table(pa.table({"history_id": ["icrl4aht-data"]}), tmp_path / "other.parquet")
     (tmp_path / "page.html").write_text("<!doctype html>\n<title>mine</title>")
-    for path in tmp_path.iterdir():
+    for path in sorted(tmp_path.iterdir()):
         with pytest.raises(OptionError, match="is not a file as this command writes it"):
             check_new_file(path, overwrite=True)
 

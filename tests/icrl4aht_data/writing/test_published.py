@@ -125,6 +125,29 @@ def test_short_views_are_completed(short_views, tmp_path):
     assert verify_release(tmp_path / "out", level="deep").ok
 
 
+@pytest.mark.parametrize("kind", ["lite", "full"])
+def test_short_views_with_states(short_views, tmp_path, kind):
+    """The states show the rows that were not recorded; a changed recorded row is found."""
+    files, _, complete = short_views
+    shutil.copytree(files, tmp_path / "files")
+    dataset = load_icrl4aht(files.parent / "release")
+    with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+        for name, group in file.items():
+            for field in ("state", "episode_end_state"):
+                group[field] = dataset[int(name)].read(field)
+    from_published(tmp_path / "files", tmp_path / "out", kind, kept_steps=20)
+    found = load_icrl4aht(tmp_path / "out", obs="uint8")
+    np.testing.assert_array_equal(np.stack([history.obs[:] for history in found]), complete)
+    (of_task,) = read_provenance(tmp_path / "out" / PROVENANCE).values()
+    assert "padding" not in of_task.other.get("published", {})
+    assert verify_release(tmp_path / "out", level="deep").ok
+    with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
+        stored: Any = file["/1/obs"]
+        stored[7] = stored[8]
+    with pytest.raises(PublishedFormatError, match="group /1: obs is not what state shows"):
+        from_published(tmp_path / "files", tmp_path / "again", kind, kept_steps=20)
+
+
 @pytest.mark.parametrize("layout", CRAMPED, ids=lambda layout: layout.name)
 def test_every_cell_of_a_cramped_map_is_told_by_its_short_view(layout):
     records = np.zeros((len(layout.rooms[0]), record_size(layout)), np.uint8)

@@ -231,6 +231,34 @@ def test_a_writer_killed_between_the_two_renames(tmp_path):
     assert (tmp_path / "release" / "MANIFEST.sha256").read_bytes() == before
 
 
+@pytest.mark.parametrize("end", ["partial", "old"])
+def test_folders_with_temporary_names_are_kept_also_with_a_lock(tmp_path, end):
+    folder = tmp_path / f".release.{end}"
+    folder.mkdir()
+    (folder / "precious.txt").write_text("years")
+    (tmp_path / ".release.lock").touch()
+    with pytest.raises(OptionError, match=rf"\.release\.{end}: was not left by this package"):
+        write_cramped(tmp_path / "release", fail)
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [folder.name]
+    assert (folder / "precious.txt").read_text() == "years"
+
+
+def test_leftovers_of_a_killed_writer_are_removed(tmp_path):
+    (tmp_path / ".release.partial" / "meta").mkdir(parents=True)
+    for name in ("meta/info.json", "meta/.info.json.partial", ".MANIFEST.sha256.partial"):
+        (tmp_path / ".release.partial" / name).write_text("{")
+    (tmp_path / ".release.lock").touch()
+    random_release(tmp_path / "release")
+    assert [path.name for path in tmp_path.iterdir()] == ["release"]
+
+
+def test_a_plain_folder_is_not_replaced(tmp_path):
+    (tmp_path / "release").mkdir()
+    (tmp_path / "release" / "thesis.txt").write_text("years")
+    with pytest.raises(OptionError, match=r"is not a release: it has no MANIFEST\.sha256; --overwrite replaces only"):
+        random_release(tmp_path / "release", overwrite=True)
+
+
 def test_a_link_to_a_release_is_followed(tmp_path):
     random_release(tmp_path / "real", seed=1)
     (tmp_path / "link").symlink_to(tmp_path / "real")
