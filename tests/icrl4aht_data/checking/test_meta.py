@@ -138,7 +138,8 @@ def test_a_shard_with_a_hole_of_a_terabyte(damaged, with_info):
     for level in ("quick", "full", "deep"):
         with time_limit(20):
             found = problems(damaged, level)
-            assert sum("bytes, found 1,000,000,000,000" in problem for problem in found) == 1, found
+            assert any("bytes, found 1,000,000,000,000" in problem for problem in found)
+            assert sum("bytes, found" in problem for problem in found) == 1, found
 
 
 def test_a_card_with_a_hole_of_a_terabyte(damaged):
