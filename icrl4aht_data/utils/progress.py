@@ -138,7 +138,8 @@ class LineProgress(Progress):
 
 
 def _unit(task: Task) -> str:
-    return f" {task.fields['unit']}" if task.fields.get("unit") else ""
+    unit = task.fields.get("unit") or ""
+    return f" {unit.removesuffix('s') if task.total == 1 else unit}" if unit else ""
 
 
 def _note(task: Task) -> str:
