@@ -25,7 +25,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, Kind, episode_ends
+from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES, Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
@@ -91,13 +91,13 @@ def bundle_release(release: Path) -> Path:
     return MINI
 
 
-def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTask:
-    metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
-    rewards = np.load(folder / "rewards.npy", mmap_mode="r")
-    streams = best_streams(rewards, profile.keep)
-    plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
-    labeller = choose_labeller(folder, task, suite)
-    populations = TeammateSuite(
+def _populations(task: Task, profile: Profile, suite: Path) -> TeammateSuite | None:
+    """The populations of a learned teammate: the profile's, or those named by the release that it is taken from."""
+    if suite.name == TEAMMATES and (suite.parent / PROVENANCE).is_file():
+        recorded = read_provenance(suite.parent / PROVENANCE).get(task.task_id)
+        if recorded is not None:
+            return recorded.suite
+    return TeammateSuite(
         algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
         members=profile.teammates.members,
         train=profile.teammates.train,
@@ -105,6 +105,14 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
         threshold=THRESHOLD,
         xla_threads=population_threads(suite, task.layout.name, task.teammate_kind),
     )
+
+
+def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTask:
+    metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+    rewards = np.load(folder / "rewards.npy", mmap_mode="r")
+    streams = best_streams(rewards, profile.keep)
+    plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
+    labeller = choose_labeller(folder, task, suite)
     provenance = Provenance(
         profile=metadata["profile"],
         profile_hash=profile.hash,
@@ -128,7 +136,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
             episodes=LABEL_EPISODES,
             last_return_greedy=labeller.last_return_greedy,
         ),
-        suite=populations if task.teammate_family == "rl" else None,
+        suite=_populations(task, profile, suite) if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
     if profile.policies:
