@@ -21,7 +21,7 @@ from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import explain_full_disk
 from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.locks import lock_beside, process_lock
+from icrl4aht_data.utils.locks import lock_path, process_lock
 from icrl4aht_data.utils.paths import files_below, resolve_inside
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
@@ -70,7 +70,7 @@ def atomic_folder(
 def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path], before: Snapshot) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
-    lock = lock_beside(target)
+    lock = lock_path(target)
     try:
         with process_lock(lock, wait=False):
             for leftover in (new, old):
