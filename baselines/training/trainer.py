@@ -216,8 +216,8 @@ def train(
         The state after the last step.
 
     Raises:
-        OptionError: if the folder holds a run of other settings, or one with another number of XLA threads, which would
-            go on to other bits; if tensorboardX is required and not installed.
+        OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which the
+            resumed training would give different bits; if tensorboardX is required and not installed.
         BusyError: if another process trains in the folder.
         TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
     """
