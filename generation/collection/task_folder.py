@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -44,9 +43,6 @@ FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
 """Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
 
 _LINE_BYTES = 600  # of an update, in the metrics and in the timing
-
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of the errors of a full disk, a full quota and a limited file."""
 
 EGO_CHECKPOINTS = 5
 """Checkpoints of each ego, evenly spaced over its training, as those of learned teammates are."""
