@@ -137,11 +137,6 @@ training_options = dataclass_options(
 model_options = dataclass_options(ModelOptions, "model", default_text={"layers": "the size's", "width": "the size's"})
 
 
-def format_loss(loss: float | None) -> str:
-    """Returns a note for a progress bar."""
-    return "" if loss is None else f", loss {loss:.3f}"
-
-
 def default_batch_size() -> int:
     """Returns the paper's batch size, or on a CPU one that makes a step take seconds."""
     import jax

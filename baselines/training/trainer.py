@@ -40,6 +40,11 @@ StepProgress = Callable[[int, float | None], None]
 """Called with (steps done, the loss last logged or None)."""
 
 
+def format_loss(loss: float | None) -> str:
+    """Returns the loss as a note for a progress bar; empty for None."""
+    return "" if loss is None else f", loss {loss:.3f}"
+
+
 class TrainingData(NamedTuple):
     """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
