@@ -12,7 +12,7 @@ import click
 
 from baselines.methods.options import ModelOptions
 from baselines.training.options import FILTERS, SAVE_MINUTES, TrainOptions
-from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
@@ -107,7 +107,7 @@ def history_filters(command: Any) -> Any:
         ),
         click.option(
             "--algorithm",
-            type=Names("algorithm", lambda: (*ALGORITHMS, *HEURISTIC_KINDS)),
+            type=Names("algorithm", lambda: KIND_FAMILIES),
             multiple=True,
             help="Train only with teammates of this algorithm, such as fcp, or kind of heuristic; repeat for several.",
         ),

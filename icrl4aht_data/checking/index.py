@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from itertools import islice
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
@@ -61,7 +61,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
             report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id}, of one task: unlike {unlike}")
         if not has_tasks and entry.seed != -1:
             report.add(HISTORIES, f"history {entry.history_id}: seed: expected -1 without tasks, found {entry.seed}")
-        if entry.teammate_family != _family(entry.teammate_kind, entry.teammate_family):
+        if KIND_FAMILIES.get(entry.teammate_kind, entry.teammate_family) != entry.teammate_family:
             report.add(
                 HISTORIES,
                 f"history {entry.history_id}: teammate_kind {entry.teammate_kind!r} is of another family than "
@@ -76,11 +76,6 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
         streams.add((entry.task_id, entry.env_idx))
     for task_id in by_id.keys() - {task_id for task_id, _ in streams}:
         report.add(TASKS, f"task {task_id!r} has no history")
-
-
-def _family(kind: str, otherwise: str) -> str:
-    """Return the family of a kind of teammate that the benchmark knows."""
-    return "rl" if kind in ALGORITHMS else HEURISTIC_KINDS.get(kind, otherwise)
 
 
 def _describes(task: Task, entry: Entry) -> bool:
