@@ -74,12 +74,12 @@ class Learner:
     @property
     def network(self) -> ActorCritic:
         """The ego's network."""
-        return ActorCritic(self.config.widths, encoder=self.config.encoder, view=self.view)
+        return ActorCritic(self.config.widths, view=self.view)
 
     @cached_property
     def view(self) -> CompactView:
         """What makes the network's inputs."""
-        return CompactView(self.config.encoder, (self.env.layout,))
+        return CompactView(self.config.widths.encoder, (self.env.layout,))
 
     @cached_property
     def ppo(self) -> PPO:

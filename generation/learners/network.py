@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Integer
 
-from generation.learners.config import EncoderKind, Widths
+from generation.learners.config import Widths
 from generation.learners.encoder import CompactView, Seen, WindowEncoder, orthogonal_dense
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import WINDOW
@@ -108,18 +108,16 @@ class ActorCritic(nn.Module):
     """Recurrent actor-critic: sequences of observations to action logits and values.
 
     Args:
-        widths: layer widths.
+        widths: encoder and layer widths.
         partners: number of policies among which the critic distinguishes the partner (BRDiv, Rahman et al. 2023,
             Sec. 5); 0 for a critic without that input. The actor never has it.
         critic: False for policies that only act; their values are 0.
-        encoder: kind of the encoder.
         view: what makes compact inputs, if there are any.
     """
 
     widths: Widths = Widths()
     partners: int = 0
     critic: bool = True
-    encoder: EncoderKind = "paper"
     view: CompactView | None = None
 
     @nn.compact
@@ -144,7 +142,7 @@ class ActorCritic(nn.Module):
         widths = self.widths
         features = WindowEncoder(
             features=widths.dense,
-            kind=self.encoder,
+            kind=widths.encoder,
             pointwise=widths.pointwise,
             spatial=widths.spatial,
             normalize=True,

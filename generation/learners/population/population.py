@@ -186,12 +186,12 @@ class Population:
         pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
         partners = policies if len(pairs) > policies else 0
         partners = partners if self.partners is None else self.partners
-        return ActorCritic(self.config.widths, partners, encoder=self.config.encoder, view=self.view)
+        return ActorCritic(self.config.widths, partners, view=self.view)
 
     @cached_property
     def view(self) -> CompactView:
         """What makes the network's inputs."""
-        return CompactView(self.config.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
+        return CompactView(self.config.widths.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
 
     @cached_property
     def ppo(self) -> PPO:

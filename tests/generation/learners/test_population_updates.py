@@ -44,7 +44,7 @@ def parts(lbrdiv) -> Parts:
     record = np.asarray(before.carry.env.record)[rng.integers(0, 32, (2, steps, slots))]
     zeros = np.zeros((2, steps, slots), np.float32)
     arrays: dict[str, Any] = {
-        "record": record,
+        "seen": observe(LAYOUT, record, EGO),
         "reset": np.broadcast_to(np.arange(steps)[:, None] == 0, zeros.shape),
         "action": action,
         "log_prob": zeros - np.log(6, dtype=np.float32),
@@ -133,7 +133,7 @@ def test_policies_that_learn_at_once_learn_as_each_alone(learn, parts, learned):
 
 def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
     """The first of two policies plays the rewarded action more often than before, the second less often."""
-    obs = observe(LAYOUT, np.asarray(parts.played.record[0, 0]), EGO)[None]
+    obs = parts.played.seen[0, 0][None]
 
     def probability(params):
         hidden, reset = jnp.zeros((obs.shape[1], 8)), jnp.ones(obs.shape[:2], bool)
