@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test test-slow check format bench-env bench-eval bench-learner bench-collect bench-loader bench-remote bench-faults bench-train clean
+.PHONY: help install demo generate teammates verify control test test-slow check format bench-env bench-eval bench-learner bench-curves bench-collect bench-loader bench-remote bench-faults bench-train clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -67,8 +67,12 @@ bench-eval: install ## evaluation steps/s per teammate family, compared with the
 bench-loader: install ## batches/s of each storage mode, compared with readers of the published format, JSON lines
 	$(BIN)/python -m benchmarks.bench_loader
 
-bench-learner: install ## self-play learning steps/s, compared with JaxMARL's IPPO: PEER=ippo_rnn_overcooked_v2.py of its repository
-	$(BIN)/python -m benchmarks.bench_learner --peer $(PEER)
+bench-learner: install ## learning steps/s by profile and part, JSON lines; PEER=ippo_rnn_overcooked_v2.py compares with JaxMARL's IPPO
+	$(BIN)/python -m benchmarks.bench_learner
+	$(if $(PEER),$(BIN)/python -m benchmarks.bench_learner --part peer --peer $(PEER))
+
+bench-curves: install ## learning curves of the profiles mini and cpu, 8 seeds on three layouts (half an hour); resumes
+	$(BIN)/python -m benchmarks.bench_curves
 
 bench-remote: install ## requests, bytes and seconds of remote releases over HTTP, S3 and the Hub's protocol, JSON lines
 	$(BIN)/python -m tests.robustness.bench_remote

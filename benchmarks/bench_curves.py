@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 from matplotlib.figure import Figure
 from scipy.stats import t as student_t
 
-from benchmarks.bench_learner import make_learner
+from benchmarks.bench_learner import heuristic_learner
 from benchmarks.common import print_line
 from generation.learners.config import PPOConfig
 from generation.learners.ego import compiled_update
@@ -68,7 +68,7 @@ class Curves(NamedTuple):
 
 def train_once(layout: str, config: PPOConfig, seed: int) -> dict[str, Any]:
     """Train an ego; its curve and speed, as JSON."""
-    learner = make_learner(get_layout(layout), config)
+    learner = heuristic_learner(get_layout(layout), config)
     update, state = compiled_update(learner), jax.jit(learner.init)(jax.random.key(seed))
     state, _, first = jax.block_until_ready(update(state))
     log, started = [first], time.perf_counter()
@@ -108,7 +108,7 @@ def collect(
     return found
 
 
-def draw(curves: dict[tuple[str, str], Curves], layouts: tuple[str, ...], steps: int, path: Path) -> None:
+def draw_curves(curves: dict[tuple[str, str], Curves], layouts: tuple[str, ...], steps: int, path: Path) -> None:
     """Draw a panel per layout with the mean and band of every profile."""
     figure = Figure(figsize=(4.2 * len(layouts), 3.4), layout="constrained")
     axes_of: Any = figure.subplots(1, len(layouts), squeeze=False)[0]
@@ -161,7 +161,7 @@ def main(out: Path, names: tuple[str, ...], layouts: tuple[str, ...], seeds: int
             mean_return=round(float(np.nanmean(found.returns)), 1),
             share_of_points_overlapping=round(float((np.abs(mean - first_mean) <= half + first_half).mean()), 3),
         )
-    draw(curves, layouts, first.ego.total_steps, out / "curves.png")
+    draw_curves(curves, layouts, first.ego.total_steps, out / "curves.png")
     click.echo(f"wrote {out / 'curves.png'}", err=True)
 
 

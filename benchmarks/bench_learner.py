@@ -47,7 +47,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 _UPDATES, _PEER_UPDATES, _CALLS, _MATRIX = 3, 2, 10, 2048
 
 
-def make_learner(layout: Layout, config: PPOConfig) -> Learner:
+def heuristic_learner(layout: Layout, config: PPOConfig) -> Learner:
     """An ego with these hyper-parameters and teammate H4."""
     mate = build_teammate(layout, heuristic_teammate("utility_greedy", "default", 0), noise="seeded")
     return Learner(Environment(layout), mate, config)
@@ -62,7 +62,7 @@ class Runner:
     """
 
     def __init__(self, layout: Layout, config: PPOConfig) -> None:
-        self.learner = make_learner(layout, config)
+        self.learner = heuristic_learner(layout, config)
         self._update = compiled_update(self.learner)
         self.state = jax.jit(self.learner.init)(jax.random.key(0))
         self.run(2)
