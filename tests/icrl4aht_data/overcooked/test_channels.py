@@ -1,0 +1,116 @@
+"""Canonical channels: each layout's own channels in their places, everything else 0."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from icrl4aht_data.overcooked import observe as observe_module
+from icrl4aht_data.overcooked.channels import (
+    CANONICAL_CHANNELS,
+    canonical_places,
+    channel_names,
+    observation_shape,
+)
+from icrl4aht_data.overcooked.fast_observe import fast_observe
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_data.overcooked.observe import observe, observe_both
+from icrl4aht_data.overcooked.state import columns
+from tests.helpers.random_releases import random_history
+from tests.helpers.states import random_records
+
+each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+
+def placed(layout: Layout, own: np.ndarray) -> np.ndarray:
+    """Own observations put into the canonical places by name."""
+    out = np.zeros((*own.shape[:-1], 46), own.dtype)
+    for number, name in enumerate(channel_names(layout)):
+        out[..., CANONICAL_CHANNELS.index(name)] = own[..., number]
+    return out
+
+
+@each_layout
+def test_names_and_places(layout):
+    names, places = channel_names(layout), canonical_places(layout)
+    assert len(names) == layout.channels == len(set(names))
+    assert names == tuple(CANONICAL_CHANNELS[place] for place in places)
+    assert (np.diff(places) > 0).all(), "own channels keep their order"
+    assert observation_shape(layout) == layout.obs_shape
+    assert observation_shape(layout, canonical=True) == (5, 5, len(CANONICAL_CHANNELS)) == (5, 5, 46)
+
+
+def test_the_canonical_channels_are_the_union():
+    assert set(CANONICAL_CHANNELS) == {name for layout in LAYOUTS.values() for name in channel_names(layout)}
+    assert channel_names(get_layout("test_wide")) == CANONICAL_CHANNELS
+    groups = [
+        "self",
+        "other",
+        "wall",
+        "goal",
+        "pot",
+        "recipe",
+        "button",
+        "plate",
+        "pile",
+        "item",
+        "recipe",
+        "pot",
+        "delivery",
+    ]
+    found = [name.split("_")[0] for name in CANONICAL_CHANNELS]
+    assert [name for number, name in enumerate(found) if name != (found[number - 1] if number else "")] == groups
+    for group in ("self", "other"):
+        first = found.index(group)
+        assert CANONICAL_CHANNELS[first : first + 6] == (
+            *(f"{group}_{what}" for what in ("position", "facing_up", "facing_down", "facing_right", "facing_left")),
+            f"{group}_plate",
+        )
+    documented = observe_module.__doc__
+    assert documented is not None
+    for group in ("self", "other", "static", "piles", "item", "recipe", "pot timer", "delivery"):
+        assert f"\n    {group} " in documented
+
+
+def test_a_channel_that_no_layout_has_is_refused():
+    layout = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
+    with pytest.raises(
+        ValueError, match=r"layout mine: channels \['self_ingredient_4', .* are not among the canonical"
+    ):
+        canonical_places(layout)
+
+
+@each_layout
+def test_own_channels_are_in_their_places_and_others_are_0(layout):
+    records = random_records(layout, 200, np.random.default_rng(5))
+    for agent in (0, 1):
+        expected = placed(layout, observe(layout, records, agent))
+        assert expected.any()
+        np.testing.assert_array_equal(observe(layout, records, agent, canonical=True), expected, strict=True)
+        np.testing.assert_array_equal(observe_both(layout, records, canonical=True)[:, agent], expected, strict=True)
+        rendered = np.asarray(observe(layout, jnp.asarray(records[:20]), agent, canonical=True))
+        np.testing.assert_array_equal(rendered, expected[:20], strict=True)
+
+
+@each_layout
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_fast_rendering(layout, dtype):
+    played = random_history(layout, 10, 60, np.random.default_rng(6))["state"]
+    drawn = random_records(layout, 300, np.random.default_rng(7))
+    for states in (played, drawn):
+        out = np.full((len(states), 5, 5, 46), 9, dtype)
+        assert fast_observe(layout, states, out, threads=2, canonical=True) is out
+        np.testing.assert_array_equal(out, observe(layout, states, 0, canonical=True))
+        own = np.empty((len(states), *layout.obs_shape), dtype)  # both kinds of lookup tables are cached
+        np.testing.assert_array_equal(fast_observe(layout, states, own), observe(layout, states, 0))
+
+
+def test_records_that_the_rules_exclude():
+    layout = get_layout("cramped_up")
+    states = random_history(layout, 2, 20, np.random.default_rng(3))["state"]
+    states[3, columns(layout).pot_timers] = 99
+    out = np.empty((len(states), 5, 5, 46), np.uint8)
+    np.testing.assert_array_equal(
+        fast_observe(layout, states, out, canonical=True), placed(layout, observe(layout, states, 0))
+    )
