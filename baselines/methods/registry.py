@@ -13,6 +13,7 @@ from baselines.methods.method import Method, World
 from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import BatchView, state_view
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 
 METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
@@ -35,11 +36,13 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     return METHODS[name]
 
 
-def overcooked_world(layouts: Sequence[Layout], view: BatchView | None = None) -> World:
+def overcooked_world(layouts: Sequence[Layout], view: BatchView | None = None, canonical: bool = False) -> World:
     """Returns the world of OvercookedV2 on layouts with observations of one shape.
 
     Args:
         layouts: the layouts in batches.
         view: function that returns the observations of a batch; by default it renders state records.
+        canonical: whether observations have the canonical channels, which all layouts share, or the layouts' own.
     """
-    return World(lambda dtype: GridEncoder(dtype=dtype), layouts[0].obs_shape, view or state_view(layouts))
+    obs_shape = observation_shape(layouts[0], canonical)
+    return World(lambda dtype: GridEncoder(dtype=dtype), obs_shape, view or state_view(layouts, canonical))

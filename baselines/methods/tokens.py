@@ -65,16 +65,17 @@ def plain_view(obs: Array, layouts: Array | None) -> Array:
     return obs
 
 
-def state_view(layouts: Sequence[Layout]) -> BatchView:
+def state_view(layouts: Sequence[Layout], canonical: bool = False) -> BatchView:
     """Returns the view of batches that hold state records: uint8 (B, .., S) -> the ego's observations (B, .., 5, 5, C).
 
     Args:
         layouts: the layouts that `layouts` (B,) of a batch refers to by index, with observations of one shape.
+        canonical: whether to render the canonical channels or the layouts' own.
     """
 
     def view(records: Array, which: Array | None) -> Array:
         # Every layout is rendered for all rows: under jit a row's layout is not known, and batches mostly have one.
-        seen = [observe(layout, records[..., : record_size(layout)], EGO) for layout in layouts]
+        seen = [observe(layout, records[..., : record_size(layout)], EGO, canonical) for layout in layouts]
         if which is None:
             return seen[0]
         chosen = seen[0]

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, WINDOW, Layout
+from icrl4aht_data.overcooked.state import Array
 
 Channels = Literal["own", "canonical"]
 CHANNELS: tuple[Channels, ...] = ("own", "canonical")
@@ -62,3 +63,15 @@ def canonical_places(layout: Layout) -> np.ndarray:
 def observation_shape(layout: Layout, canonical: bool = False) -> tuple[int, int, int]:
     """Return the shape of an observation: (5, 5, C), or (5, 5, 46) with canonical channels."""
     return (WINDOW, WINDOW, len(CANONICAL_CHANNELS)) if canonical else layout.obs_shape
+
+
+def to_canonical(layout: Layout, obs: Array) -> Array:
+    """Return observations (..., C) with a layout's own channels as (..., 46) with canonical channels, in NumPy or JAX.
+
+    Equal to what `observe` renders with canonical=True.
+    """
+    xp = obs.__array_namespace__()
+    # The channel after the last one is 0; every canonical channel that the layout does not have is taken from it.
+    source = np.full(len(CANONICAL_CHANNELS), layout.channels)
+    source[canonical_places(layout)] = np.arange(layout.channels)
+    return xp.take(xp.concat([obs, xp.zeros_like(obs[..., :1])], axis=-1), xp.asarray(source), axis=-1)

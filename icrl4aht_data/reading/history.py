@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import LabelsMissingError, NotStoredError, unknown
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
-from icrl4aht_data.overcooked.channels import Channels, canonical_places, observation_shape
+from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.lazy_array import LazyArray
@@ -123,12 +123,9 @@ class History:
         if self.kind in field.absent:
             return self._rendered(start, stop, dtype, self._canonical)
         rows = self.read(name, start, stop)
-        if field.row != "obs" or not self._canonical:
-            return rows.astype(dtype, copy=False)
-        layout = self._shard.layout
-        out = np.zeros((len(rows), *observation_shape(layout, canonical=True)), dtype)
-        out[..., canonical_places(layout)] = rows
-        return out
+        if field.row == "obs" and self._canonical:
+            rows = to_canonical(self._shard.layout, rows)
+        return rows.astype(dtype, copy=False)
 
     @property
     def obs(self) -> LazyArray:
