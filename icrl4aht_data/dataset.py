@@ -71,7 +71,8 @@ def load_icrl4aht(
             `sources.CACHE_MODES`.
         threads: number of threads that decode and render; by default one for each usable core.
         channels: channels of observations: "own", which differ between layouts, or "canonical", the union of all
-            layouts' channels, so that a selection of any layouts can be sampled; see `overcooked.channels`.
+            layouts' channels, so that a selection of any layouts can be sampled; see `overcooked.channels`. State
+            records (obs="state") are rendered so by `observe` with canonical=True.
 
     Raises:
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.

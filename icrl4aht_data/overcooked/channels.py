@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, WINDOW, Layout
 from icrl4aht_data.overcooked.state import Array
 
@@ -48,13 +49,15 @@ def canonical_places(layout: Layout) -> np.ndarray:
     """Return the place of each own channel of a layout among the canonical channels, int64 (C,), ascending.
 
     Raises:
-        ValueError: if the layout has a channel that is not canonical, of an ingredient that no layout of the benchmark
-            has.
+        OptionError: if the layout has a channel that is not canonical, of an ingredient that no registered layout has.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]
     if missing:
-        raise ValueError(f"layout {layout.name}: channels {missing} are not among the canonical channels")
+        raise OptionError(
+            f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
+            f"take its own channels, or register the layout as docs/extending.md describes"
+        )
     places = np.array([CANONICAL_CHANNELS.index(name) for name in names])
     places.flags.writeable = False  # callers share it
     return places
