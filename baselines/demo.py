@@ -18,7 +18,7 @@ from baselines.report.page import write_page_with_episodes
 from baselines.report.results import EvaluationRun, note_results, read_run
 from baselines.training.histories import prepare
 from baselines.training.options import HistoryOptions, TrainOptions
-from baselines.training.trainer import train
+from baselines.training.trainer import format_loss, train
 from generation.teammates.instances import published_task
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
@@ -112,7 +112,7 @@ def _train_demo(folder: Path, model: ModelOptions, options: TrainOptions, consol
     with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
-            show("AD", step, options.steps, "" if loss is None else f", loss {loss:.3f}")
+            show("AD", step, options.steps, format_loss(loss))
 
         train(job.method, job.data, job.options, folder, job.about, done=done)
     console.print(f"losses on training and held-out histories: {folder / 'curves.png'}", highlight=False)

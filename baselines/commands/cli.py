@@ -20,7 +20,6 @@ from baselines.commands.options import (
     episodes_option,
     experiment_options,
     find_ego,
-    format_loss,
     gifs_option,
     history_filters,
     model_options,
@@ -366,6 +365,7 @@ def train_command(
     if coordinator:
         jax.distributed.initialize(coordinator, processes, process)
     from baselines.training.histories import prepare
+    from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
     layers, width, steps = SIZES[size]
@@ -482,6 +482,7 @@ def control_command(out: Path) -> None:
     their context cut off. Exits with 1 if a check fails.
     """
     from baselines.control.control import format_checks, run_control
+    from baselines.training.trainer import format_loss
 
     with bars(edges=True, unit="steps") as show:
 

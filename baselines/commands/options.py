@@ -12,7 +12,7 @@ import click
 
 from baselines.methods.options import ModelOptions
 from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, TrainOptions
-from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
@@ -109,7 +109,7 @@ def history_filters(command: Any) -> Any:
         ),
         click.option(
             "--algorithm",
-            type=Names("algorithm", lambda: (*ALGORITHMS, *HEURISTIC_KINDS)),
+            type=Names("algorithm", lambda: KIND_FAMILIES),
             multiple=True,
             help="Train only with teammates of this algorithm, such as fcp, or kind of heuristic; repeat for several.",
         ),
@@ -137,11 +137,6 @@ training_options = dataclass_options(
     TrainOptions, "train", default_text={"steps": "the size's", "batch_size": _PAPER_OR_CPU}
 )
 model_options = dataclass_options(ModelOptions, "model", default_text={"layers": "the size's", "width": "the size's"})
-
-
-def format_loss(loss: float | None) -> str:
-    """Returns a note for a progress bar."""
-    return "" if loss is None else f", loss {loss:.3f}"
 
 
 def training_summary(histories: dict[str, Any]) -> str:

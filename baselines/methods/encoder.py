@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
-from generation.learners.network import Conv3x3
+from generation.learners.encoder import Conv3x3
 
 FEATURES = 64
 """Width of an encoded observation and of an embedded action (the paper's d_emb)."""
@@ -19,7 +19,7 @@ _init = nn.initializers.orthogonal(2**0.5)
 class GridEncoder(nn.Module):
     """Three 1 x 1 and three 3 x 3 SAME convolutions with ReLU, then one dense layer (paper, App. E.1).
 
-    89,112 parameters at C = 40 channels. Convolutions are matrix products, see `generation.learners.network.Conv3x3`.
+    89,112 parameters at C = 40 channels. Convolutions are matrix products, see `generation.learners.encoder.Conv3x3`.
     """
 
     features: int = FEATURES

@@ -120,7 +120,7 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
     """
     passing = np.ones(len(dataset), bool)
     for name, values in filters.items():
-        column = field_values(dataset, FILTERS[name])
+        column = dataset.column(FILTERS[name])
         passing &= np.isin(column, values)
         found = sorted(set(column.tolist()))
         for value in values:
@@ -135,12 +135,7 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
             f"{wanted}: none of {dataset!r} has these together: leave one of them out, or choose another layout or "
             f"release"
         )
-    return dataset.select(dataset.ids[passing]) if filters else dataset
-
-
-def field_values(dataset: Dataset, field: str) -> np.ndarray:
-    """Returns a text field of the selected histories, str (H,)."""
-    return np.array(dataset.index.values(field))[dataset.index.entries.column(field)[dataset.ids]]
+    return dataset.select(passing) if filters else dataset
 
 
 def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
@@ -150,10 +145,10 @@ def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
     `teammates`, the ids of the teammates, see `seen.teammate_ids`; None if the release does not describe them.
     Histories that are held out for validation do not belong to `dataset`.
     """
-    columns = [field_values(dataset, field) for field in _CELL_FIELDS.values()]
+    columns = [dataset.column(field) for field in _CELL_FIELDS.values()]
     tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
     history_of: dict[str, int] = {}
-    for *cell, task_id, history_id in zip(*columns, field_values(dataset, "task_id"), dataset.ids, strict=True):
+    for *cell, task_id, history_id in zip(*columns, dataset.column("task_id"), dataset.ids, strict=True):
         tasks[tuple(map(str, cell))].append(str(task_id))
         history_of[str(task_id)] = int(history_id)
     return [
@@ -225,9 +220,9 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0) -> HistorySpli
         held[rows[: _count(share, len(rows))]] = True
     in_held_task = np.isin(codes, held_tasks)
     return HistorySplit(
-        train=dataset.select(dataset.ids[~held & ~in_held_task]),
-        histories=dataset.select(dataset.ids[held]),
-        teammates=dataset.select(dataset.ids[in_held_task]) if len(held_tasks) else None,
+        train=dataset.select(~held & ~in_held_task),
+        histories=dataset.select(held),
+        teammates=dataset.select(in_held_task) if len(held_tasks) else None,
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import FAMILIES, KIND_FAMILIES
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -16,8 +16,7 @@ from icrl4aht_data.utils.files import json_hash
 TRAINED_ON = "trained_on"
 """Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
 
-_KINDS = {family: tuple(kind for kind, of in HEURISTIC_KINDS.items() if of == family) for family in FAMILIES}
-_KINDS["rl"] = ALGORITHMS
+_KINDS = {family: tuple(kind for kind, of in KIND_FAMILIES.items() if of == family) for family in FAMILIES}
 
 
 class SeenInTraining(NamedTuple):

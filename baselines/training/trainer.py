@@ -40,6 +40,11 @@ StepProgress = Callable[[int, float | None], None]
 """Called with (steps done, the loss last logged or None)."""
 
 
+def format_loss(loss: float | None) -> str:
+    """Returns the loss as a note for a progress bar; empty for None."""
+    return "" if loss is None else f", loss {loss:.3f}"
+
+
 class TrainingData(NamedTuple):
     """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
@@ -216,8 +221,8 @@ def train(
         The state after the last step.
 
     Raises:
-        OptionError: if the folder holds a run of other settings, or one with another number of XLA threads, which would
-            go on to other bits; if tensorboardX is required and not installed.
+        OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which the
+            resumed training would give different bits; if tensorboardX is required and not installed.
         BusyError: if another process trains in the folder.
         TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
     """

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from generation.collection.job import TaskOutcome
-from generation.collection.task_folder import FULL_DISK
+from icrl4aht_data.utils.disk import NO_ROOM
 from icrl4aht_data.utils.files import atomic_write, read_text
 from icrl4aht_data.utils.locks import process_lock
 
@@ -49,7 +49,7 @@ class FailureLog:
         try:
             self._write()
         except OSError as error:
-            if error.errno not in FULL_DISK:
+            if error.errno not in NO_ROOM:
                 raise
 
     def _write(self) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 import jax
 
 from generation.collection.task_folder import (
-    FULL_DISK,
     LEARNER,
     ArtefactWriter,
     check_room,
@@ -37,6 +36,7 @@ from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.utils.disk import NO_ROOM
 
 TEAMMATE_NOISE: Noise = "seeded"
 """Heuristic teammates of training histories draw from each episode's own key."""
@@ -153,7 +153,7 @@ def _readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if not isinstance(error, DiskFullError) and error.errno not in FULL_DISK:
+        if not isinstance(error, DiskFullError) and error.errno not in NO_ROOM:
             raise
         shown = disk_full(partial, needed)
         if not (partial / LEARNER).exists():

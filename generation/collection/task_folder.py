@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -28,7 +27,7 @@ import jax
 import numpy as np
 
 from generation.collection.record import HistoryArrays, array_shapes, record_rollout
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
 from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
@@ -45,25 +44,10 @@ FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
 
 _LINE_BYTES = 600  # of an update, in the metrics and in the timing
 
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of the errors of a full disk, a full quota and a limited file."""
-
-EGO_CHECKPOINTS = 5
-"""Checkpoints of each ego, evenly spaced over its training, as those of learned teammates are."""
-
 
 def partial_folder(folder: Path) -> Path:
     """Path of an artefact that is not finished."""
     return folder.with_name(f"{folder.name}.partial")
-
-
-def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
-    """Numbers of updates after which a checkpoint of the ego is kept, ascending; the last one is the end of training.
-
-    Fewer than `EGO_CHECKPOINTS` if there are fewer updates.
-    """
-    moments = (-(-config.updates * (number + 1) // EGO_CHECKPOINTS) for number in range(EGO_CHECKPOINTS))
-    return tuple(dict.fromkeys(moments))
 
 
 def checkpoint_path(folder: Path, number: int) -> Path:

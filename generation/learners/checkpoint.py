@@ -14,13 +14,25 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
-from generation.learners.config import Widths
+from generation.learners.config import PPOConfig, Widths
 from generation.learners.network import ActorCritic
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.checkpoints import CHECKPOINT_BYTES
 from icrl4aht_data.utils.files import parse_json, plain_size, read_text
 
 POLICY_WEIGHTS, POLICY_CARD = "policy.safetensors", "policy.json"
+
+POLICY_CHECKPOINTS = 5
+"""Checkpoints of each policy, evenly spaced over its training (paper, App. B.1)."""
+
+
+def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
+    """Numbers of updates after which a checkpoint is kept, ascending; the last one is the end of training.
+
+    Fewer than `POLICY_CHECKPOINTS` if there are fewer updates.
+    """
+    moments = (-(-config.updates * (number + 1) // POLICY_CHECKPOINTS) for number in range(POLICY_CHECKPOINTS))
+    return tuple(dict.fromkeys(moments))
 
 
 def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.option_fields import check_fields, option_field
+
+EncoderKind = Literal["paper", "words", "mlp"]
+"""How a network encodes observations.
+
+`paper`: the paper's convolutions. `words`: the same parameters, with the first layers computed once per word of a cell,
+see `learners.encoder`. `mlp`: one dense layer of the flat window, in place of the convolutions.
+"""
 
 _WIDEST, _LAYERS = 2**13, 16  # larger values in a file are a mistake, or meant to exhaust memory
 
@@ -69,6 +76,7 @@ class PPOConfig:
     shaping_horizon: int = option_field(
         PAPER_EGO_STEPS, "Environment steps until shaped rewards have the weight 0.", at_least=1
     )
+    encoder: EncoderKind = option_field("paper", "Encoder of observations: paper, words (the same, faster) or mlp.")
     widths: Widths = field(default_factory=Widths)
 
     def __post_init__(self) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Int, Key
 
 from generation.env import Environment
 from generation.learners.config import PPOConfig
+from generation.learners.encoder import CompactView
 from generation.learners.network import ActorCritic
 from generation.learners.ppo import PPO, episode_metrics, ppo_optimizer, sequences, shaping_weight
 from generation.learners.rollout import (
@@ -73,12 +74,17 @@ class Learner:
     @property
     def network(self) -> ActorCritic:
         """The ego's network."""
-        return ActorCritic(self.config.widths)
+        return ActorCritic(self.config.widths, encoder=self.config.encoder, view=self.view)
+
+    @cached_property
+    def view(self) -> CompactView:
+        """What makes the network's inputs."""
+        return CompactView(self.config.encoder, (self.env.layout,))
 
     @cached_property
     def ppo(self) -> PPO:
         """The algorithm of the updates."""
-        return PPO(self.env.layout, self.network, self.config)
+        return PPO(self.network, self.config)
 
     def init(self, key: Key[Array, ""]) -> LearnerState:
         """Returns the state of an untrained ego before the first step."""
@@ -102,7 +108,7 @@ class Learner:
         # Only for the value of the observation after the roll-out: the action is drawn again in the next one.
         after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
         shaping = shaping_weight(self.config, state.update)
-        played = sequences(rollout, EGO, ego.agent_slots, state.carry.memories[EGO], after.value, shaping)
+        played = sequences(self.view, rollout, EGO, ego.agent_slots, state.carry.memories[EGO], after.value, shaping)
         params, optimizer, losses = self.ppo.learn(state.params, state.optimizer, played, learn_key)
         metrics = losses | episode_metrics(rollout) | {"shaping": shaping}
         return (

@@ -1,8 +1,7 @@
 """The CNN-GRU actor-critic of teammates and egos (paper, App. B.1 and C.2.1), in a form that is fast on a CPU.
 
-B denotes the batch dimension, N sequences, T steps. Parameters and outputs are those of the plain form (1 x 1 and 3 x 3
-SAME convolutions, a GRU cell); the arithmetic differs: a 1 x 1 convolution is a matrix product; a 3 x 3 one on a 5 x 5
-patch is one dense matrix built from its kernel; the GRU's input products are computed for all steps outside the scan.
+N denotes sequences, T steps. Parameters and outputs are those of the plain form (convolutions and a GRU cell); the
+arithmetic differs: see `encoder`, and the GRU's input products are computed for all steps outside the scan.
 """
 
 from __future__ import annotations
@@ -12,56 +11,12 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
-from generation.learners.config import Widths
+from generation.learners.config import EncoderKind, Widths
+from generation.learners.encoder import CompactView, Seen, WindowEncoder, orthogonal_dense
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import WINDOW
-
-_CELLS = WINDOW * WINDOW
-
-
-class Conv3x3(nn.Module):
-    """A 3 x 3 SAME convolution of a 5 x 5 patch: (B, 25 * c_in) -> (B, 25 * features)."""
-
-    features: int
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "B _"]) -> Float[Array, "B _"]:
-        channels = x.shape[-1] // _CELLS
-        kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
-        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
-        matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(_CELLS * channels, _CELLS * self.features)
-        return x @ matrix + jnp.tile(bias, _CELLS)
-
-
-def _tap_of_cells() -> np.ndarray:
-    """int (25, 25): number of the kernel tap, 0..8, between an input and an output cell; 9 if they are not adjacent."""
-    cell = np.arange(_CELLS)
-    dy = cell[:, None] // WINDOW - cell // WINDOW + 1
-    dx = cell[:, None] % WINDOW - cell % WINDOW + 1
-    near = (dy >= 0) & (dy < 3) & (dx >= 0) & (dx < 3)
-    return np.where(near, dy * 3 + dx, 9)
-
-
-class ObservationEncoder(nn.Module):
-    """Maps observations, each by itself, to features."""
-
-    widths: Widths
-
-    @nn.compact
-    def __call__(self, obs: Integer[Array, "*B 5 5 C"]) -> Float[Array, "*B dense"]:
-        batch = obs.shape[:-3]
-        x = obs.reshape(-1, _CELLS, obs.shape[-1]).astype(jnp.float32)
-        for width in self.widths.pointwise:
-            x = nn.relu(_dense(width, 2**0.5)(x))
-        x = x.reshape(x.shape[0], -1)
-        for width in self.widths.spatial:
-            x = nn.relu(Conv3x3(width)(x))
-        x = nn.relu(_dense(self.widths.dense, 2**0.5)(x))
-        return nn.LayerNorm()(x).reshape(*batch, self.widths.dense)
 
 
 class GRU(nn.Module):
@@ -77,17 +32,76 @@ class GRU(nn.Module):
         recurrent = self.param("recurrent", _orthogonal_gates, (self.width, 3 * self.width))
         bias = self.param("candidate_bias", nn.initializers.zeros_init(), (self.width,))
 
-        def step(hidden, inputs):
-            gates, reset = inputs
-            hidden = jnp.where(reset[:, None], 0.0, hidden)
-            r_in, z_in, n_in = jnp.split(gates, 3, axis=-1)
-            r_h, z_h, n_h = jnp.split(hidden @ recurrent, 3, axis=-1)
-            r, z = nn.sigmoid(r_in + r_h), nn.sigmoid(z_in + z_h)
-            candidate = nn.tanh(n_in + r * (n_h + bias))
-            hidden = (1 - z) * candidate + z * hidden
-            return hidden, hidden
+        states = recurrent_states(hidden, gates, reset, recurrent, bias)
+        return states[-1], states
 
-        return jax.lax.scan(step, hidden, (gates, reset))
+
+@jax.custom_vjp
+def recurrent_states(
+    hidden: Float[Array, "N H"],
+    gates: Float[Array, "T N 3*H"],
+    reset: Bool[Array, "T N"],
+    recurrent: Float[Array, "H 3*H"],
+    bias: Float[Array, " H"],
+) -> Float[Array, "T N H"]:
+    """Returns the states of a GRU after every step.
+
+    Args:
+        hidden: state before the first step.
+        gates: the input's part of reset gate, update gate and candidate.
+        reset: whether the state is zero before a step.
+        recurrent: weights of the state for the same three.
+        bias: of the state's part of the candidate.
+    """
+    return _scan_states(hidden, gates, reset, recurrent, bias)[0]
+
+
+def _scan_states(hidden, gates, reset, recurrent, bias):
+    """The states, and what their gradient needs."""
+    width = recurrent.shape[0]
+
+    def step(hidden, inputs):
+        gates, reset = inputs
+        before = jnp.where(reset[:, None], 0.0, hidden)
+        own = before @ recurrent
+        r, z = jnp.split(nn.sigmoid(gates[:, : 2 * width] + own[:, : 2 * width]), 2, axis=-1)
+        memory = own[:, 2 * width :] + bias
+        candidate = nn.tanh(gates[:, 2 * width :] + r * memory)
+        hidden = (1 - z) * candidate + z * before
+        return hidden, (hidden, (before, r, z, memory, candidate))
+
+    states, inner = jax.lax.scan(step, hidden, (gates, reset))[1]
+    return states, (inner, reset, recurrent)
+
+
+def _states_gradient(saved, to_states):
+    """Gradients of all inputs, in up to half the time of those that JAX derives.
+
+    The loop computes only what depends on the step after it; all else, the weights' gradient above all, is one
+    operation over all steps.
+    """
+    (before, r, z, memory, candidate), reset, recurrent = saved
+    width = recurrent.shape[0]
+    to_candidate = (1 - z) * (1 - candidate**2)
+    to_z = (before - candidate) * z * (1 - z)
+    to_r = memory * r * (1 - r)
+    continues = 1.0 - reset[..., None]
+
+    def step_back(to_hidden, inputs):
+        to_state, to_candidate, to_z, to_r, r, z, continues = inputs
+        to_hidden = to_hidden + to_state
+        to_n = to_hidden * to_candidate
+        to_own = jnp.concatenate([to_n * to_r, to_hidden * to_z, to_n * r], axis=-1)
+        return (to_hidden * z + to_own @ recurrent.T) * continues, (to_own, to_n)
+
+    inputs = (to_states, to_candidate, to_z, to_r, r, z, continues)
+    to_first, (to_own, to_n) = jax.lax.scan(step_back, jnp.zeros_like(to_states[0]), inputs, reverse=True)
+    to_gates = jnp.concatenate([to_own[..., : 2 * width], to_n], axis=-1)
+    to_recurrent = jnp.einsum("tnh,tng->hg", before, to_own)
+    return to_first, to_gates, None, to_recurrent, to_own[..., 2 * width :].sum(axis=(0, 1))
+
+
+recurrent_states.defvjp(_scan_states, _states_gradient)
 
 
 class ActorCritic(nn.Module):
@@ -98,17 +112,21 @@ class ActorCritic(nn.Module):
         partners: number of policies among which the critic distinguishes the partner (BRDiv, Rahman et al. 2023,
             Sec. 5); 0 for a critic without that input. The actor never has it.
         critic: False for policies that only act; their values are 0.
+        encoder: kind of the encoder.
+        view: what makes compact inputs, if there are any.
     """
 
     widths: Widths = Widths()
     partners: int = 0
     critic: bool = True
+    encoder: EncoderKind = "paper"
+    view: CompactView | None = None
 
     @nn.compact
     def __call__(
         self,
         hidden: Float[Array, "N H"],
-        obs: Integer[Array, "T N 5 5 C"],
+        obs: Seen,
         reset: Bool[Array, "T N"],
         partner: Integer[Array, " N"] | None = None,
     ) -> tuple[Float[Array, "N H"], Float[Array, "T N 6"], Float[Array, "T N"]]:
@@ -116,25 +134,34 @@ class ActorCritic(nn.Module):
 
         Args:
             hidden: recurrent state before the first step.
-            obs: observations.
+            obs: observations (T, N, 5, 5, C), or a compact form of them with axes (T, N).
             reset: whether an episode starts at a step; the recurrent state is zero there.
             partner: number of the partner's policy, for a critic with `partners`.
 
         Returns:
             The recurrent state after the last step, action logits, values.
         """
-        features = ObservationEncoder(self.widths, name="encoder")(obs)
-        hidden, states = GRU(self.widths.gru, name="gru")(hidden, features, reset)
-        actor = nn.relu(_dense(self.widths.head, 2.0, "actor_hidden")(states))
-        logits = _dense(len(ACTIONS), 0.01, "actor")(actor)
+        widths = self.widths
+        features = WindowEncoder(
+            features=widths.dense,
+            kind=self.encoder,
+            pointwise=widths.pointwise,
+            spatial=widths.spatial,
+            normalize=True,
+            view=self.view,
+            name="encoder",
+        )(obs)
+        hidden, states = GRU(widths.gru, name="gru")(hidden, features, reset)
+        actor = nn.relu(orthogonal_dense(widths.head, 2.0, "actor_hidden")(states))
+        logits = orthogonal_dense(len(ACTIONS), 0.01, "actor")(actor)
         if not self.critic:
             return hidden, logits, jnp.zeros(logits.shape[:2])
         if self.partners:
             number = jnp.zeros(hidden.shape[0], int) if partner is None else partner
             one_hot = jnp.broadcast_to(jax.nn.one_hot(number, self.partners), (*states.shape[:2], self.partners))
             states = jnp.concatenate([states, one_hot], axis=-1)
-        critic = nn.relu(_dense(self.widths.head, 2.0, "critic_hidden")(states))
-        value = _dense(1, 1.0, "critic")(critic)
+        critic = nn.relu(orthogonal_dense(widths.head, 2.0, "critic_hidden")(states))
+        value = orthogonal_dense(1, 1.0, "critic")(critic)
         return hidden, logits, value[..., 0]
 
     def untrained(self, key: Array, channels: int) -> Any:
@@ -145,10 +172,6 @@ class ActorCritic(nn.Module):
     def initial_hidden(self, batch: int) -> Float[Array, "N H"]:
         """Returns the recurrent state at the start of an episode: zeros."""
         return jnp.zeros((batch, self.widths.gru), jnp.float32)
-
-
-def _dense(width: int, scale: float, name: str | None = None) -> nn.Dense:
-    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale), name=name)
 
 
 def _orthogonal_gates(key: Array, shape: tuple[int, int], dtype=jnp.float32) -> Array:

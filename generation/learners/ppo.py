@@ -2,9 +2,8 @@
 
 T denotes the steps of a roll-out, M the agent slots of one policy: pairs of an environment and one of its two agents
 that the policy controls. A sequence is the T steps of one slot. Minibatches consist of complete sequences, because the
-recurrent state is recomputed from the one before the first step. Sequences hold state records, which are much smaller
-than the observations that the loss renders from them. The algorithms for egos and populations differ only in the
-partner and in the weight of each sequence's advantage.
+recurrent state is recomputed from the one before the first step. The network's inputs are made once per roll-out. The
+algorithms for egos and populations differ only in the partner and in the weight of each sequence's advantage.
 """
 
 from __future__ import annotations
@@ -16,14 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from generation.learners.config import PPOConfig
+from generation.learners.encoder import CompactView, Seen
 from generation.learners.network import ActorCritic
 from generation.learners.rollout import Rollout, slot_records
 from icrl4aht_data.overcooked.actions import EGO
-from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.observe import observe
 
 
 def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -44,7 +42,7 @@ class Sequences(NamedTuple):
     """T steps in the M agent slots of one policy. Slots are on axis 1 of every array.
 
     Attributes:
-        record: uint8 (T, M, S), state records with the policy's own agent first.
+        seen: the network's input, leaves (T, M, ..).
         reset: bool (T, M), whether the record starts an episode.
         action: int32 (T, M), the actions taken, 0..5.
         log_prob: float32 (T, M), log-probability of the action when it was played.
@@ -57,7 +55,7 @@ class Sequences(NamedTuple):
         last_value: float32 (1, M), the critic's estimate for the observation after the last step.
     """
 
-    record: UInt8[Array, "T M S"]
+    seen: Seen
     reset: Bool[Array, "T M"]
     action: Int[Array, "T M"]
     log_prob: Float[Array, "T M"]
@@ -71,11 +69,18 @@ class Sequences(NamedTuple):
 
 
 def sequences(
-    rollout: Rollout, player: int, agent_slots: np.ndarray, hidden: Array, last_value: Array, shaping: Array
+    view: CompactView,
+    rollout: Rollout,
+    player: int,
+    agent_slots: np.ndarray,
+    hidden: Array,
+    last_value: Array,
+    shaping: Array,
 ) -> Sequences:
     """Returns the sequences in one player's agent slots, all with partner 0 and weight 1.
 
     Args:
+        view: makes the network's input of state records.
         rollout: the roll-out.
         player: number of the player in the roll-out.
         agent_slots: int (M,), the player's slots; slot a * N + n is agent a of environment n.
@@ -86,7 +91,7 @@ def sequences(
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
     choice = rollout.choices[player]
     return Sequences(
-        record=slot_records(rollout.record, agent_slots),
+        seen=view(slot_records(rollout.record, agent_slots)),
         reset=rollout.reset[:, env],
         action=choice.action,
         log_prob=choice.log_prob,
@@ -105,12 +110,10 @@ class PPO:
     """Proximal policy optimisation (Schulman et al. 2017) of a recurrent actor-critic.
 
     Attributes:
-        layout: the layout of the records.
         network: the actor-critic.
         config: hyper-parameters.
     """
 
-    layout: Layout
     network: ActorCritic
     config: PPOConfig
 
@@ -157,8 +160,7 @@ class PPO:
         Source: paper, App. B.1, table of PPO hyper-parameters; Schulman et al. 2017, eq. 7.
         """
         config, played = self.config, batch.played
-        obs = observe(self.layout, played.record, EGO)
-        result: Any = self.network.apply(params, played.hidden[0], obs, played.reset, played.partner[0])
+        result: Any = self.network.apply(params, played.hidden[0], played.seen, played.reset, played.partner[0])
         _, logits, value = result
         log_probs = jax.nn.log_softmax(logits)
         log_prob = jnp.take_along_axis(log_probs, played.action[..., None], axis=-1)[..., 0]

@@ -29,7 +29,7 @@ from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.locks import lock_beside, process_lock
+from icrl4aht_data.utils.locks import lock_path, process_lock
 
 METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
 
@@ -105,7 +105,7 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(process_lock(lock_beside(folder), wait=wait))
+            stack.enter_context(process_lock(lock_path(folder), wait=wait))
         except Timeout as error:
             message = f"{folder}: another process works in this folder; wait for it, or choose another"
             raise BusyError(message) from error

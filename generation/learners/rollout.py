@@ -180,18 +180,20 @@ def network_player(
     """
     flat, shape = agent_slots.reshape(-1), agent_slots.shape
 
-    def forward(params, hidden, obs, partner) -> tuple[Array, Array, Array]:
-        result: Any = network.apply(params, hidden, obs[None], jnp.zeros((1, obs.shape[0]), bool), partner)
+    def forward(params, hidden, seen, partner) -> tuple[Array, Array, Array]:
+        one_step = jax.tree.map(lambda leaf: leaf[None], seen)
+        result: Any = network.apply(params, hidden, one_step, jnp.zeros((1, hidden.shape[0]), bool), partner)
         return result[0], result[1][0], result[2][0]
 
     def init(state: EnvState) -> Array:
         return jnp.zeros((flat.size, network.widths.gru), jnp.float32)
 
     def act(hidden, state: EnvState, key):
-        obs = observe(env.layout, slot_records(state.record, flat), EGO)
-        hidden, obs = (x.reshape(*shape, *x.shape[1:]) for x in (hidden, obs))
+        records = slot_records(state.record, flat)
+        seen = network.view(records) if network.view else observe(env.layout, records, EGO)
+        hidden, seen = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (hidden, seen))
         apply: Any = jax.vmap(forward) if agent_slots.ndim == 2 else forward
-        results = apply(params, hidden, obs, partner)
+        results = apply(params, hidden, seen, partner)
         hidden, logits, value = (x.reshape(flat.size, *x.shape[agent_slots.ndim :]) for x in results)
         if isinstance(greedy, bool):
             action = jnp.argmax(logits, axis=-1) if greedy else jax.random.categorical(key, logits)

@@ -16,7 +16,7 @@ from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.locks import lock_beside, process_lock
+from icrl4aht_data.utils.locks import lock_path, process_lock
 
 THRESHOLD = 20.0
 """Returns of 400 steps that a teammate must exceed (paper, App. B.1)."""
@@ -115,7 +115,7 @@ def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> lis
     folder = suite / "manifests"
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    with process_lock(lock_beside(folder)):  # several processes may train one suite
+    with process_lock(lock_path(folder)):  # several processes may train one suite
         for track in TRACKS:
             own = [selection for selection in selections if track_of(selection.layout) == track]
             for split in ("train", "heldout"):

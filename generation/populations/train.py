@@ -24,7 +24,15 @@ import jax
 import numpy as np
 
 from generation.env import Environment
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_card, load_policy, save_policy
+from generation.learners.checkpoint import (
+    POLICY_CARD,
+    POLICY_CHECKPOINTS,
+    POLICY_WEIGHTS,
+    checkpoint_updates,
+    load_card,
+    load_policy,
+    save_policy,
+)
 from generation.learners.config import PPOConfig
 from generation.learners.population.brdiv import BRDiv
 from generation.learners.population.comedi import CoMeDi
@@ -48,9 +56,6 @@ from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
-
-CHECKPOINTS_PER_MEMBER = 5
-"""Evenly spaced over a policy's training (paper, App. B.1)."""
 
 POPULATION_SAVE_SECONDS = 60.0
 """Interval of saves: the work that a kill can cost."""
@@ -90,10 +95,10 @@ class PopulationRun:
     def __post_init__(self) -> None:
         if self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, ALGORITHMS)
-        if self.config.updates < CHECKPOINTS_PER_MEMBER:
+        if self.config.updates < POLICY_CHECKPOINTS:
             raise OptionError(
                 f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "
-                f"{CHECKPOINTS_PER_MEMBER}, one for each checkpoint"
+                f"{POLICY_CHECKPOINTS}, one for each checkpoint"
             )
         try:
             for stage in self.stages:
@@ -234,8 +239,7 @@ class _PopulationTraining:
         population, updates = self.run.stages[stage], self.run.config.updates
         state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
         update = jax.jit(population.update, donate_argnums=0)
-        count = CHECKPOINTS_PER_MEMBER
-        checkpoint_after = {-(-updates * (number + 1) // count): number for number in range(count)}
+        moments = checkpoint_updates(self.run.config)
         started, first = time.perf_counter(), int(state.update)
         for number in range(first, updates):
             if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
@@ -247,8 +251,8 @@ class _PopulationTraining:
             log.write(line, timing={"stage": stage, "update": number} | speed)
             done = stage * updates + number + 1
             self.on_update(done, self.run.updates, line | speed)
-            if number + 1 in checkpoint_after:
-                self._save_checkpoints(stage, checkpoint_after[number + 1], number + 1, state.params)
+            if number + 1 in moments:
+                self._save_checkpoints(stage, moments.index(number + 1), number + 1, state.params)
             if self.interval.due(done):
                 log.sync()
                 self.saved.save(state, done)
@@ -271,7 +275,7 @@ class _PopulationTraining:
         """The parameters with the former member that plays best with the new one as the frozen policy (paper, App.
         B.1, "Partner Selection")."""
         network, layout = self.run.stages[stage].network, self.run.layout
-        last = CHECKPOINTS_PER_MEMBER - 1
+        last = POLICY_CHECKPOINTS - 1
         former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
         returns = cross_play_returns(layout, network, new, former, seed=number)[0]
@@ -304,7 +308,7 @@ class _PopulationTraining:
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
-            if run.has_best_responses and checkpoint == CHECKPOINTS_PER_MEMBER - 1:
+            if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
                 path = self.folder / "responses" / f"m{k}"
                 save_policy(path, population.network, response, card | {"role": "best response", "seats": [0]})
@@ -394,7 +398,7 @@ def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = Fals
     Raises:
         OptionError: if the population is not finished.
     """
-    final = f"c{CHECKPOINTS_PER_MEMBER - 1}"
+    final = f"c{POLICY_CHECKPOINTS - 1}"
     last = [point for point in suite_checkpoints(suite, layout.name, algorithm) if point.path.endswith(final)]
     loaded = [load_policy(suite / point.path) for point in last]
     members = stacked([params for _, params, _ in loaded])

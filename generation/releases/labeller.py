@@ -1,8 +1,8 @@
 """Which checkpoint of an ego labels its task's histories, by what the checkpoints earn with the task's teammate.
 
 The labeller is the last checkpoint, the paper's, unless an earlier one earns clearly more when it acts greedily, as
-labellers do. A policy that learned to act by drawing its actions can stand still when it always takes the most probable
-one, and its labels would teach a model to stand still.
+labellers do. A policy that was trained to draw its actions can repeat the action "stay" when it always takes the most
+probable one, and a model that is trained on its labels would learn to do so, too.
 """
 
 from __future__ import annotations

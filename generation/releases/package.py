@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -57,9 +57,9 @@ def package_release(
         OptionError: if something else is at `target`, see `check_release_folder`.
     """
     check_release_folder(target, profile)
-    new = []
+    recorded, new = _recorded_provenance(suite), []
     for task in tasks:
-        new.append(_new_task(artefacts / task.task_id, task, profile, suite))
+        new.append(_new_task(artefacts / task.task_id, task, profile, suite, recorded))
         advance(0)
     return write_release(
         target, kind, new, data_version=profile.data_version, overwrite=True, done=lambda task: advance(1)
@@ -91,12 +91,16 @@ def bundle_release(release: Path) -> Path:
     return MINI
 
 
-def _populations(task: Task, profile: Profile, suite: Path) -> TeammateSuite | None:
+def _recorded_provenance(suite: Path) -> dict[str, Provenance]:
+    """Provenance of the release whose teammates the suite is, by task id; empty for the suite of a profile."""
+    path = suite.parent / PROVENANCE
+    return read_provenance(path) if suite.name == TEAMMATES and path.is_file() else {}
+
+
+def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> TeammateSuite | None:
     """The populations of a learned teammate: the profile's, or those named by the release that it is taken from."""
-    if suite.name == TEAMMATES and (suite.parent / PROVENANCE).is_file():
-        recorded = read_provenance(suite.parent / PROVENANCE).get(task.task_id)
-        if recorded is not None:
-            return recorded.suite
+    if task.task_id in recorded:
+        return recorded[task.task_id].suite
     return TeammateSuite(
         algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
         members=profile.teammates.members,
@@ -107,7 +111,7 @@ def _populations(task: Task, profile: Profile, suite: Path) -> TeammateSuite | N
     )
 
 
-def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTask:
+def _new_task(folder: Path, task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> NewTask:
     metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")
     streams = best_streams(rewards, profile.keep)
@@ -136,7 +140,7 @@ def _new_task(folder: Path, task: Task, profile: Profile, suite: Path) -> NewTas
             episodes=LABEL_EPISODES,
             last_return_greedy=labeller.last_return_greedy,
         ),
-        suite=_populations(task, profile, suite) if task.teammate_family == "rl" else None,
+        suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
     if profile.policies:

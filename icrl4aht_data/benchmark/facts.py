@@ -34,6 +34,9 @@ HEURISTIC_KINDS = {
 ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
 """The teammate kinds of family `rl`: algorithms that train teammates (paper, App. B.1)."""
 
+KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
+"""teammate kind -> family, for algorithms and heuristics."""
+
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""
 

@@ -14,7 +14,7 @@ from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, exp
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.files import plain_size
@@ -146,21 +146,17 @@ def check_checkpoints(root: Path, tasks: list[Task], report: Report) -> None:
         report.notes.append(f"{without} tasks have learned teammates whose checkpoints this release does not have")
 
 
-def check_experts(index: Index, report: Report) -> None:
+def check_experts(root: Path, provenance: Mapping[str, Provenance], report: Report) -> None:
     """Check the policies behind the expert actions, in folder EXPERTS, against meta/provenance.json.
 
     A release may omit the policies.
     """
-    try:
-        provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
-    except Icrl4ahtError:  # reported by `check_provenance`
-        return
     for task_id, of_task in provenance.items():
         if of_task.expert is None:
             continue
         name = expert_folder(of_task.expert.policy_sha256)
         try:
-            files = expert_files(resolve_inside(index.root, name), of_task.expert.policy_sha256, index.root)
+            files = expert_files(resolve_inside(root, name), of_task.expert.policy_sha256, root)
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from itertools import islice
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
-from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import LayoutStatistics, ReleaseInfo, describe
-from icrl4aht_data.format.provenance import read_provenance
-from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE, TASKS, Entry
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, TASKS, Entry
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.paths import resolve_inside
 from icrl4aht_data.writing.statistics import layout_statistics
@@ -27,19 +27,20 @@ _OF_A_TASK = (
 """Fields of the index that the histories of one task share."""
 
 
-def check_index(index: Index, tasks: list[Task], report: Report) -> None:
+def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
     """Check that index, tasks, totals and shard names agree.
 
     Args:
         index: the release's index.
         tasks: its tasks.
+        provenance: task id -> how its histories were made; None if they cannot be read, which `report` says already.
         report: receives the problems.
     """
     _check_tasks(index, tasks, report)
     _check_disjoint_teammates(tasks, report)
     if not index.entries:
         report.add(HISTORIES, "no histories")
-    _check_info(index, tasks, report)
+    _check_info(index, tasks, provenance, report)
     shards = {entry.shard for entry in index.entries}
     for shard in shards:
         stem, count = shard.removesuffix(".h5").split("-")[0], int(shard.removesuffix(".h5").split("-")[-1])
@@ -60,7 +61,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
             report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id}, of one task: unlike {unlike}")
         if not has_tasks and entry.seed != -1:
             report.add(HISTORIES, f"history {entry.history_id}: seed: expected -1 without tasks, found {entry.seed}")
-        if entry.teammate_family != _family(entry.teammate_kind, entry.teammate_family):
+        if KIND_FAMILIES.get(entry.teammate_kind, entry.teammate_family) != entry.teammate_family:
             report.add(
                 HISTORIES,
                 f"history {entry.history_id}: teammate_kind {entry.teammate_kind!r} is of another family than "
@@ -75,11 +76,6 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
         streams.add((entry.task_id, entry.env_idx))
     for task_id in by_id.keys() - {task_id for task_id, _ in streams}:
         report.add(TASKS, f"task {task_id!r} has no history")
-
-
-def _family(kind: str, otherwise: str) -> str:
-    """Return the family of a kind of teammate that the benchmark knows."""
-    return "rl" if kind in ALGORITHMS else HEURISTIC_KINDS.get(kind, otherwise)
 
 
 def _describes(task: Task, entry: Entry) -> bool:
@@ -107,20 +103,16 @@ def _as_old_as(found: dict[str, Any], expected: dict[str, dict[str, Any]]) -> di
     }
 
 
-def _check_info(index: Index, tasks: list[Task], report: Report) -> None:
+def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
     """Check that meta/info.json has the totals and statistics of the index, with the sizes of shards that it says."""
     root, info, shards = index.root, index.info, index.values("shard")
     kept_steps = info.environment.kept_steps
     described = describe(info.kind, info.data_version, kept_steps, list(index.entries), info.format_version)
     if info.shards.keys() != set(shards):
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")
-    elif report.ok:
-        try:
-            provenance = read_provenance(resolve_inside(root, PROVENANCE))
-            statistics = layout_statistics(index.entries, tasks, provenance, kept_steps, info.shards)
-            described = replace(described, shards=info.shards, statistics=statistics)
-        except (Icrl4ahtError, OSError) as error:
-            report.add(INFO, f"statistics cannot be computed from {PROVENANCE}: {error}")
+    elif report.ok and provenance is not None:
+        statistics = layout_statistics(index.entries, tasks, provenance, kept_steps, info.shards)
+        described = replace(described, shards=info.shards, statistics=statistics)
     found = parse_json(read_text(resolve_inside(root, INFO)))  # also fields that `ReleaseInfo` does not have
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")

@@ -3,37 +3,32 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
-from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.index import Index
-from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
+from icrl4aht_data.format.provenance import Provenance, StreamReturns
 from icrl4aht_data.format.schema import EXPERTS, HISTORIES, PROVENANCE, Entry
 from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.paths import resolve_inside
 
 _ROUNDING = 1e-3  # of the means that a stream filter records
 
 
-def check_provenance(index: Index, tasks: Sequence[Task], listed: Iterable[str], report: Report) -> None:
+def check_provenance(
+    index: Index, tasks: Sequence[Task], provenance: Mapping[str, Provenance], listed: Iterable[str], report: Report
+) -> None:
     """Check what provenance says of each task's learner, its streams and their filter; see also `files.check_experts`.
 
     Args:
         index: the release's index.
         tasks: its tasks; none in a release that knows them by name only.
+        provenance: task id -> how its histories were made.
         listed: the files of the manifest.
         report: receives the problems.
     """
-    try:
-        provenance = read_provenance(resolve_inside(index.root, PROVENANCE))
-    except Icrl4ahtError as error:
-        if PROVENANCE not in report.files_at_fault:
-            report.add(PROVENANCE, str(error))
-        return
     members: dict[str, list[Entry]] = defaultdict(list)
     for entry in index.entries:
         members[entry.task_id].append(entry)

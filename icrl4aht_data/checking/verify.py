@@ -26,7 +26,8 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import KINDS, MANIFEST, TASKS
+from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
@@ -119,8 +120,10 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
     check_references(listed, index, tasks, report)
-    check_provenance(index, tasks, listed, report)
-    check_index(index, tasks, report)
+    provenance = _read_provenance(origin, report)
+    if provenance is not None:
+        check_provenance(index, tasks, provenance, listed, report)
+    check_index(index, tasks, provenance, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
@@ -129,8 +132,18 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         check_shard_sizes(origin, index, shards, report)
     else:
         check_checkpoints(origin.folder, tasks, report)
-        check_experts(index, report)
+        check_experts(origin.folder, provenance or {}, report)
         _check_shards(index, shards, report, advance)
+
+
+def _read_provenance(origin: ReleaseLocation, report: Report) -> dict[str, Provenance] | None:
+    """Return the content of meta/provenance.json; None, and a problem in the report, if it cannot be read."""
+    try:
+        return read_provenance(resolve_inside(origin.folder, PROVENANCE))
+    except Icrl4ahtError as error:
+        if PROVENANCE not in report.files_at_fault:
+            report.add(PROVENANCE, str(error))
+        return None
 
 
 def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgress) -> None:

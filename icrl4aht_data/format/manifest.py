@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, OptionError, UnsafePathError
 from icrl4aht_data.format.schema import EXPERTS, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
-from icrl4aht_data.utils.files import atomic_write, plain_size, read_text, wrap_read_errors
+from icrl4aht_data.utils.files import atomic_write, final_name, plain_size, read_text, wrap_read_errors
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import LARGEST, files_below, is_inside, resolve_inside
 from icrl4aht_data.utils.remembered import remembered_hash
@@ -175,6 +175,6 @@ def check_only_files_of(folder: Path, manifest: Mapping[str, str]) -> None:
         OptionError: names a file that the manifest does not list.
     """
     for name in files_below(folder):
-        file = re.sub(r"(^|/)\.([^/]+)\.partial$", r"\1\2", name)  # of `atomic_write`, cut or still at work
+        file = final_name(name)  # of a file that is being written, or whose writer was killed
         if file != MANIFEST and file not in manifest:
             raise OptionError(f"{folder / name}: not a file of this release: move it elsewhere, or give another folder")

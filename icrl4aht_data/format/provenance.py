@@ -67,10 +67,6 @@ class ExpertLabels:
     episodes: _Count | None = None
     last_return_greedy: _Return | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """The object to write, without what was not recorded."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
-
 
 @dataclass(frozen=True, kw_only=True)
 class TeammateSuite:
@@ -147,12 +143,11 @@ class Provenance:
 
     def to_json(self) -> dict[str, Any]:
         """The object to write, without what was not recorded."""
-        content = {name: value for name, value in asdict(self).items() if name != "other" and value is not None}
-        if self.expert is not None:
-            content["expert"] = self.expert.to_json()
-        if self.suite is not None:
-            content["suite"] = {name: value for name, value in content["suite"].items() if value is not None}
-        return content | self.other
+        content = _recorded(asdict(self))
+        for name in {"expert", "suite"} & content.keys():
+            content[name] = _recorded(content[name])
+        other = content.pop("other")
+        return content | other
 
     @classmethod
     def from_json(cls, content: Any) -> Provenance:
@@ -172,6 +167,10 @@ class Provenance:
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
         return replace(found, other={name: value for name, value in content.items() if name not in known})
+
+
+def _recorded(content: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in content.items() if value is not None}
 
 
 @dataclass(frozen=True)

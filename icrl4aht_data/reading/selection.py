@@ -360,7 +360,7 @@ class Selection:
         absent = np.isnan(returns)
         if absent.any():
             tasks = np.unique(self.column("task_id")[absent])
-            known = 'ds.select(ds.ids[~np.isnan(ds.column("expert_return"))])'
+            known = 'ds.select(~np.isnan(ds.column("expert_return")))'
             raise NotStoredError(
                 f"min_expert_return: {self.origin} does not say what the policies behind the labels of "
                 f"{int(absent.sum())} of {len(self)} histories earn (first task: {tasks[0]}), as releases of format "
@@ -373,7 +373,7 @@ class Selection:
                 f"{self.root}: no history of this selection has expert_return >= {least:g}; the highest is "
                 f"{returns.max():g}; it is {self!r}"
             )
-        return self.select(self.ids[kept])
+        return self.select(kept)
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
         """Return the histories of this selection with these ids, in this order.

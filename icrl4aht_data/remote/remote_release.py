@@ -47,7 +47,7 @@ from icrl4aht_data.utils.cache import data_folder
 from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size, read_text
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.hashes import file_hash, git_hash
-from icrl4aht_data.utils.locks import lock_beside, process_lock, remove_empty_folders
+from icrl4aht_data.utils.locks import lock_path, process_lock, remove_empty_folders
 from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
 from icrl4aht_data.utils.remembered import remembered_hash
 
@@ -307,7 +307,7 @@ class HubRemote(Remote):
         """Download files to the Hub's cache, or by way of `partial` to `folder`; remove those with a wrong hash."""
         assert isinstance(self.store, HubStore)
         damaged = ""
-        with nullcontext() if self.in_hub_cache else process_lock(lock_beside(self.folder)):
+        with nullcontext() if self.in_hub_cache else process_lock(lock_path(self.folder)):
             names = [name for name in names if not self.is_here(name)]
             for name in names if self.in_hub_cache else ():
                 _remove_from_cache(self.path(name))  # changed; the client would take what is there
@@ -382,7 +382,7 @@ def _open_address(address: str, to: Path | None, retry: RetryPolicy | None) -> R
     check_partial_folder(_partial_folder(folder), manifest)
     _claim_folder(folder, text, manifest, url, chosen=to is not None)
     if to is None and known != revision:
-        with process_lock(lock_beside(latest)), atomic_write(latest) as partial:
+        with process_lock(lock_path(latest)), atomic_write(latest) as partial:
             partial.write_text(revision, encoding="utf-8")
     owned = to is None or read_note(to) is not None
     return Remote(url, revision, folder, _partial_folder(folder), manifest, store, owned=owned)
@@ -442,7 +442,7 @@ def _claim_folder(folder: Path, text: bytes, manifest: dict[str, str], url: str,
         if chosen:
             check_only_files_of(folder, manifest)
         return
-    with process_lock(lock_beside(folder)):
+    with process_lock(lock_path(folder)):
         note = read_note(folder)
         ours = not chosen or (note is not None and note.belongs_to(manifest))
         if path.exists() and not has_content(path, text) and not ours and not _has_only_files_of(folder, manifest):

@@ -17,6 +17,7 @@ from urllib.parse import urljoin
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
 from icrl4aht_data.remote.addresses import address_of, check_credentials, check_redirect, without_credentials
+from icrl4aht_data.utils.disk import NO_ROOM
 from icrl4aht_data.utils.forks import ForkSafeLock
 
 T = TypeVar("T")
@@ -340,7 +341,7 @@ def _root_cause(error: BaseException) -> BaseException:
 
 
 def _is_disk_error(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+    return isinstance(error, OSError) and error.errno in (*NO_ROOM, errno.EROFS)
 
 
 def _answers(error: BaseException | None) -> Iterator[tuple[Any, Any]]:

@@ -22,6 +22,7 @@ from filelock import Timeout
 
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
 from icrl4aht_data.utils.cache import CACHE_VARIABLES, cache_folder, cache_limit
+from icrl4aht_data.utils.disk import NO_ROOM
 from icrl4aht_data.utils.files import add_filename, allocate, sync
 from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.utils.remembered import read_checked_json, remembered_block_hashes, write_checked_json
@@ -145,7 +146,7 @@ def _build(folder: Path, build: Callable[[Path], None]) -> None:
 
 def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
     """The error for arrays that cannot be written to the cache folder."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    if error.errno in NO_ROOM:
         free = ""
         with suppress(OSError):
             free = f", {shutil.disk_usage(folder).free:,} bytes are free"

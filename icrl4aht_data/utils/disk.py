@@ -13,6 +13,9 @@ from icrl4aht_data.errors import DiskFullError
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk, and of a used-up quota."""
 
+NO_ROOM = (*FULL, errno.EFBIG)
+"""Error numbers of a full disk, of a used-up quota, and of a limit on the size of files."""
+
 
 def describe_disk(path: Path) -> str:
     """The disk that a path is on, which need not exist, and its free space, in words."""

@@ -9,6 +9,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -163,6 +164,11 @@ def sync(path: Path) -> None:
             os.fsync(number)
     finally:
         os.close(number)
+
+
+def final_name(name: str) -> str:
+    """Path, in a folder, that a temporary file of `atomic_write` would have got; other paths unchanged."""
+    return re.sub(r"(^|/)\.([^/]+)\.partial$", r"\1\2", name)
 
 
 @contextmanager

@@ -39,7 +39,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
         lock.release()
 
 
-def lock_beside(folder: Path) -> Path:
+def lock_path(folder: Path) -> Path:
     """Path of a folder's lock: next to the folder, so that the folder can be renamed or removed meanwhile."""
     return folder.with_name(f".{folder.name}.lock")
 

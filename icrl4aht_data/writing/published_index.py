@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import FAMILIES, HEURISTIC_KINDS, KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import named_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError, unknown
 from icrl4aht_data.format.schema import ENTRY_HINTS, check_value
@@ -19,7 +19,7 @@ from icrl4aht_data.utils.files import parse_json, read_lines
 PUBLISHED_FIELDS = tuple(ENTRY_HINTS)[:14]
 """Fields of an index line (paper, App. D.3)."""
 
-_KINDS = dict.fromkeys(("ippo", *ALGORITHMS), "rl") | HEURISTIC_KINDS
+_KINDS = {"ippo": "rl"} | KIND_FAMILIES
 """Names of algorithms and heuristics -> family."""
 
 FAMILY_MAP = (

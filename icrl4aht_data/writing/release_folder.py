@@ -6,7 +6,6 @@ A folder is proved by its manifest: it lists every file of the folder, and each 
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -19,9 +18,9 @@ from icrl4aht_data.format.manifest import is_known_file, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import explain_full_disk
-from icrl4aht_data.utils.files import read_text
+from icrl4aht_data.utils.files import final_name, read_text
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.locks import lock_beside, process_lock
+from icrl4aht_data.utils.locks import lock_path, process_lock
 from icrl4aht_data.utils.paths import files_below, resolve_inside
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
@@ -32,8 +31,6 @@ PUBLISHED_FILES = (HISTORIES_H5, HISTORIES_INDEX, "tasks.jsonl", "provenance.jso
 
 LISTING = "files.sha256"
 """Their hashes, in sha256sum's format."""
-
-_PARTIAL = re.compile(r"^(.*/)?\.([^/]+)\.partial$")  # files of `atomic_write`, which a killed writer leaves
 
 Snapshot = dict[str, tuple[int, int, int]]
 """File of a folder -> its inode, size and time of change in nanoseconds."""
@@ -70,7 +67,7 @@ def atomic_folder(
 def _locked_folder(target: Path, overwrite: bool, sources: Iterable[str | Path], before: Snapshot) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     new, old = (target.with_name(f".{target.name}.{end}") for end in ("partial", "old"))
-    lock = lock_beside(target)
+    lock = lock_path(target)
     try:
         with process_lock(lock, wait=False):
             for leftover in (new, old):
@@ -166,7 +163,7 @@ def _was_left_by_a_writer(folder: Path) -> bool:
         return True
     if folder.is_symlink() or not folder.is_dir():
         return False
-    names = [_PARTIAL.sub(r"\1\2", name) for name in files_below(folder)]
+    names = map(final_name, files_below(folder))
     return all(name in own or is_known_file(name) for name in names)
 
 

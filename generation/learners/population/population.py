@@ -22,9 +22,11 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.env import Environment, EnvState
 from generation.learners.config import PPOConfig
+from generation.learners.encoder import CompactView
 from generation.learners.network import ActorCritic
 from generation.learners.ppo import PPO, ppo_optimizer, sequences, shaping_weight
 from generation.learners.rollout import Player, Rollout, RolloutCarry, init_rollout, network_player, roll_out
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
 
 class Assignment(NamedTuple):
@@ -183,12 +185,18 @@ class Population:
         policies = self.assignment.policies
         pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
         partners = policies if len(pairs) > policies else 0
-        return ActorCritic(self.config.widths, partners if self.partners is None else self.partners)
+        partners = partners if self.partners is None else self.partners
+        return ActorCritic(self.config.widths, partners, encoder=self.config.encoder, view=self.view)
+
+    @cached_property
+    def view(self) -> CompactView:
+        """What makes the network's inputs."""
+        return CompactView(self.config.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
 
     @cached_property
     def ppo(self) -> PPO:
         """The algorithm of each policy's updates."""
-        return PPO(self.env.layout, self.network, self.config)
+        return PPO(self.network, self.config)
 
     @cached_property
     def groups(self) -> list[PolicyGroup]:
@@ -282,7 +290,7 @@ class Population:
             last, _ = player.act(carry.memories[number], carry.env, key)
             # A policy that lowers a return must not be paid, nor charged, for the shaped rewards on the way.
             own_shaping = shaping * (weight[slots] >= 0)
-            played = sequences(rollout, number, slots, state.carry.memories[number], last.value, own_shaping)
+            played = sequences(self.view, rollout, number, slots, state.carry.memories[number], last.value, own_shaping)
             partner = jnp.asarray(self.assignment.partner[slots])[None]
             played = played._replace(partner=partner, weight=weight[slots][None])
 

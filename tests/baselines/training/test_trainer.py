@@ -396,7 +396,7 @@ def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
 
 @pytest.mark.slow
 def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
-    """Also when process 1 alone is told to stop: both save the step, and the same command resumes."""
+    """If only process 1 receives SIGTERM, both processes save the step they are at, and the same command resumes."""
     with socket.socket() as held:  # keeps the port from other programs; JAX's coordinator may share it
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         held.bind(("127.0.0.1", 0))

@@ -24,7 +24,7 @@ from generation.collection import task as collect
 from generation.collection import task_folder as artefacts
 from generation.collection.job import CollectionError
 from generation.collection.task_folder import METADATA
-from generation.learners.checkpoint import load_policy
+from generation.learners.checkpoint import checkpoint_updates, load_policy
 from generation.learners.config import PPOConfig
 from generation.populations import select
 from generation.populations import train as suite
@@ -106,7 +106,7 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
 
 def test_few_updates_have_as_many_checkpoints():
     def updates(number: int) -> tuple[int, ...]:
-        return artefacts.checkpoint_updates(PPOConfig(total_steps=number, environments=1, rollout=1, minibatches=1))
+        return checkpoint_updates(PPOConfig(total_steps=number, environments=1, rollout=1, minibatches=1))
 
     assert updates(1) == (1,)
     assert updates(3) == (1, 2, 3)

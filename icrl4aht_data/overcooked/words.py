@@ -1,0 +1,242 @@
+"""State records -> the 25 visible cells as numbers of words, batch first, for NumPy and JAX alike.
+
+A *word* is what one visible cell shows, that is its observation channels. The rules allow only a few hundred words on a
+layout, so what a network computes of every cell by itself can be computed once per word and looked up. Records of
+several layouts share their lookup tables, so one batch may mix layouts.
+
+`B` denotes the batch dimensions, `S` the bytes of a state record, `V` the number of words, `C` channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.overcooked.layouts import CENTRE, COOKED, FACINGS, GOAL, INDICATOR, NOWHERE, PLATE, VISIBLE, Layout
+from icrl4aht_data.overcooked.observe import fixed_channels, observe
+from icrl4aht_data.overcooked.rules import look_up
+from icrl4aht_data.overcooked.state import (
+    BUTTON_STEPS,
+    POT_STEPS,
+    Array,
+    columns,
+    ingredient_count,
+    possible_items,
+    record_size,
+)
+
+# What a cell shows follows from its kind and two numbers of the record: a byte (an item or a recipe), and a timer, flag
+# or facing. Lookup tables have an entry for every pair of numbers, so that no value of a record can index outside.
+_SECONDS = 32
+_PAIRS = 256 * _SECONDS
+_FIXED, _RECIPE, _GOAL, _POT, _BUTTON, _COUNTER, _SELF, _OTHER = range(8)
+
+
+class _Slot(NamedTuple):
+    """Cells that show the same part of the record.
+
+    Args:
+        kind: selects the lookup table.
+        cells: numbers of the cells.
+        byte: the record's column of the byte.
+        second: the record's column of the second number; None for 0.
+    """
+
+    kind: int
+    cells: list[int]
+    byte: int
+    second: int | None = None
+
+
+class CellWords:
+    """The words of the cells that are visible on one or several layouts; `cell_words` makes it.
+
+    Attributes:
+        layouts: the layouts; their observations have the same channels.
+        channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, stands for what the
+            rules cannot produce.
+    """
+
+    def __init__(self, layouts: Sequence[Layout]) -> None:
+        self.layouts = tuple(layouts)
+        fixed = [_fixed_cells(layout) for layout in layouts]
+        contents = [_contents(layout) for layout in layouts]
+        shown = fixed + [channels for kinds in contents for _, channels in kinds.values()]
+        # Rows are sorted, so that word 0 shows nothing: empty floor, and what is outside the map.
+        words, numbers = np.unique(np.concatenate(shown), axis=0, return_inverse=True)
+        self.channels = np.append(words, np.full_like(words[:1], 255), axis=0)
+        parts = iter(np.split(numbers.reshape(-1).astype(np.int16), np.cumsum([len(rows) for rows in shown])[:-1]))
+        self._size = max(map(record_size, layouts))
+        self._fill_views([next(parts) for _ in layouts])
+        self._words = np.full((len(layouts), _OTHER + 1, _PAIRS), len(words), np.int16)
+        self._words[:, _FIXED] = 0
+        for number, kinds in enumerate(contents):
+            for kind, (pairs, _) in kinds.items():
+                self._words[number, kind, pairs] = next(parts)
+
+    def _fill_views(self, fixed: list[np.ndarray]) -> None:
+        """Fills the lookup tables by the observer's cell, and those of the slots; slot 0 is that of all fixed cells."""
+        count, cells = len(self.layouts), max(layout.cells for layout in self.layouts)
+        slots = [[_Slot(_FIXED, [], 0), *_slots(layout)] for layout in self.layouts]
+        self._slot = np.zeros((count, cells, VISIBLE), np.uint8)
+        self._fixed = np.zeros((count, cells, VISIBLE), np.int16)
+        self._window_position = np.full((count, cells, cells), NOWHERE, np.uint8)
+        self._kind = np.zeros((count, max(map(len, slots))), np.int32)
+        self._byte, self._second = np.zeros_like(self._kind), np.full_like(self._kind, self._size)
+        for number, layout in enumerate(self.layouts):
+            slot_of = np.zeros(layout.cells, np.uint8)
+            for k, slot in enumerate(slots[number]):
+                slot_of[slot.cells] = k
+                self._kind[number, k], self._byte[number, k] = slot.kind, slot.byte
+                if slot.second is not None:
+                    self._second[number, k] = slot.second
+            here = number, slice(layout.cells)
+            self._slot[here] = np.where(layout.window >= 0, slot_of[layout.window], 0)
+            self._fixed[here] = np.where(self._slot[here] == 0, fixed[number].reshape(-1, VISIBLE), 0)
+            self._window_position[(*here, slice(layout.cells))] = layout.window_position
+
+    def ids(self, record: Array, layout_number: Array | None = None, agent: int = 0) -> Array:
+        """Return the words of the cells that one agent sees.
+
+        Args:
+            record: uint8 (B, S), state records; those of several layouts are padded at the end.
+            layout_number: int, index of each record's layout in `layouts`, with the shape of the first axes of B; None
+                if there is one layout.
+            agent: 0 (ego) or 1 (teammate).
+
+        Returns:
+            int32 (B, 25), rows of `channels`: `channels[ids]` is what `observe` returns.
+        """
+        xp = record.__array_namespace__()
+        batch = record.shape[:-1]
+        several = layout_number is not None
+        number: Any = 0
+        if several:
+            number = xp.reshape(layout_number, (*layout_number.shape, *[1] * (len(batch) - layout_number.ndim)))
+            number = xp.astype(xp.broadcast_to(number, batch), xp.int32)
+
+        def at(table: np.ndarray, *indices: Array) -> Array:
+            """Returns table[number, *indices]; the table's other axes stay."""
+            flat = number
+            for index, size in zip(indices, table.shape[1:], strict=False):
+                flat = flat * size + xp.astype(index, xp.int32)
+            rest = table.shape[1 + len(indices) :]
+            return look_up(table.reshape(-1, *rest), flat) if several or indices else xp.asarray(table[0])
+
+        def pairs(byte: Array, second: Array) -> Array:
+            return xp.astype(second & (_SECONDS - 1), xp.int32) << 8 | xp.astype(byte, xp.int32)
+
+        zeros = xp.zeros((*batch, self._size + 1 - record.shape[-1]), dtype=xp.uint8)
+        padded = xp.concat([record, zeros], axis=-1)
+        if several:
+            byte, second = (xp.take_along_axis(padded, at(c), axis=-1) for c in (self._byte, self._second))
+        else:
+            byte, second = padded[..., self._byte[0]], padded[..., self._second[0]]
+        first = (number[..., None] if several else 0) * self._words[0].size + at(self._kind) * _PAIRS
+        by_slot = look_up(self._words.reshape(-1), first + pairs(byte, second))
+
+        me, other = record[..., agent], record[..., 1 - agent]
+        slots = xp.astype(at(self._slot, me), xp.int32)
+        words = xp.take_along_axis(by_slot, slots, axis=-1) + at(self._fixed, me)
+        facings, hands = record[..., 2:4], record[..., 4:6]
+        own = at(self._words[:, _SELF], pairs(hands[..., agent], facings[..., agent]))
+        others = at(self._words[:, _OTHER], pairs(hands[..., 1 - agent], facings[..., 1 - agent]))
+        position, relative = xp.arange(VISIBLE, dtype=xp.uint8), at(self._window_position, me, other)
+        words = xp.where(position == relative[..., None], others[..., None], words)
+        return xp.astype(xp.where(position == CENTRE, own[..., None], words), xp.int32)
+
+    @lru_cache  # noqa: B019 - instances live as long as the process, see `cell_words`
+    def entries(self, agents: tuple[int, ...] = (0,)) -> np.ndarray:
+        """Return the entries of a flat observation that can differ from 0 on these layouts.
+
+        Args:
+            agents: the agents that observe: 0 (ego), 1 (teammate). An agent stays in its room, so one sees less than
+                both.
+
+        Returns:
+            int64 (E,), ascending: cell * C + channel, with cells of the window in reading order.
+        """
+        nonzero = self.channels[:-1] > 0
+        shown = np.zeros((VISIBLE, nonzero.shape[-1]), bool)
+        for number, layout in enumerate(self.layouts):
+            of_kind = np.stack([nonzero[words[words < len(nonzero)]].any(axis=0) for words in self._words[number]])
+            for agent in agents:
+                room, other_room = layout.rooms[agent], layout.rooms[1 - agent]
+                kinds = self._kind[number, self._slot[number, room]]  # (cells of the room, 25)
+                shown |= (of_kind[kinds] | nonzero[self._fixed[number, room]]).any(axis=0)
+                relative = np.unique(layout.window_position[np.ix_(room, other_room)])
+                shown[np.setdiff1d(relative, [NOWHERE, CENTRE])] |= of_kind[_OTHER]
+                shown[CENTRE] |= of_kind[_SELF]
+        return np.flatnonzero(shown)
+
+
+def cell_words(layouts: Sequence[Layout]) -> CellWords:
+    """Return the words of the cells that are visible on these layouts, whose observations have the same channels."""
+    return _cached(tuple(layouts))
+
+
+@lru_cache(maxsize=16)
+def _cached(layouts: tuple[Layout, ...]) -> CellWords:
+    return CellWords(layouts)
+
+
+def _slots(layout: Layout) -> list[_Slot]:
+    where = columns(layout)
+    indicators, goals = (np.flatnonzero(layout.kinds == kind).tolist() for kind in (INDICATOR, GOAL))
+    return [
+        _Slot(_RECIPE, indicators, where.recipe),
+        _Slot(_GOAL, goals, where.delivered),
+        *(_Slot(_POT, [c], where.pot_items.start + k, where.pot_timers.start + k) for k, c in enumerate(layout.pots)),
+        *(_Slot(_BUTTON, [c], where.recipe, where.buttons.start + k) for k, c in enumerate(layout.buttons)),
+        *(_Slot(_COUNTER, [c], where.counters.start + k) for k, c in enumerate(layout.counters)),
+    ]
+
+
+def _fixed_cells(layout: Layout) -> np.ndarray:
+    """uint8 (cells * 25, C): what the window of an observer on each cell shows of an empty map, without agents."""
+    record = np.zeros((layout.cells, record_size(layout)), np.uint8)
+    record[:, 0] = np.arange(layout.cells)
+    obs = observe(layout, record, 0)
+    obs[..., : fixed_channels(layout).start] = 0
+    return obs.reshape(-1, obs.shape[-1])
+
+
+def _contents(layout: Layout) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Kind -> pairs of numbers that the rules allow, int (n,), and what the cell shows then, uint8 (n, C)."""
+    item = np.arange(256)
+    possible, count = possible_items(layout), ingredient_count(item)
+    carried = np.flatnonzero(possible & ((item & PLATE > 0) | (count <= 1)))
+    recipes = np.flatnonzero(possible & (item & (PLATE | COOKED) == 0) & (count == 3))
+    potted = np.setdiff1d(np.flatnonzero(possible & (item & PLATE == 0)), recipes)
+    cooking = (recipes + (np.arange(1, POT_STEPS + 1)[:, None] << 8)).ravel()
+    lit = (recipes + (np.arange(BUTTON_STEPS + 1)[:, None] << 8)).ravel()
+    pairs = {_RECIPE: recipes, _GOAL: np.arange(2), _POT: np.append(potted, cooking), _BUTTON: lit, _COUNTER: carried}
+    found = {}
+    for slot in _slots(layout):
+        if slot.kind not in found and (views := np.argwhere(layout.window_position[:, slot.cells] != NOWHERE)).size:
+            observer, cell = views[0][0], slot.cells[views[0][1]]
+            found[slot.kind] = pairs[slot.kind], _shown(layout, slot, pairs[slot.kind], observer, cell)
+    bodies = (carried + (np.arange(len(FACINGS))[:, None] << 8)).ravel()
+    record = np.zeros((len(bodies), record_size(layout)), np.uint8)
+    where = columns(layout)
+    record[:, 0] = np.flatnonzero(layout.walkable)[0]
+    record[:, where.facings.start], record[:, where.hands.start] = bodies >> 8, bodies & 255
+    own = observe(layout, record, 0).reshape(len(bodies), VISIBLE, -1)[:, CENTRE]
+    channels = fixed_channels(layout).start // 2  # of one agent; those of the other one follow
+    own[:, channels:] = 0
+    return found | {_SELF: (bodies, own), _OTHER: (bodies, np.roll(own, channels, axis=-1))}
+
+
+def _shown(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int) -> np.ndarray:
+    """uint8 (n, C): what a slot's cell shows to an observer on another cell."""
+    record = np.zeros((len(pairs), record_size(layout)), np.uint8)
+    record[:, slot.byte] = pairs & 255
+    if slot.second is not None:
+        record[:, slot.second] = pairs >> 8
+    record[:, 0] = observer
+    obs = observe(layout, record, 0).reshape(len(pairs), VISIBLE, -1)[:, layout.window_position[observer, cell]]
+    obs[:, : fixed_channels(layout).start] = 0
+    return obs

@@ -1,0 +1,76 @@
+"""Words of visible cells are what `observe` shows."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from icrl4aht_data.overcooked.layouts import CENTRE, LAYOUTS, VISIBLE, Layout, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.overcooked.words import cell_words
+from tests.helpers.random_releases import random_history
+from tests.helpers.states import random_records
+
+each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+
+def records_of(layout: Layout) -> np.ndarray:
+    """uint8 (800, S): states that play reaches, and states of every kind that the rules allow."""
+    rng = np.random.default_rng(5)
+    return np.concatenate([random_history(layout, 4, 100, rng)["state"], random_records(layout, 400, rng)])
+
+
+@each_layout
+@pytest.mark.parametrize("agent", [0, 1])
+def test_channels_of_the_words_are_the_observation(layout, agent):
+    records, words = records_of(layout), cell_words([layout])
+    expected = observe(layout, records, agent)
+    ids = words.ids(records, agent=agent)
+    assert ids.dtype == np.int32
+    np.testing.assert_array_equal(words.channels[ids].reshape(expected.shape), expected)
+    np.testing.assert_array_equal(np.asarray(words.ids(jnp.asarray(records), agent=agent)), ids)
+
+
+@each_layout
+def test_entries_that_can_differ_from_zero(layout):
+    records, words = records_of(layout), cell_words([layout])
+    seen = [np.flatnonzero(observe(layout, records, agent).reshape(len(records), -1).any(axis=0)) for agent in (0, 1)]
+    assert np.isin(seen[0], words.entries((0,))).all()
+    assert np.isin(seen[1], words.entries((1,))).all()
+    np.testing.assert_array_equal(words.entries((0, 1)), np.union1d(words.entries((0,)), words.entries((1,))))
+    assert len(words.entries((0,))) < VISIBLE * layout.channels / 2  # few, which is what they are for
+
+
+@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+def test_records_of_several_layouts_in_one_batch(xp):
+    layouts = [get_layout(name) for name in ("asymm_both", "cramped_up", "asymm_right", "cramped_down")]
+    words, number = cell_words(layouts), np.array([2, 0, 3, 1, 1])
+    mixed, expected = np.zeros((5, 6, 64), np.uint8), np.zeros((5, 6, *layouts[0].obs_shape), np.uint8)
+    for row, layout in enumerate(layouts[n] for n in number):
+        records = records_of(layout)[: 6 * 7 : 7]
+        mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0)
+    size = max(np.flatnonzero(mixed.any(axis=(0, 1)))) + 1
+    ids = words.ids(xp.asarray(mixed[..., :size]), xp.asarray(number))
+    np.testing.assert_array_equal(words.channels[np.asarray(ids)].reshape(expected.shape), expected)
+
+
+def test_words_are_few_and_the_first_shows_nothing():
+    words = cell_words([get_layout("demo_wide")])
+    assert 300 < len(words.channels) < 400
+    assert not words.channels[0].any()
+    assert len(np.unique(words.channels, axis=0)) == len(words.channels)
+
+
+@pytest.mark.parametrize(("column", "value"), [("pot_timers", 31), ("pot_items", 255), ("hands", 255)])
+def test_contents_that_the_rules_exclude_have_the_last_word(column, value):
+    layout = get_layout("cramped_up")
+    records, words = records_of(layout), cell_words([layout])
+    records[:, getattr(columns(layout), column)] = value
+    ids = words.ids(records)
+    impossible = len(words.channels) - 1
+    assert (ids == impossible).any(axis=-1).mean() > 0.5
+    assert (words.channels[impossible] == 255).all()
+    if column == "hands":
+        assert (ids[:, CENTRE] == impossible).all()
