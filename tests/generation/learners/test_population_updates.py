@@ -269,7 +269,7 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
     def sequences_of_all(state, carry, rollout):
         last = trained._players(state.params)[0].act(carry.memories[0], carry.env, key)[0].value
         shaping = shaping_weight(CONFIG, state.update)
-        return sequences(rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
+        return sequences(trained.view, rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
 
     everyone = jax.tree.map(np.asarray, compiled(sequences_of_all)(before, lbrdiv.carry, lbrdiv.rollout))
     for number in range(4):
