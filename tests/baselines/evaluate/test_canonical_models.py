@@ -130,6 +130,22 @@ def test_batches_of_states_show_what_batches_of_observations_hold(lite, reconver
     assert jax.tree.map(jnp.shape, shapes[0]) == jax.tree.map(jnp.shape, shapes[1])
 
 
+def test_every_part_is_rendered_by_its_own_layouts(lite):
+    """A held-out part is on some of the layouts only, here the second one, and batches number those of the model."""
+    job = prepare("ad", MODEL, dataclasses.replace(OPTIONS, batch_size=8), HistoryOptions(("all",), str(lite[0])))
+    names = job.about["histories"]["layouts"]
+    view = CompactView("paper", tuple(map(get_layout, names)), canonical=True)
+    found = {}
+    for part, sampler in {"train": job.data.train, **job.data.validation}.items():
+        batch = sampler[0]
+        rendered: Any = view(jnp.asarray(batch.obs), jnp.asarray(batch.layouts))
+        stored = sampler.dataset.with_options(obs="uint8").ad(batch_size=8, length=6)[0]
+        np.testing.assert_array_equal(np.asarray(rendered), stored.obs, strict=True, err_msg=part)
+        found[part] = [layout.name for layout in sampler.dataset.layouts]
+    assert found["train"] == names
+    assert found["teammates"] == [names[1]]
+
+
 @pytest.mark.parametrize(
     ("layouts", "given", "channels", "size"),
     [
