@@ -227,13 +227,13 @@ def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) 
 
 
 def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
-    sizes, model = bench.sizes, model_options(bench.sizes, size, encoder, dtype)
+    sizes, model = bench.sizes, architecture(bench.sizes, size, encoder, dtype)
     length = context_length(sizes, size)
     dataset = load_icrl4aht(layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
     trainer = Trainer(get_method("ad")(model, overcooked_world(dataset.layouts)), options)
     state = trainer.init()
-    with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, None) as batches:
+    with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, sys.maxsize) as batches:
         batch = next(batches)
         program = compile_measured(trainer.step, state, batch)
         limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", program.bytes)
@@ -288,7 +288,7 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     sizes, context = bench.sizes, context_length(bench.sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = tasks_beside_h4()[: sizes.tasks]
-    method = get_method("ad")(model_options(sizes, size, encoder, "float32"), overcooked_world([layout]))
+    method = get_method("ad")(architecture(sizes, size, encoder, "float32"), overcooked_world([layout]))
     policy = learned(method, method.init(jax.random.key(0)), context, "cached")
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps)
     started = time.perf_counter()
@@ -339,7 +339,7 @@ def tasks_beside_h4() -> list[Task]:
     return [task for task in tasks if task.layout.name == _LAYOUT and task.teammate_family == "H4"]
 
 
-def model_options(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
+def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
     """Returns the architecture of a size of AD."""
     layers, width = sizes.models[size]
     positions = "rope" if size == "tiny" else "none"
@@ -439,7 +439,10 @@ def main(
 
 def make_bench(small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]) -> Bench:
     """Returns the settings of this process, in which JAX is used from here on."""
-    sizes = SMALL_SIZES if small or jax.default_backend() == "cpu" else FULL_SIZES
+    sizes = FULL_SIZES
+    if small or jax.default_backend() == "cpu":
+        sizes = SMALL_SIZES
+        jax.config.update("jax_disable_most_optimizations", True)  # compiling would be nearly all of the time
     return Bench(replace(sizes, seconds=sizes.seconds if seconds is None else seconds), dict(peaks))
 
 
