@@ -1,34 +1,205 @@
-"""Self-play learning speed compared with JaxMARL's recurrent IPPO for OvercookedV2: `make bench-learner PEER=file`.
+"""Learning speed: `make bench-learner`.
 
-The peer is JaxMARL's `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which its package does not contain: give the path of
-a copy. Both learn on the same map with the same network, environments and hyper-parameters, in turn in one process.
-Modules that the peer imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by stubs; it
-also needs distrax, from the extra `peers`.
+    speed     environment steps/s of an ego that learns with a heuristic teammate, by profile, in turn
+    parts     where an update's time goes: each part by itself, and FLOP/s compared with one large matrix product
+    peer      self-play with the paper's network compared with JaxMARL's recurrent IPPO: `PEER=file`
+
+One JSON line each. XLA takes the threads that the profiles fix. The peer is JaxMARL's
+`baselines/IPPO/ippo_rnn_overcooked_v2.py`, which its package does not contain: give the path of a copy. Both learn on
+the same map with the same network, environments and hyper-parameters, in turn in one process. Modules that the peer
+imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by stubs; it also needs distrax, from
+the extra `peers`.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import statistics
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import jax
+import jax.numpy as jnp
+import optax
 
-from benchmarks.common import print_line, rates_in_turn, ratio_facts
-from benchmarks.peers import jaxmarl_environment
+from benchmarks.common import elapsed, print_line, rates_in_turn, ratio_facts
 from generation.env import Environment
 from generation.learners.config import PPOConfig
+from generation.learners.ego import Learner, compiled_update
+from generation.learners.encoder import WindowEncoder
+from generation.learners.network import GRU
 from generation.learners.population.fcp import FCP
 from generation.learners.population.population import Population
-from icrl4aht_data.commands.options import COUNT
+from generation.learners.ppo import ppo_optimizer
+from generation.learners.resume import limit_xla_threads, xla_threads
+from generation.learners.rollout import roll_out
+from generation.profiles import load_profile
+from generation.teammates.registry import build_teammate, heuristic_teammate
+from icrl4aht_data.commands.options import COUNT, LAYOUT
+from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
-_UPDATES = 2
+_UPDATES, _PEER_UPDATES, _CALLS, _MATRIX = 3, 2, 10, 2048
+
+
+def make_learner(layout: Layout, config: PPOConfig) -> Learner:
+    """An ego with these hyper-parameters and teammate H4."""
+    mate = build_teammate(layout, heuristic_teammate("utility_greedy", "default", 0), noise="seeded")
+    return Learner(Environment(layout), mate, config)
+
+
+class Runner:
+    """A learner that runs; its update is compiled and warm.
+
+    Attributes:
+        learner: the learner.
+        state: its state.
+    """
+
+    def __init__(self, layout: Layout, config: PPOConfig) -> None:
+        self.learner = make_learner(layout, config)
+        self._update = compiled_update(self.learner)
+        self.state = jax.jit(self.learner.init)(jax.random.key(0))
+        self.run(2)
+
+    def run(self, updates: int = _UPDATES) -> None:
+        """Does some updates and waits for the last one."""
+        for _ in range(updates):
+            self.state, _, _ = self._update(self.state)
+        jax.block_until_ready(self.state.params)
+
+
+def compare_profiles(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> None:
+    """Print steps/s of every profile's ego; they take turns, so that all meet the same load of the machine."""
+    runners = {name: Runner(layout, config) for name, config in configs.items()}
+    steps = {name: _UPDATES * config.steps_per_update for name, config in configs.items()}
+    rates = [{name: steps[name] / elapsed(runner.run) for name, runner in runners.items()} for _ in range(rounds)]
+    first = next(iter(configs))
+    for name, config in configs.items():
+        print_line(
+            "learner",
+            part="speed",
+            profile=name,
+            layout=layout.name,
+            threads=xla_threads(),
+            encoder=config.widths.encoder,
+            environments=config.environments,
+            rollout=config.rollout,
+            minibatches=config.minibatches,
+            epochs=config.epochs,
+            steps_per_second=round(statistics.median(rate[name] for rate in rates)),
+            **{f"ratio_to_{first}": round(statistics.median(rate[name] / rate[first] for rate in rates), 2)},
+        )
+
+
+class Part(NamedTuple):
+    """A part of an update.
+
+    Attributes:
+        seconds: of one call.
+        calls: calls in an update.
+        flops: floating-point operations of a call; 0 if they do not matter.
+    """
+
+    seconds: float
+    calls: int = 1
+    flops: float = 0
+
+
+def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Part]]:
+    """Seconds of an update, and its parts.
+
+    Encoder, recurrent layer and all layers are timed forward and backward on a minibatch of a real roll-out. What all
+    layers take in addition to the first two are the heads.
+    """
+    runner = Runner(layout, config)
+    learner, state, widths = runner.learner, runner.state, config.widths
+    play = jax.jit(
+        lambda s: roll_out(learner.env, learner.players(s.params, s.teammate), s.carry, config.rollout, s.key)[1]
+    )
+    rollout = play(state)
+    batch = config.environments // config.minibatches
+    seen = jax.tree.map(lambda leaf: leaf[:, :batch], learner.view(rollout.record))
+    params, reset, hidden = state.params["params"], rollout.reset[:, :batch], jnp.zeros((batch, widths.gru))
+    features = jax.random.normal(jax.random.key(1), (config.rollout, batch, widths.dense))
+    encoder = WindowEncoder(
+        widths.dense, widths.encoder, widths.pointwise, widths.spatial, normalize=True, view=learner.view
+    )
+    recurrent = GRU(widths.gru)
+
+    def encode(params: Any) -> Any:
+        return jnp.vdot(encoder.apply({"params": params}, seen), features)
+
+    def recur(params: Any, features: Any) -> Any:
+        return (recurrent.apply({"params": params}, hidden, features, reset)[1] ** 2).sum()
+
+    def apply_network(params: Any) -> Any:
+        _, logits, value = learner.network.apply({"params": params}, hidden, seen, reset)  # type: ignore[misc]
+        return (jax.nn.log_softmax(logits)[..., 0] ** 2).sum() + (value**2).sum()
+
+    optimizer = ppo_optimizer(config)
+
+    def optimise(params: Any, memory: Any) -> Any:
+        change, memory = optimizer.update(params, memory, params)
+        return optax.apply_updates(params, change), memory
+
+    calls, steps = config.epochs * config.minibatches, batch * config.rollout
+    of_encoder, encoder_flops = _timed(jax.grad(encode), params["encoder"])
+    of_recurrent, _ = _timed(jax.grad(recur, argnums=(0, 1)), params["gru"], features)
+    of_network, _ = _timed(jax.grad(apply_network), params)
+    # Forward, and backward to inputs and weights: three products of two operations an entry.
+    weights = 3 * widths.gru * (widths.dense + widths.gru)
+    heads = 2 * widths.gru * widths.head + widths.head * (len(ACTIONS) + 1)
+    parts = {
+        "roll-out": Part(_timed(play, state)[0]),
+        "rendering": Part(_timed(learner.view, rollout.record)[0]),
+        "encoder": Part(of_encoder, calls, encoder_flops),
+        "recurrent layer": Part(of_recurrent, calls, 6 * steps * weights),
+        "heads": Part(max(0.0, of_network - of_encoder - of_recurrent), calls, 6 * steps * heads),
+        "optimiser": Part(_timed(optimise, state.params, state.optimizer)[0], calls),
+    }
+    return elapsed(runner.run) / _UPDATES, parts
+
+
+def print_parts(layout: Layout, name: str, config: PPOConfig) -> None:
+    """Print the share of each part of an update, and FLOP/s compared with one large matrix product.
+
+    The line "rest" is what the parts do not explain: shuffling, advantages, the loss itself, and the overhead of many
+    small operations.
+    """
+    matrix = jax.random.normal(jax.random.key(0), (_MATRIX, _MATRIX))
+    seconds, flops = _timed(lambda a: a @ a, matrix)
+    print_line(
+        "learner", part="matrix product", size=_MATRIX, threads=xla_threads(), gflops=round(flops / seconds / 1e9, 1)
+    )
+    total, parts = update_parts(layout, config)
+    known = sum(part.seconds * part.calls for part in parts.values())
+    for what, part in (parts | {"rest": Part(total - known)}).items():
+        rate = {"gflops": round(part.flops / part.seconds / 1e9, 1)} if part.flops and part.seconds else {}
+        print_line(
+            "learner",
+            part="parts",
+            profile=name,
+            layout=layout.name,
+            what=what,
+            calls=part.calls,
+            milliseconds=round(1000 * part.seconds * part.calls, 3),
+            share=round(part.seconds * part.calls / total, 3),
+            **rate,
+        )
+
+
+def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
+    """Seconds of a call, the fastest of some, and the floating-point operations that XLA counts."""
+    compiled = jax.jit(function).lower(*arguments).compile()
+    cost = compiled.cost_analysis() or {}
+    calls = [elapsed(lambda: jax.block_until_ready(compiled(*arguments))) for _ in range(_CALLS)]
+    return min(calls), cost.get("flops", 0.0)
 
 
 def load_peer(path: Path) -> ModuleType:
@@ -48,7 +219,9 @@ def load_peer(path: Path) -> ModuleType:
 
 
 def peer_training(module: ModuleType, layout: Layout, config: PPOConfig) -> Callable[[], None]:
-    """A compiled call of the peer's training: initialisation and `_UPDATES` updates."""
+    """A compiled call of the peer's training: initialisation and `_PEER_UPDATES` updates."""
+    from benchmarks.peers import jaxmarl_environment  # only the peer needs JaxMARL
+
     module.jaxmarl.make = lambda name, **options: jaxmarl_environment(layout)
     options = {
         "ENV_NAME": "overcooked_v2",
@@ -60,7 +233,7 @@ def peer_training(module: ModuleType, layout: Layout, config: PPOConfig) -> Call
         "NUM_STEPS": config.rollout,
         "UPDATE_EPOCHS": config.epochs,
         "NUM_MINIBATCHES": config.minibatches,
-        "TOTAL_TIMESTEPS": _UPDATES * config.steps_per_update,
+        "TOTAL_TIMESTEPS": _PEER_UPDATES * config.steps_per_update,
         "REW_SHAPING_HORIZON": config.shaping_horizon,
         "FC_DIM_SIZE": config.widths.head,
         "GRU_HIDDEN_DIM": config.widths.gru,
@@ -78,30 +251,71 @@ def peer_training(module: ModuleType, layout: Layout, config: PPOConfig) -> Call
 
 
 def our_training(layout: Layout, config: PPOConfig) -> Callable[[], None]:
-    """A compiled call of our training: initialisation and `_UPDATES` updates."""
+    """A compiled call of our training: initialisation and `_PEER_UPDATES` updates."""
     population = Population(Environment(layout), FCP(1), config)
 
     def train_through(key):
         state = population.init(key)
-        return jax.lax.scan(lambda state, _: population.update(state), state, length=_UPDATES)
+        return jax.lax.scan(lambda state, _: population.update(state), state, length=_PEER_UPDATES)
 
     train = jax.jit(train_through).lower(jax.random.key(0)).compile()
     return lambda: jax.block_until_ready(train(jax.random.key(0)))
 
 
+def compare_peer(peer: Path, layout: Layout, config: PPOConfig, rounds: int) -> None:
+    """Print steps/s of self-play learning with the paper's network, ours with encoder `words`, and the ratio."""
+    words = replace(config, widths=replace(config.widths, encoder="words"))
+    ours, theirs = our_training(layout, words), peer_training(load_peer(peer), layout, config)
+    pairs = rates_in_turn(ours, theirs, _PEER_UPDATES * config.steps_per_update, rounds)
+    sizes = {name: getattr(config, name) for name in ("environments", "rollout", "minibatches")}
+    print_line(
+        "learner",
+        part="peer",
+        layout=layout.name,
+        threads=xla_threads(),
+        **sizes,
+        **ratio_facts(pairs, "jaxmarl", 1, 2),
+    )
+
+
 @click.command()
-@click.option("--peer", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=True)
-@click.option("--layout", "layout_name", default="cramped_up", show_default=True)
-@click.option("--environments", type=COUNT, default=32, show_default=True)
-@click.option("--rollout", type=COUNT, default=64, show_default=True)
-@click.option("--minibatches", type=COUNT, default=8, show_default=True)
-@click.option("--rounds", type=COUNT, default=3, show_default=True)
-def main(peer: Path, layout_name: str, rounds: int, **sizes: int) -> None:
-    """Compare environment steps/s of self-play learning with the paper's network; one JSON line."""
-    layout, config = get_layout(layout_name), replace(PPOConfig(), warmup=0.05, **sizes)
-    ours, theirs = our_training(layout, config), peer_training(load_peer(peer), layout, config)
-    pairs = rates_in_turn(ours, theirs, _UPDATES * config.steps_per_update, rounds)
-    print_line("learner", layout=layout.name, **sizes, **ratio_facts(pairs, "jaxmarl", 1, 2))
+@click.option(
+    "--part", "parts", multiple=True, type=click.Choice(["speed", "parts", "peer"]), default=("speed", "parts")
+)
+@click.option(
+    "--profile", "names", multiple=True, default=("mini", "cpu"), show_default=True, help="Profiles to compare."
+)
+@click.option("--layout", type=LAYOUT, default="demo_wide", show_default=True, help="Layout of `speed` and `parts`.")
+@click.option(
+    "--peer", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="The peer's file, for `peer`."
+)
+@click.option("--peer-layout", type=LAYOUT, default="cramped_up", show_default=True, help="Layout of `peer`.")
+@click.option("--environments", type=COUNT, default=32, show_default=True, help="Environments of `peer`.")
+@click.option("--rounds", type=COUNT, default=5, show_default=True)
+def main(
+    parts: tuple[str, ...],
+    names: tuple[str, ...],
+    layout: str,
+    peer: Path | None,
+    peer_layout: str,
+    environments: int,
+    rounds: int,
+) -> None:
+    """Print the speed of learning by profile, where its time goes, and a comparison with JaxMARL's IPPO."""
+    if "peer" in parts and not peer:
+        raise click.UsageError("--part peer: expected --peer FILE, a copy of JaxMARL's ippo_rnn_overcooked_v2.py")
+    profiles = [load_profile(name) for name in names]
+    configs = {profile.name: profile.ego for profile in profiles}
+    if profiles[-1].xla_threads and set(parts) != {"peer"}:
+        limit_xla_threads(profiles[-1].xla_threads)
+    if "speed" in parts:
+        compare_profiles(get_layout(layout), configs, rounds)
+    if "parts" in parts:
+        for name, config in configs.items():
+            print_parts(get_layout(layout), name, config)
+    if "peer" in parts and peer:
+        config = replace(PPOConfig(), warmup=0.05, environments=environments, rollout=64, minibatches=8)
+        compare_peer(peer, get_layout(peer_layout), config, rounds)
 
 
 if __name__ == "__main__":

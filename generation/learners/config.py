@@ -21,20 +21,34 @@ _WIDEST, _LAYERS = 2**13, 16  # larger values in a file are a mistake, or meant 
 
 @dataclass(frozen=True)
 class Widths:
-    """Layer widths of the network; the defaults are the paper's (273,375 parameters at C = 40)."""
+    """Encoder and layer widths of the network; the defaults are the paper's (273,375 parameters at C = 40).
+
+    Encoder `mlp` has no convolutions: `pointwise` and `spatial` are empty then, whatever was given.
+    """
 
     pointwise: tuple[int, ...] = option_field(
-        (128, 128, 8), "Width of a 1 x 1 convolution; repeat for more layers.", at_least=1, at_most=_WIDEST
+        (128, 128, 8),
+        "Width of a 1 x 1 convolution; repeat for more layers.",
+        at_least=1,
+        at_most=_WIDEST,
+        may_be_empty=True,
     )
     spatial: tuple[int, ...] = option_field(
-        (16, 32, 32), "Width of a 3 x 3 convolution; repeat for more layers.", at_least=1, at_most=_WIDEST
+        (16, 32, 32),
+        "Width of a 3 x 3 convolution; repeat for more layers.",
+        at_least=1,
+        at_most=_WIDEST,
+        may_be_empty=True,
     )
     dense: int = option_field(128, "Width of the encoder's dense layer.", at_least=1, at_most=_WIDEST)
     gru: int = option_field(128, "Width of the recurrent state.", at_least=1, at_most=_WIDEST)
     head: int = option_field(128, "Width of the actor's and the critic's hidden layers.", at_least=1, at_most=_WIDEST)
+    encoder: EncoderKind = option_field("paper", "Encoder of observations: paper, words (the same, faster) or mlp.")
 
     def __post_init__(self) -> None:
         for name in ("pointwise", "spatial"):
+            if self.encoder == "mlp":
+                object.__setattr__(self, name, ())
             if len(getattr(self, name)) > _LAYERS:
                 raise OptionError(f"{name} = {getattr(self, name)!r:.200}: expected at most {_LAYERS} layers")
         check_fields(self)
@@ -76,7 +90,6 @@ class PPOConfig:
     shaping_horizon: int = option_field(
         PAPER_EGO_STEPS, "Environment steps until shaped rewards have the weight 0.", at_least=1
     )
-    encoder: EncoderKind = option_field("paper", "Encoder of observations: paper, words (the same, faster) or mlp.")
     widths: Widths = field(default_factory=Widths)
 
     def __post_init__(self) -> None:

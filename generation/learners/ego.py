@@ -74,8 +74,12 @@ class Learner:
     @property
     def network(self) -> ActorCritic:
         """The ego's network."""
-        view = CompactView(self.config.encoder, (self.env.layout,))
-        return ActorCritic(self.config.widths, encoder=self.config.encoder, view=view)
+        return ActorCritic(self.config.widths, view=self.view)
+
+    @cached_property
+    def view(self) -> CompactView:
+        """What makes the network's inputs."""
+        return CompactView(self.config.widths.encoder, (self.env.layout,))
 
     @cached_property
     def ppo(self) -> PPO:
@@ -104,9 +108,7 @@ class Learner:
         # Only for the value of the observation after the roll-out: the action is drawn again in the next one.
         after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
         shaping = shaping_weight(self.config, state.update)
-        played = sequences(
-            self.network.view, rollout, EGO, ego.agent_slots, state.carry.memories[EGO], after.value, shaping
-        )
+        played = sequences(self.view, rollout, EGO, ego.agent_slots, state.carry.memories[EGO], after.value, shaping)
         params, optimizer, losses = self.ppo.learn(state.params, state.optimizer, played, learn_key)
         metrics = losses | episode_metrics(rollout) | {"shaping": shaping}
         return (

@@ -34,6 +34,7 @@ class FieldBounds(NamedTuple):
         at_most, below: upper bounds, inclusive and exclusive.
         flags: further names of the option, such as "--ta".
         default_text: text shown as the default, for a default that says nothing, such as None.
+        may_be_empty: whether a tuple without values is valid.
     """
 
     help: str
@@ -43,6 +44,7 @@ class FieldBounds(NamedTuple):
     below: float | None = None
     flags: tuple[str, ...] = ()
     default_text: str | None = None
+    may_be_empty: bool = False
 
     def describe(self) -> str:
         """Returns the bounds in words, such as "at least 0 and below 1"."""
@@ -93,6 +95,7 @@ def option_field(
     below: float | None = None,
     flags: Sequence[str] = (),
     default_text: str | None = None,
+    may_be_empty: bool = False,
 ) -> Any:
     """Returns a dataclass field that becomes a command-line option.
 
@@ -102,8 +105,9 @@ def option_field(
         at_least, above, at_most, below: bounds of numbers.
         flags: further names of the option. Its first name is that of the field, with dashes.
         default_text: shown instead of the default.
+        may_be_empty: whether a tuple without values is valid.
     """
-    bounds = FieldBounds(help, at_least, above, at_most, below, tuple(flags), default_text)
+    bounds = FieldBounds(help, at_least, above, at_most, below, tuple(flags), default_text, may_be_empty)
     return dataclasses.field(default=default, metadata={_KEY: bounds})
 
 
@@ -131,7 +135,8 @@ def check_fields(options: Any) -> None:
     """Validate the values of a dataclass against the choices and bounds of its fields.
 
     Raises:
-        OptionError: for a number of the wrong type or out of bounds, or an empty tuple; names the field.
+        OptionError: for a number of the wrong type or out of bounds, or an empty tuple where values are required; names
+            the field.
         UnknownNameError: for a value that is not among the choices; lists them.
     """
     for field in option_fields(type(options)):
@@ -139,7 +144,7 @@ def check_fields(options: Any) -> None:
         if value is None and field.optional:
             continue
         values = value if field.repeated else (value,)
-        if not values:
+        if not values and not field.bounds.may_be_empty:
             raise OptionError(f"{field.name} = {value}: expected one value or more")
         for item in values:
             _check_value(field, item)

@@ -185,9 +185,13 @@ class Population:
         policies = self.assignment.policies
         pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
         partners = policies if len(pairs) > policies else 0
-        view = CompactView(self.config.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
         partners = partners if self.partners is None else self.partners
-        return ActorCritic(self.config.widths, partners, encoder=self.config.encoder, view=view)
+        return ActorCritic(self.config.widths, partners, view=self.view)
+
+    @cached_property
+    def view(self) -> CompactView:
+        """What makes the network's inputs."""
+        return CompactView(self.config.widths.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
 
     @cached_property
     def ppo(self) -> PPO:
@@ -286,9 +290,7 @@ class Population:
             last, _ = player.act(carry.memories[number], carry.env, key)
             # A policy that lowers a return must not be paid, nor charged, for the shaped rewards on the way.
             own_shaping = shaping * (weight[slots] >= 0)
-            played = sequences(
-                self.network.view, rollout, number, slots, state.carry.memories[number], last.value, own_shaping
-            )
+            played = sequences(self.view, rollout, number, slots, state.carry.memories[number], last.value, own_shaping)
             partner = jnp.asarray(self.assignment.partner[slots])[None]
             played = played._replace(partner=partner, weight=weight[slots][None])
 

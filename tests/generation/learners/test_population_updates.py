@@ -44,7 +44,7 @@ def parts(lbrdiv) -> Parts:
     record = np.asarray(before.carry.env.record)[rng.integers(0, 32, (2, steps, slots))]
     zeros = np.zeros((2, steps, slots), np.float32)
     arrays: dict[str, Any] = {
-        "record": record,
+        "seen": observe(LAYOUT, record, EGO),
         "reset": np.broadcast_to(np.arange(steps)[:, None] == 0, zeros.shape),
         "action": action,
         "log_prob": zeros - np.log(6, dtype=np.float32),
@@ -133,7 +133,7 @@ def test_policies_that_learn_at_once_learn_as_each_alone(learn, parts, learned):
 
 def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
     """The first of two policies plays the rewarded action more often than before, the second less often."""
-    obs = observe(LAYOUT, np.asarray(parts.played.record[0, 0]), EGO)[None]
+    obs = parts.played.seen[0, 0][None]
 
     def probability(params):
         hidden, reset = jnp.zeros((obs.shape[1], 8)), jnp.ones(obs.shape[:2], bool)
@@ -269,7 +269,7 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
     def sequences_of_all(state, carry, rollout):
         last = trained._players(state.params)[0].act(carry.memories[0], carry.env, key)[0].value
         shaping = shaping_weight(CONFIG, state.update)
-        return sequences(rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
+        return sequences(trained.view, rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
 
     everyone = jax.tree.map(np.asarray, compiled(sequences_of_all)(before, lbrdiv.carry, lbrdiv.rollout))
     for number in range(4):

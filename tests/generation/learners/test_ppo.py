@@ -19,6 +19,7 @@ import pytest
 from generation.env import Environment
 from generation.learners.config import PPOConfig, Widths
 from generation.learners.ego import Learner, LearnerState
+from generation.learners.encoder import CompactView
 from generation.learners.ppo import (
     PPO,
     Batch,
@@ -149,7 +150,8 @@ def egos(rollout: Rollout) -> Choice:
 def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
     """Return the sequences that the ego learns from in the roll-out from this state."""
     slots, hidden = np.arange(CONFIG.environments), state.carry.memories[EGO]
-    return sequences(rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(0))
+    view = CompactView("paper", (CLOSET,))
+    return sequences(view, rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(0))
 
 
 # Advantages.
@@ -307,7 +309,7 @@ def test_minibatches_are_shuffled_by_the_key(update, learning):
 @pytest.mark.slow
 def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
     """Four sequences for three minibatches: the key decides which one is left out."""
-    ppo = PPO(CLOSET, learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
+    ppo = PPO(learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
     learn = compiled(ppo.learn)
     given = egos_sequences(played.before[1], played.rollouts[1])
 
