@@ -42,6 +42,7 @@ from baselines.agents.egos import learned
 from baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.methods.attention import causal_attention
+from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.training.options import TrainOptions
@@ -51,15 +52,14 @@ from benchmarks.flops import compile_measured, device_memory, gib
 from benchmarks.isolated import run_isolated
 from generation.collection.options import request_determinism
 from generation.env import Environment
-from generation.learners.config import EncoderKind, PPOConfig
+from generation.learners.config import EncoderKind, PPOConfig, Widths
 from generation.learners.ego import Learner, compiled_update
 from generation.learners.resume import xla_threads
 from generation.teammates.instances import published_tasks
 from generation.teammates.registry import build_teammate
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.threads import usable_cores
 
 _LAYOUT = "demo_wide"
@@ -185,10 +185,8 @@ def measure_product(bench: Bench) -> dict[str, Any]:
 
 def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
     """Environment steps/s of complete updates of an ego beside teammate H4."""
-    task = tasks_beside_h4()[0]
-    config = replace(PPOConfig(), encoder=encoder, **bench.sizes.ppo)
-    teammate = build_teammate(task.layout, task.teammate, TEAMMATE)
-    learner = Learner(Environment(task.layout), teammate, config)
+    learner = ego_learner(bench.sizes, encoder)
+    config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
     program = compile_measured(compiled_update(learner), state)
 
@@ -231,7 +229,7 @@ def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, p
     length = context_length(sizes, size)
     dataset = load_icrl4aht(layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
-    trainer = Trainer(get_method("ad")(model, overcooked_world(dataset.layouts)), options)
+    trainer = Trainer(ad_method(model, dataset.layouts), options)
     state = trainer.init()
     with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, sys.maxsize) as batches:
         batch = next(batches)
@@ -288,7 +286,7 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     sizes, context = bench.sizes, context_length(bench.sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = tasks_beside_h4()[: sizes.tasks]
-    method = get_method("ad")(architecture(sizes, size, encoder, "float32"), overcooked_world([layout]))
+    method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
     policy = learned(method, method.init(jax.random.key(0)), context, "cached")
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps)
     started = time.perf_counter()
@@ -339,11 +337,23 @@ def tasks_beside_h4() -> list[Task]:
     return [task for task in tasks if task.layout.name == _LAYOUT and task.teammate_family == "H4"]
 
 
+def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
+    """Returns the learner of an ego beside teammate H4, with the paper's network but for the encoder."""
+    task = tasks_beside_h4()[0]
+    config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
+    return Learner(Environment(task.layout), build_teammate(task.layout, task.teammate, noise="seeded"), config)
+
+
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
     """Returns the architecture of a size of AD."""
     layers, width = sizes.models[size]
     positions = "rope" if size == "tiny" else "none"
     return ModelOptions(layers, width, positions=positions, bfloat16=dtype == "bfloat16")
+
+
+def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
+    """Returns AD for batches of state records of these layouts."""
+    return get_method("ad")(model, overcooked_world(layouts))
 
 
 def context_length(sizes: Sizes, size: str) -> int:

@@ -12,7 +12,9 @@ import jax
 import pytest
 from click.testing import CliRunner
 
-from baselines.methods.registry import get_method, overcooked_world
+from baselines.agents.egos import learned
+from baselines.evaluate.protocols import PROTOCOLS
+from baselines.evaluate.rollout import EvaluationRollout
 from baselines.training.options import TrainOptions
 from baselines.training.trainer import Trainer
 from benchmarks import bench_gpu
@@ -22,16 +24,16 @@ from benchmarks.bench_gpu import (
     PARTS,
     SMALL_SIZES,
     Bench,
+    ad_method,
     architecture,
     context_length,
+    ego_learner,
     main,
     measure_training,
     tasks_beside_h4,
 )
 from benchmarks.flops import product_flops
-from generation.env import Environment
-from generation.learners.config import PPOConfig
-from generation.learners.ego import Learner, compiled_update
+from generation.learners.ego import compiled_update
 from generation.teammates.registry import build_teammate
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
@@ -120,29 +122,36 @@ def test_other_errors_of_training_are_errors(monkeypatch):
 @pytest.mark.parametrize("encoder", ["paper", "words", "mlp"])
 def test_learners_lower_for_cuda(encoder):
     """In the sizes that the benchmark has on a GPU; nothing is compiled."""
-    task = tasks_beside_h4()[0]
-    config = PPOConfig(encoder=encoder, **FULL_SIZES.ppo)
-    learner = Learner(Environment(task.layout), build_teammate(task.layout, task.teammate, TEAMMATE), config)
-    traced = compiled_update(learner).trace(jax.eval_shape(learner.init, jax.random.key(0)))
+    learner = ego_learner(FULL_SIZES, encoder)
+    update: Any = compiled_update(learner)
+    traced = update.trace(jax.eval_shape(learner.init, jax.random.key(0)))
     traced.lower(lowering_platforms=("cuda",))
-    assert product_flops(traced.jaxpr) > 1e6 * config.steps_per_update
+    assert product_flops(traced.jaxpr) > 1e6 * learner.steps_per_update
 
 
-@pytest.mark.parametrize("case", [name for name in CASES if name.startswith("train/")])
+@pytest.mark.parametrize("case", ["small/paper/bfloat16", "small/words/float32", "tiny/mlp/bfloat16"])
 def test_training_steps_lower_for_cuda(case):
     """In the sizes that the benchmark has on a GPU; nothing is compiled."""
-    _, size, encoder, dtype = case.split("/")
-    dataset = load_icrl4aht(layout="demo_wide", obs="state")
-    length, options = context_length(FULL_SIZES, size), architecture(FULL_SIZES, size, encoder, dtype)  # type: ignore
-    trainer = Trainer(
-        get_method("ad")(options, overcooked_world(dataset.layouts)),
-        TrainOptions(batch_size=FULL_SIZES.batch, context=length),
-    )
+    size, encoder, dtype = case.split("/")
+    dataset, length = load_icrl4aht(layout="demo_wide", obs="state"), context_length(FULL_SIZES, size)
+    method = ad_method(architecture(FULL_SIZES, size, encoder, dtype), dataset.layouts)  # type: ignore[arg-type]
+    trainer = Trainer(method, TrainOptions(batch_size=FULL_SIZES.batch, context=length))
     batch = dataset.ad(batch_size=1, length=length, seed=0)[0]
 
-    def large(leaf):
+    def of_full_size(leaf: Any) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((FULL_SIZES.batch, *leaf.shape[1:]), leaf.dtype)
 
-    traced = trainer.step.trace(trainer.state_like(), jax.tree.map(large, batch))
+    traced = trainer.step.trace(trainer.state_like(), jax.tree.map(of_full_size, batch))
     traced.lower(lowering_platforms=("cuda",))
     assert product_flops(traced.jaxpr) > 1e5 * FULL_SIZES.batch * length
+
+
+def test_acting_lowers_for_cuda():
+    tasks = tasks_beside_h4()[:2]
+    method = ad_method(architecture(SMALL_SIZES, "tiny", "mlp", "float32"), [tasks[0].layout])
+    params = jax.eval_shape(method.init, jax.random.key(0))
+    mates = [build_teammate(task.layout, task.teammate, TEAMMATE, "seeded") for task in tasks]
+    rollout = EvaluationRollout(tasks[0].layout, learned(method, params, 10), mates, PROTOCOLS["seeded"])
+    params_and_keys = params, jax.eval_shape(lambda: jax.random.split(jax.random.key(0)))
+    state = jax.eval_shape(lambda params, keys: rollout.start(keys), *params_and_keys)
+    jax.jit(rollout.episode).trace(params, rollout.teammate_params, state).lower(lowering_platforms=("cuda",))
