@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from baselines.methods.conditional import change_if
 from baselines.methods.method import (
@@ -26,7 +26,8 @@ from baselines.methods.method import (
     squared_error,
 )
 from baselines.methods.options import ModelOptions
-from baselines.methods.tokens import BatchView, RingBuffer, StepInput, StepTokens, batch_steps
+from baselines.methods.tokens import RingBuffer, StepInput, StepTokens, batch_steps
+from generation.learners.encoder import encoding_log
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -60,7 +61,8 @@ class StepModel(nn.Module):
     """Model of AD, Hybrid-AD and AMAGO-Offline: steps to tokens, a trunk, a head.
 
     A trunk takes complete sequences of tokens (B, L, D), and one token at a time through `start(context)` or
-    `start_after(tokens, context)` and `advance(token, memory)`.
+    `start_after(tokens, context)` and `advance(token, memory)`. Its features at a position depend on the tokens up to
+    there, so padding, which comes last, needs no mask before the loss.
     """
 
     tokens: StepTokens
@@ -72,13 +74,12 @@ class StepModel(nn.Module):
         self,
         steps: StepInput,
         actions: Int[Array, "B L"] | None = None,
-        lengths: Int[Array, " B"] | None = None,
         deterministic: bool = True,
     ) -> StepOutput:
-        """Returns the output for windows of steps, the first `lengths` of them valid; predicts if actions are given."""
+        """Returns the output for windows of steps; predicts observations if actions are given."""
         trunk: Any = self.trunk
         tokens_BxLxD = self.tokens(steps, deterministic)
-        features_BxLxD = trunk(tokens_BxLxD, lengths=lengths, deterministic=deterministic)
+        features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
         predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
         return StepOutput(self.head(features_BxLxD), predicted)
 
@@ -140,25 +141,25 @@ def example_step(world: World) -> StepInput:
     return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
 
 
-def next_obs_loss(predicted: Float[Array, "B L N"], obs: Array, batch: ADBatch) -> Float[Array, ""]:
+def next_obs_loss(predicted: Float[Array, "B L N"], obs: Num[Array, "B L ..."], batch: ADBatch) -> Float[Array, ""]:
     """Returns the auxiliary loss over steps whose successor is in the window and in the same episode."""
     errors = squared_error(predicted[:, :-1], obs[:, 1:])
     return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
 
 
-def action_loss(model: StepModel, options: ModelOptions, view: BatchView) -> Loss:
+def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
     """Returns AD's loss: cross-entropy of the actions taken, over valid positions (paper, App. E.2)."""
 
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
-        steps, mask = batch_steps(batch, view), jnp.asarray(batch.attention_mask)
+        steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
         actions = jnp.asarray(batch.target_actions)
-        output: StepOutput = run_model(model, options, params, key, steps, actions, mask.sum(axis=1))
+        output: StepOutput = run_model(model, options, params, key, steps, actions)
         total = mean_of_rows(cross_entropy(output.head, actions, options.label_smoothing), mask)
         log = {"action_loss": total, "accuracy": mean_of_rows(1.0 * (output.head.argmax(axis=-1) == actions), mask)}
         if output.next_obs is not None:
-            log["next_obs_loss"] = next_obs_loss(output.next_obs, steps.obs, batch)
+            log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
             total += log["next_obs_loss"]
-        return total, {"loss": total, **log}
+        return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
     return loss
 
@@ -177,7 +178,7 @@ def action_method(
             data="ad",
             model=model,
             example=(example, example.prev_action),
-            loss=action_loss(model, options, world.view),
+            loss=action_loss(model, options, world),
             logits=lambda head: head,
         )
 

@@ -22,6 +22,7 @@ from baselines.methods.ad import StepOutput, example_step, make_step_model, next
 from baselines.methods.method import Method, World, cross_entropy, make_transformer, mean_of_rows, run_model
 from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import batch_steps
+from generation.learners.encoder import encoding_log
 from icrl4aht_data.sampling.ad import ADBatch
 
 CRITICS = 2
@@ -71,10 +72,10 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
 
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
-        actions, lengths = jnp.asarray(batch.target_actions), mask.sum(axis=1)
-        output: StepOutput = run_model(model, options, params, key, steps, actions, lengths)
+        actions = jnp.asarray(batch.target_actions)
+        output: StepOutput = run_model(model, options, params, key, steps, actions)
         online: ActorCriticOutput = output.head
-        target: ActorCriticOutput = run_model(model, options, slow, None, steps, None, lengths).head
+        target: ActorCriticOutput = run_model(model, options, slow, None, steps).head
         policy_BxLxGxA = jax.nn.softmax(online.logits)
         taken_BxLx1xA = jax.nn.one_hot(actions, world.actions)[:, :, None]
 
@@ -101,9 +102,9 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
             "imitated": mean_of_rows(better.mean(axis=-1), mask),
         }
         if output.next_obs is not None:
-            log["next_obs_loss"] = next_obs_loss(output.next_obs, steps.obs, batch)
+            log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
             total += log["next_obs_loss"]
-        return total, {"loss": total, **log}
+        return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
     example = example_step(world)
     return Method(

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Int
 
 from baselines.methods.conditional import change_if
 from baselines.methods.method import (
@@ -35,6 +35,7 @@ from baselines.methods.tokens import (
     batch_transitions,
 )
 from baselines.methods.transformer import AttentionCache, Transformer
+from generation.learners.encoder import encoding_log
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.sampling.dpt import DPTBatch
 
@@ -85,9 +86,9 @@ class DPT(nn.Module):
     next_obs: nn.Module | None = None
     finished_episodes_only: bool = True
 
-    def __call__(self, context: Transition, query: Num[Array, "B ..."], deterministic: bool = True) -> DPTOutput:
+    def __call__(self, context: Transition, query: Any, deterministic: bool = True) -> DPTOutput:
         """Returns the answers to a query (B, ..) after every part of a context (B, K)."""
-        tokens_BxKxD = self.tokens.context(context, deterministic)
+        tokens_BxKxD, obs_features = self.tokens.context(context, deterministic)
         query_BxD = self.tokens.query(query, deterministic)
         batch, length, width = tokens_BxKxD.shape
         queries = jnp.broadcast_to(query_BxD[:, None], (batch, length + 1, width))
@@ -96,10 +97,9 @@ class DPT(nn.Module):
         features, answers = features[:, :length], features[:, length:]
         predicted = None
         if self.next_obs is not None:
-            # A transition's token holds its outcome, so the prediction reads the features before it and encodes its
-            # first observation again.
-            obs_features = self.tokens.encoder(context.obs[:, 1:])  # type: ignore[operator]
-            known = jnp.concatenate([features[:, :-1], obs_features], axis=-1)
+            # A transition's token holds its outcome, so the prediction reads the features before it, and its first
+            # observation by itself.
+            known = jnp.concatenate([features[:, :-1], obs_features[:, 1:]], axis=-1)
             predicted = self.next_obs(known, context.action[:, 1:])
         return DPTOutput(self.head(answers), predicted)
 
@@ -119,8 +119,9 @@ class DPT(nn.Module):
         observation of the next episode is not its successor.
         """
         obs = step.obs.astype(jnp.float32)
-        transition = Transition(memory.last_obs, step.prev_action, step.prev_reward, obs, step.prev_teammate_action)
-        token, query = self.tokens.context(transition), self.tokens.query(obs)
+        both = jnp.stack([memory.last_obs, obs])
+        transition = Transition(both, step.prev_action, step.prev_reward, step.prev_teammate_action)
+        token, query = self.tokens.context(transition)[0], self.tokens.query(obs)
         written = memory.buffer.written + (memory.started & ~done)
         # Without a new transition `written` stays, and the next step overwrites the token added here.
         buffer = RingBuffer(memory.buffer.add(token).tokens, written)
@@ -177,10 +178,11 @@ def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True
         hits = output.logits.argmax(axis=-1) == target
         log = {"action_loss": total, "accuracy": hits[:, -1].mean(), "prior_accuracy": hits[:, 0].mean()}
         if output.next_obs is not None:
-            log["next_obs_loss"] = squared_error(output.next_obs, context.next_obs[:, 1:]).mean()
+            after = world.observations(context.obs)[:, 1:, 1]
+            log["next_obs_loss"] = squared_error(output.next_obs, after).mean()
             total += log["next_obs_loss"]
-        return total, {"loss": total, **log}
+        return total, {"loss": total, **log, **encoding_log(context.obs)}
 
-    two, none = jnp.zeros((1, 2, *world.obs_shape)), jnp.zeros((1, 2), jnp.int32)
-    example = (Transition(two, none, jnp.zeros((1, 2)), two, none), two[:, 0])
+    both, none = jnp.zeros((1, 2, 2, *world.obs_shape)), jnp.zeros((1, 2), jnp.int32)
+    example = (Transition(both, none, jnp.zeros((1, 2)), none), both[:, 0, 0])
     return Method("dpt", "DPT", "dpt", model, example, loss, lambda logits: logits)

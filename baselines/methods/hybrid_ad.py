@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from baselines.methods.ad import action_method
 from baselines.methods.options import ModelOptions
@@ -28,13 +28,8 @@ class RecurrentTrunk(nn.Module):
         self.grus = [GRU(self.width) for _ in range(self.layers)]
         self.norm, self.drop = nn.LayerNorm(), nn.Dropout(self.dropout)
 
-    def __call__(
-        self, x: Float[Array, "B N D"], *, lengths: Int[Array, " B"] | None = None, deterministic: bool = True
-    ) -> Float[Array, "B N D"]:
-        """Returns features of complete sequences.
-
-        `lengths` change nothing: padding comes after the valid tokens, and a state depends on earlier tokens only.
-        """
+    def __call__(self, x: Float[Array, "B N D"], *, deterministic: bool = True) -> Float[Array, "B N D"]:
+        """Returns features of complete sequences."""
         zeros = tuple(jnp.zeros((x.shape[0], self.width), x.dtype) for _ in range(self.layers))
         return jnp.swapaxes(self._scan(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
 

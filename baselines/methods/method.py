@@ -32,16 +32,18 @@ class World(NamedTuple):
     """Description of the world that a model acts in.
 
     Attributes:
-        encoder: dtype -> module from observations to features.
+        encoder: dtype -> module from observations, or what `view` makes of a batch, to features.
         obs_shape: shape of one observation.
-        view: function that returns the observations of a batch.
+        view: function that returns the encoder's input for a batch.
         actions: number of actions.
+        observations: function from the encoder's input (*B, ..) back to observations.
     """
 
     encoder: Callable[[Any], nn.Module]
     obs_shape: tuple[int, ...]
     view: BatchView
     actions: int = len(ACTIONS)
+    observations: Callable[[Any], Num[Array, "*B ..."]] = lambda seen: seen
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from generation.learners.config import EncoderKind
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.option_fields import check_fields, option_field
 
@@ -28,6 +29,9 @@ class ModelOptions:
     heads: int = option_field(4, "Attention heads.", at_least=1)
     recurrent_layers: int = option_field(2, "GRU layers of Hybrid-AD, in place of the transformer.", at_least=1)
     dropout: float = option_field(0.1, "Dropout rate in training.", at_least=0, below=1)
+    encoder: EncoderKind = option_field(
+        "paper", "Encoder of observations: paper, words (the same, faster) or mlp (one dense layer)."
+    )
     positions: Positions = option_field("none", "Position embedding: none, as published, or rope.")
     teammate_actions: bool = option_field(False, "+TA: input the teammate's previous action, too.", flags=["--ta"])
     next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")

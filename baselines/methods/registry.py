@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from baselines.methods.ad import ad
 from baselines.methods.amago_offline import amago_offline
 from baselines.methods.dpt import dpt
-from baselines.methods.encoder import GridEncoder
+from baselines.methods.encoder import FEATURES
 from baselines.methods.hybrid_ad import hybrid_ad
 from baselines.methods.method import Method, World
 from baselines.methods.options import ModelOptions
-from baselines.methods.tokens import BatchView, state_view
+from baselines.methods.tokens import BatchView
+from generation.learners.config import EncoderKind
+from generation.learners.encoder import CompactView, WindowEncoder
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import Layout
 
@@ -35,11 +38,18 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     return METHODS[name]
 
 
-def overcooked_world(layouts: Sequence[Layout], view: BatchView | None = None) -> World:
+def overcooked_world(layouts: Sequence[Layout], encoder: EncoderKind = "paper", view: BatchView | None = None) -> World:
     """Returns the world of OvercookedV2 on layouts with observations of one shape.
 
     Args:
         layouts: the layouts in batches.
-        view: function that returns the observations of a batch; by default it renders state records.
+        encoder: kind of the encoder, see `EncoderKind`.
+        view: function that returns the observations of a batch; by default the batches hold state records, of which the
+            encoder's compact input is made.
     """
-    return World(lambda dtype: GridEncoder(dtype=dtype), layouts[0].obs_shape, view or state_view(layouts))
+    compact = CompactView(encoder, tuple(layouts))
+
+    def make_encoder(dtype: Any) -> WindowEncoder:
+        return WindowEncoder(FEATURES, encoder, view=compact, dtype=dtype)
+
+    return World(make_encoder, layouts[0].obs_shape, view or compact, observations=compact.observations)

@@ -6,37 +6,35 @@ training, none when acting), `D` width of a token, `K` length of a context, `S` 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Float, Int
 
 from baselines.methods.encoder import FEATURES
-from icrl4aht_data.overcooked.actions import ACTIONS, EGO
-from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import record_size
+from generation.learners.encoder import group_equal
+from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 
-BatchView = Callable[[Array, Array | None], Array]
-"""Function (stored observations or state records of a batch, `layouts` of the batch or None) -> observations."""
+BatchView = Callable[[Any, Any], Any]
+"""Function (observations or state records of a batch, `layouts` of the batch or None) -> input of the encoder."""
 
 
 class StepInput(NamedTuple):
     """Input of an ego before an action. Before a history's first step all `prev_*` fields are zero (paper, App. E.2).
 
     Attributes:
-        obs: (*B, ..), the ego's observation, uint8 or float.
+        obs: (*B, ..), the ego's observation, uint8 or float, or another input of the encoder made of it.
         prev_action: int32 (*B,), the ego's action in the previous step.
         prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
         prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.
     """
 
-    obs: Num[Array, "*B ..."]
+    obs: Any
     prev_action: Int[Array, "*B"]
     prev_reward: Float[Array, "*B"]
     prev_teammate_action: Int[Array, "*B"] | None
@@ -46,17 +44,15 @@ class Transition(NamedTuple):
     """An action and its outcome, within one episode.
 
     Attributes:
-        obs: (*B, ..), the ego's observation before the action.
+        obs: (*B, 2, ..), the ego's observations before and after the action, or another input of the encoder.
         action: int32 (*B,), the ego's action.
         reward: float32 (*B,), the team's reward, unscaled.
-        next_obs: (*B, ..), the ego's observation after the action.
         teammate_action: int32 (*B,), the teammate's action in the same step; None without +TA.
     """
 
-    obs: Num[Array, "*B ..."]
+    obs: Any
     action: Int[Array, "*B"]
     reward: Float[Array, "*B"]
-    next_obs: Num[Array, "*B ..."]
     teammate_action: Int[Array, "*B"] | None
 
 
@@ -65,30 +61,9 @@ def plain_view(obs: Array, layouts: Array | None) -> Array:
     return obs
 
 
-def state_view(layouts: Sequence[Layout]) -> BatchView:
-    """Returns the view of batches that hold state records: uint8 (B, .., S) -> the ego's observations (B, .., 5, 5, C).
-
-    Args:
-        layouts: the layouts that `layouts` (B,) of a batch refers to by index, with observations of one shape.
-    """
-
-    def view(records: Array, which: Array | None) -> Array:
-        # Every layout is rendered for all rows: under jit a row's layout is not known, and batches mostly have one.
-        seen = [observe(layout, records[..., : record_size(layout)], EGO) for layout in layouts]
-        if which is None:
-            return seen[0]
-        chosen = seen[0]
-        for number, other in enumerate(seen[1:], start=1):
-            rows = (which == number).reshape(-1, *[1] * (other.ndim - 1))
-            chosen = jnp.where(rows, other, chosen)
-        return chosen
-
-    return view
-
-
 def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
     """Returns the steps (B, L) of an AD batch."""
-    obs = view(batch.obs, batch.layouts)  # type: ignore[arg-type]
+    obs = group_equal(view(batch.obs, batch.layouts))
     return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
 
 
@@ -97,14 +72,12 @@ def percept_step(percept: Any) -> StepInput:
     return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
 
 
-def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Array]:
+def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:
     """Returns the context's transitions (B, K) and the query's observations (B, ..) of a DPT batch."""
-    obs, following, query = (
-        view(part, batch.layouts)  # type: ignore[arg-type]
-        for part in (batch.context_obs, batch.context_next_obs, batch.query_obs)
-    )
+    both = jnp.stack([jnp.asarray(batch.context_obs), jnp.asarray(batch.context_next_obs)], axis=2)
+    obs, query = group_equal(view(both, batch.layouts)), view(batch.query_obs, batch.layouts)
     mate: Any = batch.context_teammate_actions
-    return Transition(obs, batch.context_actions, batch.context_rewards, following, mate), query  # type: ignore[arg-type]
+    return Transition(obs, batch.context_actions, batch.context_rewards, mate), query  # type: ignore[arg-type]
 
 
 class Tokens(nn.Module):
@@ -150,15 +123,16 @@ class TransitionTokens(Tokens):
     def setup(self) -> None:
         self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)
 
-    def context(self, transition: Transition, deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Returns one token per transition."""
-        seen = self.encoder(jnp.stack([transition.obs, transition.next_obs]))
-        parts = [seen[0], jax.nn.one_hot(transition.action, self.actions)]
+    def context(self, transition: Transition, deterministic: bool = True) -> tuple[Array, Float[Array, "*B F"]]:
+        """Returns one token (*B, D) per transition, and the encoded observations before the actions."""
+        seen = self.encoder(transition.obs)
+        before, after = seen[..., 0, :], seen[..., 1, :]
+        parts = [before, jax.nn.one_hot(transition.action, self.actions)]
         if self.teammate_actions:
             parts.append(jax.nn.one_hot(transition.teammate_action, self.actions))
-        return self._token([*parts, seen[1], transition.reward[..., None]], deterministic)
+        return self._token([*parts, after, transition.reward[..., None]], deterministic), before
 
-    def query(self, obs: Num[Array, "*B ..."], deterministic: bool = True) -> Float[Array, "*B D"]:
+    def query(self, obs: Any, deterministic: bool = True) -> Float[Array, "*B D"]:
         """Returns one token per observation for which an action is predicted."""
         seen = self.encoder(obs)
         rest = self.actions * (1 + self.teammate_actions) + seen.shape[-1] + 1

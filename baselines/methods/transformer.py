@@ -69,12 +69,11 @@ class TransformerBlock(nn.Module):
         x_BxNxD: Float[Array, "B N D"],
         positions_N: Int[Array, " N"],
         context: int,
-        lengths_B: Int[Array, " B"] | None,
         deterministic: bool,
     ) -> Float[Array, "B N D"]:
         """Returns features of complete sequences; see `Transformer.__call__` for the arguments."""
         q, k, v = self._project(x_BxNxD, positions_N)  # each (B, N, H, Dh)
-        attended = causal_attention(q[:, :context], k[:, :context], v[:, :context], lengths_B)
+        attended = causal_attention(q[:, :context], k[:, :context], v[:, :context])
         if context < x_BxNxD.shape[1]:
             answers = query_attention(q[:, context:], k[:, context:], v[:, context:], k[:, :context], v[:, :context])
             attended = jnp.concatenate([attended, answers], axis=1)
@@ -154,7 +153,7 @@ class Transformer(nn.Module):
     def setup(self) -> None:
         block: Any = TransformerBlock
         if self.remat:
-            block = nn.remat(TransformerBlock, static_argnums=(3, 5), methods=["__call__"])
+            block = nn.remat(TransformerBlock, static_argnums=(3, 4), methods=["__call__"])
         rope = self.positions == "rope"
         self.blocks = [block(self.width, self.heads, self.dropout, rope) for _ in range(self.layers)]
         self.norm = nn.LayerNorm()
@@ -163,7 +162,6 @@ class Transformer(nn.Module):
         self,
         x: Float[Array, "B N D"],
         *,
-        lengths: Int[Array, " B"] | None = None,
         context: int | None = None,
         deterministic: bool = True,
     ) -> Float[Array, "B N D"]:
@@ -171,7 +169,6 @@ class Transformer(nn.Module):
 
         Args:
             x: tokens.
-            lengths: valid tokens of each sequence; the others are padding.
             context: if given, the first `context` tokens are a context and the `context + 1` tokens behind it are
                 queries: query j sees the first j tokens and itself, as if it followed them directly.
             deterministic: False for dropout, under the rng `dropout`.
@@ -180,7 +177,7 @@ class Transformer(nn.Module):
         context = length if context is None else context
         positions_N = jnp.concatenate([jnp.arange(context), jnp.arange(length - context)])
         for block in self.blocks:
-            x = block(x, positions_N, context, lengths, deterministic)
+            x = block(x, positions_N, context, deterministic)
         return self.norm(x)
 
     def step(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num, UInt8
@@ -48,8 +49,29 @@ class WindowEntries(NamedTuple):
     values: UInt8[Array, "*B E"]
 
 
-Seen = Num[Array, "*B 5 5 C"] | WindowWords | WindowEntries
+class GroupedWords(NamedTuple):
+    """Observations as words of cells, with equal ones in groups, so that one of each is encoded.
+
+    N denotes the number of observations, the product of B.
+
+    Attributes:
+        ids: int32 (*B, 25), see `CellWords.ids`.
+        first: int32 (N,), for each group the number of one of its observations, then zeros.
+        group: int32 (*B,), the group of each observation.
+        count: int32 (), number of groups.
+    """
+
+    ids: Int[Array, "*B 25"]
+    first: Int[Array, " N"]
+    group: Int[Array, "*B"]
+    count: Int[Array, ""]
+
+
+Seen = Num[Array, "*B 5 5 C"] | WindowWords | GroupedWords | WindowEntries
 """Input of an encoder: observations, uint8 or float, or one of their compact forms."""
+
+_BLOCKS = 4
+"""Grouped observations are encoded in so many blocks; those without a group are skipped."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +115,50 @@ class CompactView:
             obs = obs.reshape(*batch, WINDOW, WINDOW, self.channels)
         return obs if self.kind == "paper" else WindowEntries(obs.reshape(*batch, -1)[..., self.entries])
 
+    def observations(self, seen: Seen) -> Num[Array, "*B 5 5 C"]:
+        """Returns the observations that an encoder's input was made of."""
+        if isinstance(seen, (WindowWords, GroupedWords)):
+            flat = jnp.asarray(self.words.channels)[seen.ids]
+        elif isinstance(seen, WindowEntries):
+            zeros = jnp.zeros((*seen.values.shape[:-1], VISIBLE * self.channels), seen.values.dtype)
+            flat = zeros.at[..., self.entries].set(seen.values)
+        else:
+            return seen
+        return flat.reshape(*jax.tree.leaves(seen)[0].shape[:-1], WINDOW, WINDOW, self.channels)
+
+
+def group_equal(seen: Seen) -> Seen:
+    """Returns words of cells with equal observations in groups, and any other input unchanged.
+
+    Observations are sorted by a hash, and then compared exactly: if two that differ have one hash, every observation
+    becomes a group of its own. Sorting needs all observations on one device, so with several nothing is grouped.
+    """
+    if not isinstance(seen, WindowWords) or jax.device_count() > 1:
+        return seen
+    ids = seen.ids.reshape(-1, VISIBLE)
+    number = jnp.arange(len(ids), dtype=jnp.int32)
+    *hashes, order = jax.lax.sort((*_hash_words(ids), number), num_keys=2)
+    starts = jnp.append(True, (jnp.diff(hashes[0]) != 0) | (jnp.diff(hashes[1]) != 0))
+    group_of_sorted = jnp.cumsum(starts, dtype=jnp.int32) - 1
+    group = jnp.zeros_like(number).at[order].set(group_of_sorted, unique_indices=True)
+    first = jnp.zeros_like(number).at[jnp.where(starts, group_of_sorted, len(ids))].set(order, mode="drop")
+    exact = (ids[first[group]] == ids).all()
+    first, group = (jnp.where(exact, found, number) for found in (first, group))
+    count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
+    return GroupedWords(seen.ids, first, group.reshape(seen.ids.shape[:-1]), count)
+
+
+def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
+    """Returns two uint32 (N,) that equal rows have in common: sums of the words times random odd numbers."""
+    factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
+    one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
+    return one, two
+
+
+def encoding_log(seen: Seen) -> dict[str, Array]:
+    """Returns what a training log says of an encoder's input: the share of observations that differ, if known."""
+    return {"distinct_observations": seen.count / seen.group.size} if isinstance(seen, GroupedWords) else {}
+
 
 class WindowEncoder(nn.Module):
     """Maps observations, each by itself, to features (paper, App. B.1 and E.1).
@@ -117,6 +183,8 @@ class WindowEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Seen) -> Float[Array, "*B F"]:
+        if isinstance(seen, GroupedWords):
+            return self._encode_groups(seen)
         if self.kind == "mlp":
             x = nn.relu(FlatDense(MLP_WIDTH, self.view, self.dtype)(seen))
         else:
@@ -128,6 +196,27 @@ class WindowEncoder(nn.Module):
             x = x.reshape(*batch, x.shape[-1])
         x = orthogonal_dense(self.features)(x)
         return nn.LayerNorm()(nn.relu(x)) if self.normalize else x
+
+    def _encode_groups(self, seen: GroupedWords) -> Float[Array, "*B F"]:
+        """Encodes one observation of each group."""
+        encoder, variables = self.clone(parent=None), self.variables
+        size = -(-len(seen.first) // _BLOCKS)
+        rows = jnp.pad(seen.first, (0, _BLOCKS * size - len(seen.first))).reshape(_BLOCKS, size)
+        ids = seen.ids.reshape(-1, VISIBLE)[rows]
+
+        def encode(variables: Any, ids: Array) -> Array:
+            features: Any = encoder.apply(variables, WindowWords(ids))
+            return features
+
+        shape = jax.eval_shape(encode, variables, ids[0])
+
+        def encode_block(_: None, block: tuple[Array, Array]) -> tuple[None, Array]:
+            number, ids = block
+            nothing = jnp.zeros(shape.shape, shape.dtype)
+            return None, jax.lax.cond(number * size < seen.count, encode, lambda *_: nothing, variables, ids)
+
+        _, features = jax.lax.scan(encode_block, None, (jnp.arange(_BLOCKS), ids))
+        return features.reshape(-1, self.features)[seen.group]
 
     def _encode_cells(self, seen: Seen) -> Float[Array, "*B 25 F"]:
         """Applies the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""

@@ -25,12 +25,10 @@ from baselines.methods.tokens import (
     batch_transitions,
     percept_step,
     plain_view,
-    state_view,
 )
-from icrl4aht_data import get_layout, load_icrl4aht
+from icrl4aht_data import get_layout
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.sampling.ad import ADBatch
-from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, dpt_batch, random_parameters
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -179,19 +177,10 @@ def test_attention_is_that_of_the_mask(monkeypatch):
         return jax.jit(jax.value_and_grad(lambda *qkv: (attend(*qkv) * to).sum(), argnums=(0, 1, 2)))(q, k, v)
 
     expected = results(of_mask)
-    for rows in (attention.ROWS, 5):
-        monkeypatch.setattr(attention, "ROWS", rows)
+    for short, long in ((attention.SHORT_ROWS, attention.LONG_ROWS), (3, 15), (3, 5)):
+        monkeypatch.setattr(attention, "SHORT_ROWS", short)
+        monkeypatch.setattr(attention, "LONG_ROWS", long)
         jax.tree.map(partial(np.testing.assert_allclose, rtol=2e-5, atol=5e-6), results(ours), expected)
-
-
-def test_padding_is_not_seen(monkeypatch):
-    q, k, v = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2, 8, 2, 8)), jnp.float32)
-    lengths = jnp.array([3, 8])
-    expected = jax.nn.dot_product_attention(q, k, v, is_causal=True, key_value_seq_lengths=lengths)
-    for rows in (attention.ROWS, 5):
-        monkeypatch.setattr(attention, "ROWS", rows)
-        found = jax.jit(lambda q, k, v: attention.causal_attention(q, k, v, lengths))(q, k, v)
-        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-6)
 
 
 def arrays_in(jaxpr: Any) -> Iterator[Any]:
@@ -273,36 +262,6 @@ def test_next_observations_are_of_the_same_episode():
     assert loss(last) == loss(last._replace(obs=after_the_end)) != loss(last._replace(obs=within))
 
 
-class TestOvercooked:
-    """Models on batches of OvercookedV2."""
-
-    @pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
-    def test_states_rendered_in_the_step_give_the_loss_of_observations(self, lite, name):
-        world = overcooked_world([get_layout("demo_wide")])
-        options = dataclasses.replace(TINY, teammate_actions=False, next_obs=True, layers=1)
-        data = {obs: load_icrl4aht(lite[0], layout="demo_wide", obs=obs) for obs in ("state", "float32")}
-        shown = get_method(name)(options, world._replace(view=plain_view))
-        rendered = get_method(name)(options, world)
-        params = random_parameters(shown)
-        state, obs = (
-            d.ad(batch_size=2, length=6)[3] if name == "ad" else d.dpt(batch_size=2, context=5)[3]
-            for d in data.values()
-        )
-        one = jax.jit(rendered.loss)(params, None, state, None)[0]
-        np.testing.assert_allclose(one, jax.jit(shown.loss)(params, None, obs, None)[0], rtol=1e-6)
-
-    def test_a_batch_of_several_layouts(self, tmp_path):
-        random_release(tmp_path / "two", layouts=("asymm_both", "cramped_up"))
-        states, shown = (
-            load_icrl4aht(tmp_path / "two", obs=obs).ad(batch_size=8, length=5) for obs in ("state", "uint8")
-        )
-        batch = states[0]
-        assert len(set(batch.layouts.tolist())) == 2  # type: ignore[union-attr]
-        np.testing.assert_array_equal(
-            state_view(states.layouts)(*map(jnp.asarray, (batch.obs, batch.layouts))), shown[0].obs
-        )
-
-
 def percepts(steps: int, episode: int, seed=0) -> Percept:
     """Input of an ego over some steps."""
     rng = np.random.default_rng(seed)
@@ -361,9 +320,8 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
     seen = percepts(11, episode=4)  # two finished episodes, and three steps of the third
     known = np.array([0, 1, 2, 4, 5, 6])[first:]  # an episode's last step has no successor in it
     after = jax.tree.map(lambda x: x[known + 1][None], seen)
-    transitions = Transition(
-        seen.obs[known][None], after.prev_action, after.prev_reward, after.obs, after.prev_teammate_action
-    )
+    both = jnp.stack([seen.obs[known][None], after.obs], axis=2)
+    transitions = Transition(both, after.prev_action, after.prev_reward, after.prev_teammate_action)
     answer = jax.jit(lambda query: run(method, params, transitions, query).logits[0, -1])
     expected = [answer(seen.obs[t][None]) for t in (8, 9, 10)]
     np.testing.assert_allclose(player("dpt", context, False)(seen)[8:], np.stack(expected), rtol=1e-4, atol=1e-5)
