@@ -6,15 +6,16 @@
     train      training step of AD: B = 1024, L = 500 for the paper's small; seconds waited for the loader
     loader     batches/s alone, from the bundled release to the device
     act        the evaluator's steps/s with cached acting, on the tasks of one layout
-    attention  forward and backward pass of attention as in training, compared with cuDNN's
+    attention  forward and backward pass of attention as in training, compared with JAX's and cuDNN's
 
 One JSON line for each case. Cases run in child processes, in a new one after each failure; when the time is over, the
 running case is stopped and the others are skipped, both with a line. Learners run in a process of their own, with XLA's
 deterministic operations, as in `generate`. Models are untrained.
 
 `mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
-(`benchmarks.flops.product_flops`, backward pass included, all N x N scores of attention) by the time of a step, divided
-by what the large product reaches with the same dtype, or by `--peak-tflops`.
+(`benchmarks.flops.product_flops`, backward pass included) by the time of a step, divided by what the large product
+reaches with the same dtype, or by `--peak-tflops`. With `words` in training, the operations are those of a batch whose
+observations all differ; equal ones are computed once.
 """
 
 from __future__ import annotations
@@ -309,20 +310,20 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
 
 
 def measure_attention(bench: Bench) -> dict[str, Any]:
-    """Milliseconds of attention, forward and backward in bfloat16: as the models compute it, and by cuDNN."""
+    """Milliseconds of attention, forward and backward in bfloat16: as the models compute it, by JAX, and by cuDNN."""
     shape = (bench.sizes.batch, bench.sizes.length, *_HEADS_SHAPE)
     q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
-    lengths = jnp.full(shape[0], shape[1], jnp.int32)
-    fused = partial(jax.nn.dot_product_attention, is_causal=True, implementation="cudnn")
+    library = partial(jax.nn.dot_product_attention, is_causal=True)
     ways: dict[str, Callable[..., Any]] = {
         "models": causal_attention,
-        "cudnn": lambda q, k, v, lengths: fused(q, k, v, key_value_seq_lengths=lengths),
+        "jax": library,
+        "cudnn": partial(library, implementation="cudnn"),
     }
     facts: dict[str, Any] = {"shape": shape}
     for name, attend in ways.items():
         gradient = jax.jit(jax.grad(lambda *x, attend=attend: attend(*x).astype(jnp.float32).sum(), (0, 1, 2)))
         try:
-            seconds = seconds_of_calls(partial(gradient, q, k, v, lengths), bench.sizes.seconds / 4)
+            seconds = seconds_of_calls(partial(gradient, q, k, v), bench.sizes.seconds / 4)
             facts[f"{name}_milliseconds"] = round(1e3 * statistics.median(seconds), 4)
         except Exception as error:  # cuDNN is missing, too old or refuses the shape
             if name == "models":
@@ -348,12 +349,12 @@ def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> M
     """Returns the architecture of a size of AD."""
     layers, width = sizes.models[size]
     positions = "rope" if size == "tiny" else "none"
-    return ModelOptions(layers, width, positions=positions, bfloat16=dtype == "bfloat16")
+    return ModelOptions(layers, width, encoder=encoder, positions=positions, bfloat16=dtype == "bfloat16")
 
 
 def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
     """Returns AD for batches of state records of these layouts."""
-    return get_method("ad")(model, overcooked_world(layouts))
+    return get_method("ad")(model, overcooked_world(layouts, model.encoder))
 
 
 def context_length(sizes: Sizes, size: str) -> int:
