@@ -1,8 +1,9 @@
 """The paper's experiments: sweeps, ablations, held-out learned teammates (Sec. 5.3 and 5.4, App. F).
 
-An experiment is a list of entries; each entry is trained on each layout and evaluated on that layout's tasks:
+An experiment is a list of entries; each entry is trained on each layout, or once on all of them, and evaluated on its
+layouts' tasks:
 
-    OUT/<method>-<entry>/<layout>/run          run folder, as of `train`
+    OUT/<method>-<entry>/<layout>/run          run folder, as of `train`; <layout> is "all" for a model of all layouts
     OUT/<method>-<entry>/<layout>/results      results, as of `evaluate`
     OUT/report/                                report of all entries, with report.html and a card of each model
 
@@ -27,7 +28,7 @@ from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import REPORT_BEGINS, write_report
 from baselines.training.histories import TrainingTask, filter_histories, prepare
-from baselines.training.options import SAVE_MINUTES, HistoryOptions, TrainOptions
+from baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
@@ -35,6 +36,7 @@ from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
+from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_files
 
@@ -128,7 +130,9 @@ class ExperimentPlan:
 
     Attributes:
         methods: to train.
-        layouts: to train on; by default those of the experiment that the release has.
+        layouts: to train on, one model each; by default those of the experiment that the release has. `ALL_LAYOUTS`
+            alone for one model of all layouts that the release has, which is tested on the layouts of all of them.
+        channels: channels of the models' observations, see `HistoryOptions`.
         root: folder or address of a release; None for the bundled mini release.
         suite: folder of learned teammates; required for "heldout-rl".
         train: values of `TrainOptions` for all entries, such as steps.
@@ -148,6 +152,7 @@ class ExperimentPlan:
 
     methods: tuple[str, ...] = ("ad", "dpt")
     layouts: tuple[str, ...] = ()
+    channels: Channels | None = None
     root: str | None = None
     suite: Path | None = None
     train: dict[str, Any] = field(default_factory=dict)
@@ -208,8 +213,9 @@ def run_experiment(
     layouts, notes = _training_layouts(experiment, plan)
     tasks = {layout: _test_tasks(experiment, plan, layout) for layout in layouts}
     models = list(product(plan.methods, entries, layouts))
-    for model in models:
-        _prepare_entry(*model, plan)  # impossible trainings fail before any work
+    chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
+    if any(histories["channels"] == "canonical" for histories in chosen):
+        notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
     check_new_files(out / "report", overwrite=True, begins={**REPORT_BEGINS, "report.html": None})  # of a stopped run
     results = []
     for method, entry, layout in models:
@@ -243,7 +249,7 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
 
 
 def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
-    """Returns the layouts to train on, and a note on those that were left out."""
+    """Returns the layouts to train on, or `ALL_LAYOUTS` for one model of all, and a note on those left out."""
     dataset = load_icrl4aht(plan.root, split="train")
     filters = HistoryOptions((), **plan.filters).filters
     if filters:
@@ -252,6 +258,8 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
     available = {name for name, histories in by_layout.items() if _pass_all(histories, filters)}
     release = plan.root or "the bundled mini release"
     kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
+    if ALL_LAYOUTS in plan.layouts:
+        return list(HistoryOptions(plan.layouts).layouts), []
     if plan.layouts:
         names = [get_layout(name).name for name in plan.layouts]
         for name in names:
@@ -282,8 +290,20 @@ def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
         return False
 
 
+def _all_layouts(plan: ExperimentPlan) -> list[str]:
+    """Returns the layouts of a model of all layouts, in the order of `TESTED_ON`."""
+    filters = HistoryOptions((), **plan.filters).filters
+    dataset = filter_histories(load_icrl4aht(plan.root, split="train"), filters)
+    names = [name for name in TESTED_ON if name in {layout.name for layout in dataset.layouts}]
+    if not names:
+        raise EmptySelectionError(f"{dataset!r}: none of its layouts is a training layout of the benchmark")
+    return names
+
+
 def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
-    """Returns the tasks that a model trained on a layout is tested on."""
+    """Returns the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is tested on."""
+    if layout == ALL_LAYOUTS:
+        return [task for name in _all_layouts(plan) for task in _test_tasks(experiment, plan, name)]
     if experiment.held_out:
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
@@ -345,8 +365,9 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
 def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
     options = TrainOptions(**{**entry.train, **plan.train})
     model = ModelOptions(**{**entry.model, **plan.model})
+    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters)
     try:
-        return prepare(method, model, options, HistoryOptions((layout,), plan.root, **plan.filters))
+        return prepare(method, model, options, histories)
     except (EmptySelectionError, LabelsMissingError, OptionError) as error:
         hint = "or leave it out, by --method, --only and --layout"
         error.args = (f"{method} {entry.name} on {layout}: {error}; {hint}",)
@@ -388,7 +409,8 @@ def _evaluate_entry(
 ) -> None:
     agent = find_agent(str(folder / "run"), plan.acting or experiment.acting)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
-    what = f"{agent.name} {entry.name} on {tasks[0].layout.name}: episodes"
+    names = list(dict.fromkeys(task.layout.name for task in tasks))
+    what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"
     protocol = get_protocol(plan.protocol, plan.episodes)
     evaluate(
         agent.name,

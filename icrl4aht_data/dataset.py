@@ -13,6 +13,7 @@ from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import INFO, PROVENANCE, TASKS
+from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Obs
 from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
@@ -44,6 +45,7 @@ def load_icrl4aht(
     obs: Obs = "float32",
     cache: CacheMode = "auto",
     threads: int | None = None,
+    channels: Channels = "own",
 ) -> Dataset:
     """Open a release and return a selection of its histories.
 
@@ -68,6 +70,9 @@ def load_icrl4aht(
             the chunks that a batch needs, "auto" chooses by size and free memory. The batches are the same. See
             `sources.CACHE_MODES`.
         threads: number of threads that decode and render; by default one for each usable core.
+        channels: channels of observations: "own", which differ between layouts, or "canonical", the union of all
+            layouts' channels, so that a selection of any layouts can be sampled; see `overcooked.channels`. State
+            records (obs="state") are rendered so by `observe` with canonical=True.
 
     Raises:
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
@@ -76,7 +81,7 @@ def load_icrl4aht(
         NotStoredError: for `min_expert_return`, if the release does not have the returns, as in format version 2.
         ReleaseError: if the release cannot be read.
     """
-    options = ReadOptions(obs, cache, usable_cores() if threads is None else threads)
+    options = ReadOptions(obs, cache, usable_cores() if threads is None else threads, channels)
     dataset = open_dataset(open_root(MINI if root is None else root), options)
     return dataset.filter(
         split=split,

@@ -16,6 +16,7 @@ from baselines.training.histories import TrainedModel, read_trained
 from generation.policy import Policy
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
+from icrl4aht_data.overcooked.channels import Channels, to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 
 Acting = Literal["cached", "exact"]
@@ -80,6 +81,17 @@ def learned(method: Method, params: Any, context: int, acting: Acting = "cached"
     return Policy(params, lambda params, key: method.start(context, acting == "cached"), act, "percept")
 
 
+def with_channels(policy: Policy, channels: Channels, layout: Layout) -> Policy:
+    """Returns a policy for percepts of a layout, made of one that takes observations with these channels."""
+    if channels == "own":
+        return policy
+
+    def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
+        return policy.act(params, memory, percept._replace(obs=to_canonical(layout, percept.obs)), key)
+
+    return policy._replace(act=act)
+
+
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
 """Reference egos: name -> function from a layout to the policy."""
 
@@ -114,20 +126,21 @@ def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
 
     def make(layout: Layout) -> Policy:
         check_fits(run, layout, folder)
-        return policy
+        return with_channels(policy, run.channels, layout)
 
     details = {"run": run.hash, "step": run.step, "context": run.context, "acting": acting}
     return NamedEgo(run.label, make, {**details, "trained_on": run.trained_on})
 
 
 def check_fits(run: TrainedModel, layout: Layout, folder: Path) -> None:
-    """Check that a trained model can play on a layout.
+    """Check that a trained model can play on a layout: with canonical channels on every one.
 
     Raises:
         OptionError: if the layout's observations have another shape; names `folder`.
     """
-    if layout.obs_shape != run.obs_shape:
+    if run.channels == "own" and layout.obs_shape != run.obs_shape:
         raise OptionError(
             f"{folder}: trained on {', '.join(run.layouts)} with observations {run.obs_shape}; "
-            f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts"
+            f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts, or train with --channels "
+            f"canonical, which all layouts share"
         )

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import io_callback
 
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.overcooked.channels import CHANNELS, Channels, to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 
 
@@ -64,14 +65,23 @@ class HostAgent(Protocol):
         ...
 
 
-def from_host(agent: HostAgent) -> Callable[[Layout], HostPolicy]:
+def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout], HostPolicy]:
     """Returns the `make_ego` argument of `baselines.evaluate.evaluate` for a `HostAgent`.
 
     For each layout and teammate family `reset` is called once, then `act` once per step with all their tasks.
 
+    Args:
+        agent: the ego.
+        channels: channels of the observations that it takes: "own", those of each layout, or "canonical", which all
+            layouts share.
+
     Raises:
+        UnknownNameError: if there are no such channels.
         OptionError: during evaluation, if `act` does not return B integers.
     """
+
+    if channels not in CHANNELS:
+        raise unknown("channels", channels, CHANNELS)
 
     def make(layout: Layout) -> HostPolicy:
         def init(params, keys):
@@ -88,6 +98,8 @@ def from_host(agent: HostAgent) -> Callable[[Layout], HostPolicy]:
             return actions.astype(np.int32)
 
         def act(params, carry, percept: Percept, keys):
+            if channels == "canonical":
+                percept = percept._replace(obs=to_canonical(layout, percept.obs))
             shape = jax.ShapeDtypeStruct(keys.shape, jnp.int32)
             return io_callback(call, shape, *percept, ordered=True), carry
 

@@ -13,6 +13,7 @@ from baselines.commands.options import (
     EGO_NAME,
     METHOD_NAME,
     PROTOCOL_NAME,
+    TRAINING_LAYOUT,
     HostPort,
     acting_option,
     default_batch_size,
@@ -30,6 +31,7 @@ from baselines.commands.options import (
     tasks_option,
     tensorboard_option,
     training_options,
+    training_summary,
     variant_names,
 )
 from baselines.methods.options import SIZES, ModelOptions
@@ -285,7 +287,8 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
     with bars(edges=True, unit="episodes") as show:
         found = []
-        for episode in measure_drift(trained.method, trained.params, trained.context, tasks, played):
+        model = trained.method, trained.params, trained.context
+        for episode in measure_drift(*model, tasks, played, trained.channels):
             found.append(episode)
             show(f"{trained.label}, {family} on {name}", len(found), played.episodes)
     click.echo(f"{trained.label} on {name} with {len(tasks)} teammates of {family}, K = {trained.context}")
@@ -300,16 +303,17 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
         "python -m baselines train ad --layout demo_wide --out runs/ad",
         "python -m baselines train dpt --layout demo_wide --ta --out runs/dpt-ta",
         "python -m baselines train ad --layout demo_wide --steps 20 --context 50 --out runs/small",
+        "python -m baselines train ad --layout all --out runs/ad-all",
     ),
 )
 @click.argument("method", type=METHOD_NAME)
 @click.option(
     "--layout",
     "layouts",
-    type=LAYOUT,
+    type=TRAINING_LAYOUT,
     multiple=True,
     required=True,
-    help="Training layout; repeat for several, of one observation shape.",
+    help="Training layout, such as demo_wide; repeat for several, or all: those that the release has in the split.",
 )
 @root_option
 @click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
@@ -370,6 +374,7 @@ def train_command(
     sized: dict[str, Any] = {"layers": layers, "width": width}
     job = prepare(method, ModelOptions(**(sized | model)), options, choice)
     folder = out or Path("runs") / method
+    _console.print(training_summary(job.about["histories"]), highlight=False)
     with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
@@ -448,12 +453,18 @@ def heldout_rl_command(suite: Path, **options: Any) -> None:
 
 
 def _run_experiment(
-    name: str, out: Path | None, root: Any, train: dict[str, Any], suite: Path | None = None, **options: Any
+    name: str,
+    out: Path | None,
+    root: Any,
+    train: dict[str, Any],
+    histories: dict[str, Any],
+    suite: Path | None = None,
+    **options: Any,
 ) -> None:
     from baselines.experiments import ExperimentPlan, run_experiment
 
     training = {"batch_size": default_batch_size()} | train
-    plan = ExperimentPlan(root=root and str(root), suite=suite, train=training, **options)
+    plan = ExperimentPlan(root=root and str(root), suite=suite, train=training, **histories, **options)
     with bars(edges=True) as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:

@@ -11,11 +11,12 @@ from typing import Any
 import click
 
 from baselines.methods.options import ModelOptions
-from baselines.training.options import FILTERS, SAVE_MINUTES, TrainOptions
+from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked.layouts import LAYOUTS
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -60,6 +61,7 @@ class HostPort(click.ParamType):
 
 
 EGO_NAME = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
+TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
@@ -137,6 +139,12 @@ training_options = dataclass_options(
 model_options = dataclass_options(ModelOptions, "model", default_text={"layers": "the size's", "width": "the size's"})
 
 
+def training_summary(histories: dict[str, Any]) -> str:
+    """Returns the layouts and channels of a training run, one line, from the settings of its histories."""
+    shape = " x ".join(map(str, histories["obs_shape"]))
+    return f"training on {', '.join(histories['layouts'])}; {histories['channels']} channels, observations of {shape}"
+
+
 def default_batch_size() -> int:
     """Returns the paper's batch size, or on a CPU one that makes a step take seconds."""
     import jax
@@ -165,9 +173,9 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         click.option(
             "--layout",
             "layouts",
-            type=LAYOUT,
+            type=TRAINING_LAYOUT,
             multiple=True,
-            help="Training layout; repeat for several.",
+            help="Training layout, such as demo_wide; repeat for several models, or all: one model of all layouts.",
             show_default="the paper's that the release has",
         ),
         root_option,
@@ -186,6 +194,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             help="Evaluate only with teammates of this family, such as H4; repeat for several.",
         ),
         history_filters,
+        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs")),
         tasks_option,
         episodes_option,
         seeds_option,

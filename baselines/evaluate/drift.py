@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from baselines.agents.egos import with_channels
 from baselines.evaluate.evaluator import prepare_rollout
 from baselines.evaluate.protocols import Protocol
 from baselines.methods.method import Method
 from baselines.methods.tokens import percept_step
 from generation.policy import Policy
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.overcooked.channels import Channels
 
 
 class Drift(NamedTuple):
@@ -41,7 +43,12 @@ class _BothMemories(NamedTuple):
 
 
 def measure_drift(
-    method: Method, params: Any, context: int, tasks: Sequence[Task], protocol: Protocol
+    method: Method,
+    params: Any,
+    context: int,
+    tasks: Sequence[Task],
+    protocol: Protocol,
+    channels: Channels = "own",
 ) -> Iterator[Drift]:
     """Compare both ways of acting on tasks that share a layout and a teammate family.
 
@@ -49,6 +56,7 @@ def measure_drift(
         method, params, context: the model, see `agents.egos.learned`.
         tasks: B of them.
         protocol: also sets the number of episodes.
+        channels: channels of the observations that the model takes.
 
     Yields:
         One `Drift` per episode.
@@ -69,7 +77,7 @@ def measure_drift(
         return one.argmax().astype(jnp.int32), _BothMemories(cached, exact, both.steps + 1, *compared)
 
     ego = Policy(params, init, act, "percept")
-    rollout, state, episode = prepare_rollout(lambda layout: ego, tasks, protocol)
+    rollout, state, episode = prepare_rollout(lambda layout: with_channels(ego, channels, layout), tasks, protocol)
     for _ in range(protocol.episodes):
         state, _ = episode(params, rollout.teammate_params, state)
         yield Drift(np.asarray(state.ego.distance), np.asarray(state.ego.same))

@@ -16,6 +16,7 @@ from baselines.methods.tokens import BatchView
 from generation.learners.config import EncoderKind
 from generation.learners.encoder import CompactView, WindowEncoder
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 
 METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
@@ -38,7 +39,12 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     return METHODS[name]
 
 
-def overcooked_world(layouts: Sequence[Layout], encoder: EncoderKind = "paper", view: BatchView | None = None) -> World:
+def overcooked_world(
+    layouts: Sequence[Layout],
+    encoder: EncoderKind = "paper",
+    view: BatchView | None = None,
+    canonical: bool = False,
+) -> World:
     """Returns the world of OvercookedV2 on layouts with observations of one shape.
 
     Args:
@@ -46,10 +52,12 @@ def overcooked_world(layouts: Sequence[Layout], encoder: EncoderKind = "paper", 
         encoder: kind of the encoder, see `EncoderKind`.
         view: function that returns the observations of a batch; by default the batches hold state records, of which the
             encoder's compact input is made.
+        canonical: whether observations have the canonical channels, which all layouts share, or the layouts' own.
     """
-    compact = CompactView(encoder, tuple(layouts))
+    compact = CompactView(encoder, tuple(layouts), canonical=canonical)
 
     def make_encoder(dtype: Any) -> WindowEncoder:
         return WindowEncoder(FEATURES, encoder, view=compact, dtype=dtype)
 
-    return World(make_encoder, layouts[0].obs_shape, view or compact, observations=compact.observations)
+    obs_shape = observation_shape(layouts[0], canonical)
+    return World(make_encoder, obs_shape, view or compact, observations=compact.observations)

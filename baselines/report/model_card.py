@@ -104,7 +104,9 @@ def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
     tested_on: dict[str, list[ResultSource]] = {}
     for sources in models:
         config = _trained(sources)["config"]
-        tested_on.setdefault(_bullets({**config["model"], **config["train"]}), []).extend(sources)
+        channels = config["histories"].get("channels", "own")  # models of earlier versions have a layout's own
+        settings = {**config["model"], **config["train"], "channels": channels}
+        tested_on.setdefault(_bullets(settings), []).extend(sources)
     if len(tested_on) == 1:
         return next(iter(tested_on))
     return "\n\n".join(f"Tested on {_layouts(sources)}:\n\n{listed}" for listed, sources in tested_on.items())

@@ -365,6 +365,7 @@ def _settings_section(runs: Sequence[EvaluationRun]) -> str:
             protocol, model = settings["protocol"], config.get("model", {})
             training = {name: train[name] for name in _SHOWN_TRAINING if name in train}
             training |= {name: model[name] for name in _SHOWN_MODEL if name in model}
+            training |= {"channels": histories["channels"]} if "channels" in histories else {}
             values = [
                 run.label,
                 ", ".join(source.layouts),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import plain_view
-from baselines.training.options import FILTERS, HistoryOptions, TrainOptions
+from baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
 from baselines.training.seen import TRAINED_ON, teammate_ids
 from baselines.training.trainer import TrainingData
@@ -24,7 +24,8 @@ from generation.learners.resume import Checkpoints
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.channels import Channels, observation_shape
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
@@ -62,16 +63,20 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 
     Raises:
         EmptySelectionError: if no history has a value that the choice of histories filters by.
-        OptionError: if a window or a context is longer than a history, or the layouts' observations differ in shape.
+        OptionError: if a window or a context is longer than a history, or if the layouts' own channels are asked for
+            and differ in number.
         LabelsMissingError: for DPT on histories without expert actions.
     """
     dataset = _load(histories)
     split = hold_out(dataset, histories.held_out)
     view = None if dataset.obs == "state" else plain_view
-    method = get_method(name)(model, overcooked_world(dataset.layouts, view))
+    canonical = dataset.channels == "canonical"
+    method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
-        part: _sampler(method, selection, options, model.teammate_actions, histories.order)
+        part: _number_layouts(
+            _sampler(method, selection, options, model.teammate_actions, histories.order), dataset.layouts
+        )
         for part, selection in parts.items()
         if selection is not None
     }
@@ -83,7 +88,8 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "manifest_sha256": file_hash(dataset.root / MANIFEST),
             "layouts": [layout.name for layout in dataset.layouts],
             "obs": dataset.obs,
-            "obs_shape": list(dataset.layouts[0].obs_shape),
+            "channels": dataset.channels,
+            "obs_shape": list(dataset.obs_shape),
             "data_version": dataset.info.data_version,
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
@@ -94,11 +100,18 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 
 
 def _load(histories: HistoryOptions) -> Dataset:
-    """Opens the release, with state records if there are any and nothing else is required."""
-    names = [get_layout(name).name for name in histories.layouts]
+    """Opens the release, with state records if there are any and nothing else is required.
+
+    Channels are canonical if all layouts are chosen, or some whose own channels differ, and nothing else is required.
+    """
+    every = ALL_LAYOUTS in histories.layouts
+    names = None if every else [get_layout(name).name for name in histories.layouts]
     found = load_icrl4aht(histories.root, split=histories.split, layout=names, obs=histories.obs or "uint8")
     found = filter_histories(found, histories.filters)
-    return found if histories.obs or not found.has_states else found.with_options(obs="state")
+    differ = len({layout.obs_shape for layout in found.layouts}) > 1
+    channels = histories.channels or ("canonical" if every or differ else "own")
+    state = "state" if histories.obs is None and found.has_states else None
+    return found.with_options(obs=state, channels=channels)
 
 
 def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
@@ -172,6 +185,37 @@ def _sampler(
     return dataset.dpt(context=options.context, order=order, **shared)
 
 
+class LayoutNumbers:
+    """A sampler's batches of state records, with other numbers of the layouts.
+
+    Args:
+        sampler: of histories on some of the layouts.
+        numbers: int32, new number of each layout of `sampler.layouts`.
+    """
+
+    def __init__(self, sampler: Any, numbers: np.ndarray) -> None:
+        self._sampler, self._numbers = sampler, numbers
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sampler, name)
+
+    def __getitem__(self, i: int) -> Any:
+        return self.batch(i)
+
+    def batch(self, i: int, out: Any = None) -> Any:
+        """Returns batch i, written into `out` if it is given."""
+        batch = self._sampler.batch(i, out)
+        rows = np.zeros(len(batch.obs if hasattr(batch, "obs") else batch.query_obs), np.int32)
+        return batch._replace(layouts=self._numbers[rows if batch.layouts is None else batch.layouts])
+
+
+def _number_layouts(sampler: Any, layouts: Sequence[Layout]) -> Any:
+    """Returns the sampler with layouts numbered as in `layouts`, of which its histories may be on a part only."""
+    numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
+    agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
+    return sampler if agree else LayoutNumbers(sampler, numbers)
+
+
 class HistorySplit(NamedTuple):
     """Disjoint parts of a selection.
 
@@ -232,7 +276,8 @@ class TrainedModel(NamedTuple):
         step: training steps so far.
         context: K.
         layouts: names of the training layouts.
-        obs_shape: shape of the observations that it takes.
+        channels: channels of the observations that it takes: the layouts' own, or the canonical ones.
+        obs_shape: shape of these observations.
         label: as reports show it.
         hash: of the run's settings.
         trained_on: the histories that it was trained on, see `training_cells`.
@@ -243,6 +288,7 @@ class TrainedModel(NamedTuple):
     step: int
     context: int
     layouts: tuple[str, ...]
+    channels: Channels
     obs_shape: tuple[int, ...]
     label: str
     hash: str
@@ -262,16 +308,20 @@ def read_trained(folder: Path) -> TrainedModel:
         options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config["model"].items()}
         model = ModelOptions(**options)
         layouts = [get_layout(name) for name in histories["layouts"]]
-        method = get_method(config["method"])(model, overcooked_world(layouts))
-        context, obs_shape, cells = train["context"], histories["obs_shape"], config["trained_on"]
+        channels, obs_shape = histories["channels"], tuple(histories["obs_shape"])
+        expected = observation_shape(layouts[0], channels == "canonical")
+        world = overcooked_world(layouts, model.encoder, canonical=channels == "canonical")
+        method = get_method(config["method"])(model, world)
+        context, cells = train["context"], config["trained_on"]
     except (KeyError, TypeError) as error:
         raise OptionError(f"{folder}: its config.json is not of a run on learning histories: {error!r}") from error
-    if list(layouts[0].obs_shape) != obs_shape:
+    if expected != obs_shape:
         raise OptionError(
-            f"{folder}: trained on observations {obs_shape}, those of {layouts[0].name} are "
-            f"{layouts[0].obs_shape} in this version; train again"
+            f"{folder}: trained on observations {obs_shape}, those of {layouts[0].name} with {channels} channels are "
+            f"{expected} in this version; train again"
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     names = tuple(layout.name for layout in layouts)
-    return TrainedModel(method, params, step, context, names, layouts[0].obs_shape, label, json_hash(config), cells)
+    digest = json_hash(config)
+    return TrainedModel(method, params, step, context, names, channels, obs_shape, label, digest, cells)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.reading.history import Obs
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.option_fields import check_fields, option_field
@@ -42,12 +44,16 @@ FILTERS = {"teammate_family": "teammate_family", "algorithm": "teammate_kind", "
 """Field of `HistoryOptions` -> the field of a release's index that it filters by."""
 
 
+ALL_LAYOUTS = "all"
+"""In place of the names of layouts: all layouts that the release has in the split."""
+
+
 @dataclass(frozen=True)
 class HistoryOptions:
     """Choice of the histories that a run is trained on.
 
     Attributes:
-        layouts: names of training layouts, with observations of one shape.
+        layouts: names of training layouts, or `ALL_LAYOUTS` alone.
         root: folder or address of a release; None for the bundled mini release.
         split: split of the release.
         teammate_family: families of teammates, "rl" or "H1".."H4"; any by default.
@@ -70,9 +76,16 @@ class HistoryOptions:
         "Representation of observations in batches.",
         default_text="state, or uint8 if there are no state records",
     )
+    channels: Channels | None = option_field(
+        None,
+        "Channels of observations: a layout's own, or canonical, which all layouts share.",
+        default_text="canonical for --layout all and for layouts of unequal shape, or else own",
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if ALL_LAYOUTS in self.layouts and len(self.layouts) > 1:
+            raise OptionError(f"layouts = {', '.join(self.layouts)}: expected names of layouts, or {ALL_LAYOUTS} alone")
 
     @property
     def filters(self) -> dict[str, tuple[str, ...]]:

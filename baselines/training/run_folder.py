@@ -15,9 +15,9 @@ from generation.learners.resume import differing_settings
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 
-RUN_FORMAT = 3
+RUN_FORMAT = 4
 """Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
-`trained_on`."""
+`trained_on`, 4 since it has `channels`."""
 
 CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
 

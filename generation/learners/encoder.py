@@ -82,16 +82,18 @@ class CompactView:
         kind: kind of the encoder.
         layouts: layouts of the records.
         agents: the agents that observe, each as the first agent of its records; see `CellWords.entries`.
+        canonical: whether observations have the canonical channels, or the layouts' own.
     """
 
     kind: EncoderKind
     layouts: tuple[Layout, ...]
     agents: tuple[int, ...] = (EGO,)
+    canonical: bool = False
 
     @property
     def words(self) -> CellWords:
         """The words of the layouts."""
-        return cell_words(self.layouts)
+        return cell_words(self.layouts, self.canonical)
 
     @property
     def channels(self) -> int:
@@ -109,7 +111,7 @@ class CompactView:
         if self.kind == "words":
             return WindowWords(self.words.ids(record, layout_number))
         if layout_number is None:
-            obs: Any = observe(self.layouts[0], record, EGO)
+            obs: Any = observe(self.layouts[0], record, EGO, self.canonical)
         else:
             obs = jnp.asarray(self.words.channels)[self.words.ids(record, layout_number)]
             obs = obs.reshape(*batch, WINDOW, WINDOW, self.channels)
@@ -135,7 +137,7 @@ def group_equal(seen: Seen) -> Seen:
     """
     if not isinstance(seen, WindowWords) or jax.device_count() > 1:
         return seen
-    ids = seen.ids.reshape(-1, VISIBLE)
+    shape, ids = seen.ids.shape[:-1], jnp.asarray(seen.ids).reshape(-1, VISIBLE)
     number = jnp.arange(len(ids), dtype=jnp.int32)
     *hashes, order = jax.lax.sort((*_hash_words(ids), number), num_keys=2)
     starts = jnp.append(True, (jnp.diff(hashes[0]) != 0) | (jnp.diff(hashes[1]) != 0))
@@ -145,7 +147,7 @@ def group_equal(seen: Seen) -> Seen:
     exact = (ids[first[group]] == ids).all()
     first, group = (jnp.where(exact, found, number) for found in (first, group))
     count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
-    return GroupedWords(seen.ids, first, group.reshape(seen.ids.shape[:-1]), count)
+    return GroupedWords(ids.reshape(*shape, VISIBLE), first, group.reshape(shape), count)
 
 
 def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:

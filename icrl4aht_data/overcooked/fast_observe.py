@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import CENTRE, NOWHERE, VISIBLE, Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
@@ -25,7 +26,9 @@ _IMPOSSIBLE = -(2**40)  # makes every sum of lookups negative
 _TIMERS = 32  # values of a timer's five bits
 
 
-def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1) -> np.ndarray:
+def fast_observe(
+    layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1, canonical: bool = False
+) -> np.ndarray:
     """Render the ego's observations into `out`.
 
     Args:
@@ -33,9 +36,10 @@ def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: i
         record: uint8 (..., S), state records.
         out: uint8 or float32 (..., 5, 5, C), C-contiguous.
         threads: how many threads share the work.
+        canonical: whether to render the canonical channels, see `channels`, instead of the layout's own.
 
     Returns:
-        `out`, equal to `observe(layout, record, 0)`.
+        `out`, equal to `observe(layout, record, 0, canonical)`.
 
     Raises:
         ValueError: if `out` is not C-contiguous.
@@ -43,8 +47,8 @@ def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: i
     if not out.flags.c_contiguous:
         raise ValueError("expected out to be C-contiguous")
     records = record.reshape(-1, record.shape[-1])
-    flat = out.reshape(len(records), VISIBLE, layout.channels)
-    renderer = _renderer(layout, out.dtype.str)
+    flat = out.reshape(len(records), VISIBLE, observation_shape(layout, canonical)[-1])
+    renderer = _renderer(layout, out.dtype.str, canonical)
 
     def part(start: int, stop: int) -> None:
         for first in range(start, stop, _SLAB):
@@ -56,12 +60,13 @@ def fast_observe(layout: Layout, record: np.ndarray, out: np.ndarray, threads: i
 
 
 class _Renderer:
-    """Lookup tables of one layout and dtype, and the rendering with them."""
+    """Lookup tables of one layout, dtype and kind of channels, and the rendering with them."""
 
-    def __init__(self, layout: Layout, dtype: str) -> None:
-        self._layout, self._dtype = layout, np.dtype(dtype)
+    def __init__(self, layout: Layout, dtype: str, canonical: bool) -> None:
+        self._layout, self._dtype, self._canonical = layout, np.dtype(dtype), canonical
+        self._shape = observation_shape(layout, canonical)
         self._columns = columns(layout)
-        fixed = fixed_channels(layout)
+        fixed = fixed_channels(layout, canonical)
         self._agent: int = fixed.start // 2  # A: the channels of two agents precede the fixed ones
         self._first: int = fixed.stop  # first channel of what changes on a cell
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
@@ -81,12 +86,15 @@ class _Renderer:
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
             # The rules make no such record, so the lookup tables do not have it.
-            out.reshape(len(out), *self._layout.obs_shape)[...] = observe(self._layout, record, EGO)
+            out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
         np.take(self._background, background, axis=0, out=out.reshape(len(out), -1), mode="clip")
-        cells = out.reshape(-1, self._layout.channels)
+        cells = out.reshape(-1, self._shape[-1])
         self._render_agents(positions, facings, hands, cells)
         self._render_cells(record, positions, cells)
+
+    def _observe(self, record: np.ndarray) -> np.ndarray:
+        return observe(self._layout, record, EGO, self._canonical)
 
     def _render_agents(self, positions: np.ndarray, facings: np.ndarray, hands: np.ndarray, cells: np.ndarray) -> None:
         ego = _as_items(cells[:, : self._agent])
@@ -139,7 +147,7 @@ class _Renderer:
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]
         record[..., 1, self._columns.delivered] = 1
-        obs = observe(self._layout, record, EGO)
+        obs = self._observe(record)
         obs[..., : 2 * self._agent] = 0
         return obs.reshape(np.prod(shape), -1).astype(self._dtype)
 
@@ -149,7 +157,7 @@ class _Renderer:
         record[..., 0], record[..., 1] = self._floor[0], self._floor[-1]
         record[..., self._columns.facings] = np.arange(4)[:, None, None]
         record[..., self._columns.hands] = np.arange(256)[:, None]
-        obs = observe(self._layout, record, EGO).reshape(4 * 256, VISIBLE, -1)
+        obs = self._observe(record).reshape(4 * 256, VISIBLE, -1)
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
@@ -164,14 +172,14 @@ class _Renderer:
         record[1, :, where.buttons], record[1, :, where.recipe] = 1, every_byte
         record[2:, :, where.pot_items] = every_byte[:, None]
         record[2:, :, where.pot_timers] = np.arange(_TIMERS)[:, None, None]
-        patches = np.zeros((*record.shape[:2], layout.channels - self._first), self._dtype)
+        patches = np.zeros((*record.shape[:2], self._shape[-1] - self._first), self._dtype)
         kinds = (slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots)
         for rows, cells in kinds:
             # Any cell of the kind will do, seen from any cell of the floor.
             views = [(ego, cell) for cell in cells for ego in self._floor if self._in_window[ego, cell] != NOWHERE]
             if views:
                 record[rows, :, 0] = views[0][0]
-                obs = observe(layout, record[rows], EGO).reshape(-1, 256, VISIBLE, layout.channels)
+                obs = self._observe(record[rows]).reshape(-1, 256, VISIBLE, self._shape[-1])
                 patches[rows] = obs[:, :, self._in_window[views[0]], self._first :]
         return patches.reshape(-1, patches.shape[-1])
 
@@ -189,5 +197,5 @@ def _index_of(values: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _renderer(layout: Layout, dtype: str) -> _Renderer:
-    return _Renderer(layout, dtype)
+def _renderer(layout: Layout, dtype: str, canonical: bool) -> _Renderer:
+    return _Renderer(layout, dtype, canonical)

@@ -11,6 +11,7 @@ Channels, in order, for n ingredient types:
     pot timer   1       0..19
     delivery    1       on goal cells in the step after a correct delivery; only test_simple and test_wide
 
+`channels` names them, and the canonical channels, which all layouts share: these with n = 4 and delivery.
 Cells outside the map are all zero. Every value is an integer in 0..19: uint8 holds it without loss.
 """
 
@@ -21,6 +22,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrl4aht_data.overcooked.channels import (
+    CANONICAL_CHANNELS,
+    canonical_places,
+    channel_names,
+    observation_shape,
+)
 from icrl4aht_data.overcooked.layouts import (
     BUTTON,
     CENTRE,
@@ -47,13 +54,14 @@ _AGENT_BITS = 13
 
 
 class _Lookup(NamedTuple):
-    """Constants of one layout.
+    """Constants of one layout, with its own or the canonical channels.
 
     Args:
         view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word, then from
             bit 8 on the fixed bits of its word, shifted down by _FIXED.
         shift: uint32 (C,), lowest bit of each channel in its word.
-        mask: uint32 (C,), bits of each channel; 0 for an ingredient type without a pile.
+        mask: uint32 (C,), bits of each channel; 0 for what the layout does not have, such as an ingredient type
+            without a pile.
         agent_channels: the first channels, which come from the word of the agents.
     """
 
@@ -63,41 +71,43 @@ class _Lookup(NamedTuple):
     agent_channels: int
 
 
-def observe(layout: Layout, record: Array, agent: int) -> Array:
+def observe(layout: Layout, record: Array, agent: int, canonical: bool = False) -> Array:
     """Return the observations of one agent, its window of 5 x 5 cells.
 
     Args:
         layout: the layout.
         record: uint8 (B, S), state records.
         agent: 0 (ego) or 1 (teammate).
+        canonical: whether to return the canonical channels, see `channels`, instead of the layout's own.
 
     Returns:
         uint8 (B, 5, 5, C). Equal bytes from NumPy and JAX.
     """
-    return _expand(layout, *_words(layout, record, agent))
+    return _expand(layout, *_words(layout, record, agent), canonical)
 
 
-def observe_both(layout: Layout, record: Array) -> Array:
+def observe_both(layout: Layout, record: Array, canonical: bool = False) -> Array:
     """Return the observations of ego and teammate, uint8 (B, 2, 5, 5, C); see `observe`."""
     xp = record.__array_namespace__()
     ego, teammate = (_words(layout, record, agent) for agent in (0, 1))
-    return _expand(layout, *(xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True)))
+    agents, cells = (xp.stack(pair, axis=-2) for pair in zip(ego, teammate, strict=True))
+    return _expand(layout, agents, cells, canonical)
 
 
-def fixed_channels(layout: Layout) -> slice:
+def fixed_channels(layout: Layout, canonical: bool = False) -> slice:
     """The channels that are constant for a cell: its kind, and the ingredient piled on it."""
-    first = _lookup(layout).agent_channels
-    return slice(first, first + len(_STATIC) + layout.ingredient_types)
+    names = CANONICAL_CHANNELS if canonical else channel_names(layout)
+    return slice(names.index("wall"), names.index("item_plate"))
 
 
-def _expand(layout: Layout, agents: Array, cells: Array) -> Array:
+def _expand(layout: Layout, agents: Array, cells: Array, canonical: bool) -> Array:
     """Unpack words uint32 (B, 25) of agents and of cells to uint8 (B, 5, 5, C)."""
     xp = agents.__array_namespace__()
-    lookup = _lookup(layout)
-    of_agents = xp.asarray(np.arange(layout.channels) < lookup.agent_channels)
+    lookup = _lookup(layout, canonical)
+    of_agents = xp.asarray(np.arange(len(lookup.shift)) < lookup.agent_channels)
     word = xp.where(of_agents, agents[..., None], cells[..., None])
     values = xp.astype(word >> xp.asarray(lookup.shift) & xp.asarray(lookup.mask), xp.uint8)
-    return xp.reshape(values, (*agents.shape[:-1], *layout.obs_shape))
+    return xp.reshape(values, (*agents.shape[:-1], *observation_shape(layout, canonical)))
 
 
 def _words(layout: Layout, record: Array, agent: int) -> tuple[Array, Array]:
@@ -136,7 +146,12 @@ def _changing_words(xp, state) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _lookup(layout: Layout) -> _Lookup:
+def _lookup(layout: Layout, canonical: bool = False) -> _Lookup:
+    if canonical:
+        own, places = _lookup(layout), canonical_places(layout)
+        shift, mask = np.zeros((2, len(CANONICAL_CHANNELS)), np.uint32)  # mask 0: the layout does not have it
+        shift[places], mask[places] = own.shift, own.mask
+        return own._replace(shift=shift, mask=mask, agent_channels=CANONICAL_CHANNELS.index("wall"))
     column = np.zeros(layout.cells, np.int32)
     column[layout.kinds == INDICATOR] = 1
     column[layout.kinds == GOAL] = 2

@@ -56,14 +56,15 @@ class CellWords:
 
     Attributes:
         layouts: the layouts; their observations have the same channels.
+        canonical: whether these are the canonical channels, or the layouts' own.
         channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, stands for what the
             rules cannot produce.
     """
 
-    def __init__(self, layouts: Sequence[Layout]) -> None:
-        self.layouts = tuple(layouts)
-        fixed = [_fixed_cells(layout) for layout in layouts]
-        contents = [_contents(layout) for layout in layouts]
+    def __init__(self, layouts: Sequence[Layout], canonical: bool = False) -> None:
+        self.layouts, self.canonical = tuple(layouts), canonical
+        fixed = [_fixed_cells(layout, canonical) for layout in layouts]
+        contents = [_contents(layout, canonical) for layout in layouts]
         shown = fixed + [channels for kinds in contents for _, channels in kinds.values()]
         # Rows are sorted, so that word 0 shows nothing: empty floor, and what is outside the map.
         words, numbers = np.unique(np.concatenate(shown), axis=0, return_inverse=True)
@@ -173,14 +174,19 @@ class CellWords:
         return np.flatnonzero(shown)
 
 
-def cell_words(layouts: Sequence[Layout]) -> CellWords:
-    """Return the words of the cells that are visible on these layouts, whose observations have the same channels."""
-    return _cached(tuple(layouts))
+def cell_words(layouts: Sequence[Layout], canonical: bool = False) -> CellWords:
+    """Return the words of the cells that are visible on these layouts.
+
+    Args:
+        layouts: one or several, with as many own channels unless they are canonical.
+        canonical: whether words show the canonical channels, see `channels`, instead of the layouts' own.
+    """
+    return _cached(tuple(layouts), canonical)
 
 
 @lru_cache(maxsize=16)
-def _cached(layouts: tuple[Layout, ...]) -> CellWords:
-    return CellWords(layouts)
+def _cached(layouts: tuple[Layout, ...], canonical: bool) -> CellWords:
+    return CellWords(layouts, canonical)
 
 
 def _slots(layout: Layout) -> list[_Slot]:
@@ -195,16 +201,16 @@ def _slots(layout: Layout) -> list[_Slot]:
     ]
 
 
-def _fixed_cells(layout: Layout) -> np.ndarray:
+def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
     """uint8 (cells * 25, C): what the window of an observer on each cell shows of an empty map, without agents."""
     record = np.zeros((layout.cells, record_size(layout)), np.uint8)
     record[:, 0] = np.arange(layout.cells)
-    obs = observe(layout, record, 0)
-    obs[..., : fixed_channels(layout).start] = 0
+    obs = observe(layout, record, 0, canonical)
+    obs[..., : fixed_channels(layout, canonical).start] = 0
     return obs.reshape(-1, obs.shape[-1])
 
 
-def _contents(layout: Layout) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Kind -> pairs of numbers that the rules allow, int (n,), and what the cell shows then, uint8 (n, C)."""
     item = np.arange(256)
     possible, count = possible_items(layout), ingredient_count(item)
@@ -218,25 +224,27 @@ def _contents(layout: Layout) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     for slot in _slots(layout):
         if slot.kind not in found and (views := np.argwhere(layout.window_position[:, slot.cells] != NOWHERE)).size:
             observer, cell = views[0][0], slot.cells[views[0][1]]
-            found[slot.kind] = pairs[slot.kind], _shown(layout, slot, pairs[slot.kind], observer, cell)
+            shown = _shown(layout, slot, pairs[slot.kind], observer, cell, canonical)
+            found[slot.kind] = pairs[slot.kind], shown
     bodies = (carried + (np.arange(len(FACINGS))[:, None] << 8)).ravel()
     record = np.zeros((len(bodies), record_size(layout)), np.uint8)
     where = columns(layout)
     record[:, 0] = np.flatnonzero(layout.walkable)[0]
     record[:, where.facings.start], record[:, where.hands.start] = bodies >> 8, bodies & 255
-    own = observe(layout, record, 0).reshape(len(bodies), VISIBLE, -1)[:, CENTRE]
-    channels = fixed_channels(layout).start // 2  # of one agent; those of the other one follow
+    own = observe(layout, record, 0, canonical).reshape(len(bodies), VISIBLE, -1)[:, CENTRE]
+    channels = fixed_channels(layout, canonical).start // 2  # of one agent; those of the other one follow
     own[:, channels:] = 0
     return found | {_SELF: (bodies, own), _OTHER: (bodies, np.roll(own, channels, axis=-1))}
 
 
-def _shown(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int) -> np.ndarray:
+def _shown(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int, canonical: bool) -> np.ndarray:
     """uint8 (n, C): what a slot's cell shows to an observer on another cell."""
     record = np.zeros((len(pairs), record_size(layout)), np.uint8)
     record[:, slot.byte] = pairs & 255
     if slot.second is not None:
         record[:, slot.second] = pairs >> 8
     record[:, 0] = observer
-    obs = observe(layout, record, 0).reshape(len(pairs), VISIBLE, -1)[:, layout.window_position[observer, cell]]
-    obs[:, : fixed_channels(layout).start] = 0
+    obs = observe(layout, record, 0, canonical).reshape(len(pairs), VISIBLE, -1)
+    obs = obs[:, layout.window_position[observer, cell]]
+    obs[:, : fixed_channels(layout, canonical).start] = 0
     return obs

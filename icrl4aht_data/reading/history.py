@@ -10,6 +10,7 @@ from numpy.typing import DTypeLike
 
 from icrl4aht_data.errors import LabelsMissingError, NotStoredError, unknown
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
+from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.lazy_array import LazyArray
@@ -32,15 +33,17 @@ class History:
         entry: the history's entry of the index.
         shard: the shard that stores the history.
         obs: presentation of observations in `History.obs`; see `OBS`.
+        channels: channels of `History.obs`, the layout's own or the canonical ones; see `channels.CHANNELS`.
 
     Attributes:
         entry: the history's entry of the index: ids, layout, teammate, T, returns and others.
     """
 
-    def __init__(self, entry: Entry, shard: Shard, obs: Obs) -> None:
+    def __init__(self, entry: Entry, shard: Shard, obs: Obs, channels: Channels = "own") -> None:
         self.entry = entry
         self._shard = shard
         self._obs: Obs = obs
+        self._canonical = channels == "canonical"
 
     def __len__(self) -> int:
         return self.entry.T
@@ -60,7 +63,9 @@ class History:
         return self._shard.kind
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Return rows start..stop of a field; see `schema.FIELDS` for names, dtypes and shapes.
+        """Return rows start..stop of a field as stored; see `schema.FIELDS` for names, dtypes and shapes.
+
+        Observations that a lite release does not store are rendered, with the layout's own channels.
 
         Args:
             name: the field.
@@ -77,15 +82,16 @@ class History:
         start, stop, _ = slice(start, stop).indices(rows)
         stop = max(start, stop)
         if self.kind in field.absent:
-            return self._rendered(start, stop, np.uint8)
+            return self._rendered(start, stop, np.uint8, canonical=False)
         fetch_rows([RowRange(self._shard, self.entry.history_id, field, start, stop)])
         return self._shard.read(self.entry.history_id, field, start, stop)
 
-    def _rendered(self, start: int, stop: int, dtype: DTypeLike) -> np.ndarray:
+    def _rendered(self, start: int, stop: int, dtype: DTypeLike, canonical: bool) -> np.ndarray:
         """Observations (stop - start, 5, 5, C) of a release that stores states only."""
+        layout = self._shard.layout
         what = f"{self._shard.path}: history {self.entry.history_id}: obs"
-        out = new_array((stop - start, *self.entry.obs_shape), dtype, what)
-        return fast_observe(self._shard.layout, self.read("state", start, stop), out)
+        out = new_array((stop - start, *observation_shape(layout, canonical)), dtype, what)
+        return fast_observe(layout, self.read("state", start, stop), out, canonical=canonical)
 
     def _field(self, name: str) -> Field:
         if name not in FIELDS:
@@ -107,20 +113,26 @@ class History:
         """A field that is read when it is used, in the field's dtype or another one."""
         field = self._field(name)
         dtype = np.dtype(field.dtype if dtype is None else dtype)
-        row = {"scalar": (), "obs": self.entry.obs_shape}.get(field.row)
-        if row is None:
-            row = field.element(get_layout(self.entry.layout), "full").shape
+        layout, is_obs = get_layout(self.entry.layout), field.row == "obs"
+        row = observation_shape(layout, self._canonical) if is_obs else field.element(layout, "full").shape
         read = partial(self._rows, name, dtype)
         return LazyArray(f"{name} of history {self.entry.history_id}", (self.entry.rows(field), *row), dtype, read)
 
     def _rows(self, name: str, dtype: np.dtype, start: int, stop: int) -> np.ndarray:
-        if self.kind in FIELDS[name].absent:
-            return self._rendered(start, stop, dtype)
-        return self.read(name, start, stop).astype(dtype, copy=False)
+        field = FIELDS[name]
+        if self.kind in field.absent:
+            return self._rendered(start, stop, dtype, self._canonical)
+        rows = self.read(name, start, stop)
+        if field.row == "obs" and self._canonical:
+            rows = to_canonical(self._shard.layout, rows)
+        return rows.astype(dtype, copy=False)
 
     @property
     def obs(self) -> LazyArray:
-        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state"."""
+        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state".
+
+        With channels="canonical", C is 46 on every layout.
+        """
         if self._obs == "state":
             return self._lazy("state")
         return self._lazy("obs", self._obs)

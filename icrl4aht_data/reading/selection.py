@@ -13,6 +13,7 @@ from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionErro
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, Entry
+from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import OBS, History, Obs
 from icrl4aht_data.reading.shard import Shards
@@ -46,6 +47,7 @@ class ReadOptions:
         obs: presentation of observations; see `history.OBS`.
         cache: cache mode of samplers; see `sources.CACHE_MODES`.
         threads: number of threads that decode and render; by default one for each usable core.
+        channels: channels of observations; see `channels.CHANNELS`.
 
     Raises:
         UnknownNameError, OptionError: for values that do not exist.
@@ -54,12 +56,15 @@ class ReadOptions:
     obs: Obs = "float32"
     cache: CacheMode = "auto"
     threads: int = field(default_factory=usable_cores)
+    channels: Channels = "own"
 
     def __post_init__(self) -> None:
         if self.obs not in OBS:
             raise unknown("obs", self.obs, OBS)
         if self.cache not in CACHE_MODES:
             raise unknown("cache", self.cache, CACHE_MODES)
+        if self.channels not in CHANNELS:
+            raise unknown("channels", self.channels, CHANNELS)
         check_int("threads", self.threads, 1)
 
 
@@ -80,7 +85,7 @@ class Selection:
         ids: int (H,), ids of the histories in the release, in the order of the selection.
         index: the release's index.
         origin: the release: its folder on this machine, and its remote if it has one.
-        options: presentation of observations, cache and threads.
+        options: presentation and channels of observations, cache and threads.
 
     Raises:
         OptionError: for obs="state" of a release without state records.
@@ -113,6 +118,27 @@ class Selection:
     def obs(self) -> Obs:
         """The presentation of observations; see `history.OBS`."""
         return self.options.obs
+
+    @property
+    def channels(self) -> Channels:
+        """The channels of observations: each layout's own, or the canonical ones; see `channels.CHANNELS`."""
+        return self.options.channels
+
+    @property
+    def obs_shape(self) -> tuple[int, int, int]:
+        """(5, 5, C), the shape of one observation; with obs="state", of what `observe` renders of a state record.
+
+        Raises:
+            OptionError: if the selection's layouts have own channels of unequal number.
+        """
+        shapes = {observation_shape(layout, self.channels == "canonical"): layout for layout in self.layouts}
+        if len(shapes) > 1:
+            raise OptionError(
+                f"the selection spans layouts {', '.join(layout.name for layout in self.layouts)}, whose own "
+                f"observations are of unequal shape ({', '.join(map(str, shapes))}): take "
+                f'channels="canonical", which all layouts share, or add layout={self.layouts[0].name!r}'
+            )
+        return next(iter(shapes))
 
     @property
     def threads(self) -> int:
@@ -161,9 +187,10 @@ class Selection:
         layouts = [layout.name for layout in self.layouts]
         tasks = len(np.unique(self.column_codes("task_id")))
         weak = "" if self.info.has_chunk_hashes else f" of format {self.info.format_version}, without chunk hashes,"
+        canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
-            f"{int(self.column('T').sum()):,} transitions, obs {self.obs}; "
+            f"{int(self.column('T').sum()):,} transitions, obs {self.obs}{canonical}; "
             f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
         )
 
@@ -174,7 +201,7 @@ class Selection:
             UnknownNameError: if the release has no history with that id.
         """
         entry = self.index.entry(history_id)
-        return History(entry, self._shards.open(entry.shard), self.obs)
+        return History(entry, self._shards.open(entry.shard), self.obs, self.channels)
 
     def column(self, name: str) -> np.ndarray:
         """Return one index field of the selected histories: a field of `Entry`, such as "layout" or "return_end".
@@ -184,7 +211,7 @@ class Selection:
 
         Returns:
             (H,): names as NumPy strings, numbers as int64 or float64, where None is -1 or NaN, and bool; (H, 3) for
-            `obs_shape`.
+            `obs_shape`, the shape with the layout's own channels.
 
         Raises:
             UnknownNameError: if there is no such field; names the nearest one.
@@ -287,14 +314,19 @@ class Selection:
         self._shards.cache.clear()
 
     def with_options(
-        self, *, obs: Obs | None = None, cache: CacheMode | None = None, threads: int | None = None
+        self,
+        *,
+        obs: Obs | None = None,
+        cache: CacheMode | None = None,
+        threads: int | None = None,
+        channels: Channels | None = None,
     ) -> Self:
         """Return this selection with other reading options, without opening the release again; None keeps an option.
 
         Raises:
             UnknownNameError, OptionError: for impossible options, such as obs="state" for a release of observations.
         """
-        changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads}
+        changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads, "channels": channels}
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 

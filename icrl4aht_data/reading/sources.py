@@ -19,7 +19,6 @@ import numpy as np
 
 from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.cached_arrays import cache_room, cached_arrays, new_mapped_array
 from icrl4aht_data.utils.memory import free_memory, gigabytes
@@ -54,7 +53,8 @@ class ReadRequest(NamedTuple):
         histories: int (n,), positions in the selection.
         rows: int (n,), the first row of a window in each history, -1 or more; or int (n, K), any rows of each history.
         out: (n, K, ...), C-contiguous, of any dtype that represents the values. In windows, rows outside the history
-            are set to 0. State records may be wider than the history's layout needs; the rest is set to 0.
+            are set to 0. The last axis of state records and observations may be longer than the history's
+            layout needs; the rest is set to 0.
     """
 
     field: str
@@ -214,7 +214,7 @@ class FlatSource:
             self._copy(array, name, histories[chosen], rows[chosen], part)
             if part.shape == (len(chosen), *out.shape[1:]):
                 out[chosen] = part
-            else:  # a shorter state record
+            else:  # a shorter state record, or an observation of fewer channels
                 out[chosen, ..., : part.shape[-1]] = part
                 out[chosen, ..., part.shape[-1] :] = 0
 
@@ -275,8 +275,8 @@ class StreamedSource:
         field = FIELDS[request.field]
         for position, rows, out in zip(request.histories.tolist(), request.rows, request.out, strict=True):
             history_id, shard = self._entries[position].history_id, self._shards[position]
-            if field.row == "state":
-                size = record_size(shard.layout)
+            if field.row != "scalar":
+                size = field.held(shard.layout).shape[-1]
                 out[..., size:] = 0
                 out = out[..., :size]
             if rows.ndim:

@@ -61,7 +61,7 @@ class ADSampler(Sampler[ADBatch]):
     lite or full. To resume, continue with the next i.
 
     Args:
-        dataset: a selection whose layouts have observations of one shape.
+        dataset: a selection with observations of one shape: of layouts with as many channels, or channels="canonical".
         batch_size: B, over all processes.
         length: L, in steps.
         seed: any non-negative integer below 2**63.

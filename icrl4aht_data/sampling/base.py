@@ -135,6 +135,7 @@ class Sampler(Generic[B]):
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
             "data_version": self.dataset.info.data_version,
             "obs": self.dataset.obs,
+            "channels": self.dataset.channels,
             "batch_size": self.batch_size,
             "length": self.length,
             "seed": self.seed,

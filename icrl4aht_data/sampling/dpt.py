@@ -65,7 +65,8 @@ class DPTSampler(Sampler[DPTBatch]):
     stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
 
     Args:
-        dataset: a selection whose histories all have expert actions, of layouts with observations of one shape.
+        dataset: a selection whose histories all have expert actions, with observations of one shape: of layouts with as
+            many channels, or channels="canonical".
         batch_size: B, over all processes.
         context: K, in transitions.
         order: "contiguous" or "random".

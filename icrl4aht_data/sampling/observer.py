@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import record_field
+from icrl4aht_data.overcooked.channels import canonical_places
 from icrl4aht_data.overcooked.fast_observe import fast_observe
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.utils.threads import in_slices
@@ -32,11 +33,12 @@ class ArraySpec(NamedTuple):
 class Observer:
     """Renders records of a selection.
 
-    A record is a state record, or in a release without states the observation itself. `S` denotes the bytes of the
-    selection's longest state record.
+    A record is a state record, or in a release without states the stored observation. `R` denotes the shape of one
+    record: (S,) for the bytes of the selection's longest state record, or (5, 5, C) for the most own channels of a
+    layout.
 
     Args:
-        selection: histories whose layouts have observations of one shape (5, 5, C).
+        selection: histories whose observations have one shape (5, 5, C).
 
     Attributes:
         field: the field that stores records.
@@ -47,45 +49,44 @@ class Observer:
 
     def __init__(self, selection: Selection) -> None:
         self._selection, self._layouts = selection, selection.layouts
-        if len({layout.obs_shape for layout in self._layouts}) > 1:
-            raise OptionError(
-                f"the selection spans layouts {', '.join(layout.name for layout in self._layouts)} with observations "
-                f"of unequal shape, a sampler takes one shape: add layout={self._layouts[0].name!r}"
-            )
+        self._shape = selection.obs_shape
+        self._canonical = selection.channels == "canonical"
         self.field = record_field(selection.info.kind).name
-        self._renders = selection.has_states and selection.obs != "state"
-        self._size = max(record_size(layout) for layout in self._layouts)
+        self._record_shape: tuple[int, ...] = (max(record_size(layout) for layout in self._layouts),)
+        if not selection.has_states:
+            self._record_shape = (*self._shape[:-1], max(layout.channels for layout in self._layouts))
+        # Otherwise records are read into the batch directly.
+        self._renders = selection.obs != "state" and (selection.has_states or self._canonical)
 
     def spec(self, *shape: int) -> ArraySpec:
         """dtype and shape of observations (*shape, 5, 5, C), or of state records (*shape, S) with obs="state"."""
         if self._selection.obs == "state":
-            return ArraySpec("uint8", (*shape, self._size))
-        return ArraySpec(self._selection.obs, (*shape, *self._layouts[0].obs_shape))
+            return ArraySpec("uint8", (*shape, *self._record_shape))
+        return ArraySpec(self._selection.obs, (*shape, *self._shape))
 
     def record_bytes(self, shape: tuple[int, ...]) -> int:
         """Bytes of the array that `records` makes for observations of this shape (..., 5, 5, C)."""
-        return math.prod(shape[:-3]) * self._size if self._renders else 0
+        return math.prod((*shape[:-3], *self._record_shape)) if self._renders else 0
 
     def records(self, out: np.ndarray) -> np.ndarray:
-        """The array to read the records of observations `out` into: uint8 (..., S), or `out` if nothing is rendered."""
-        return np.empty((*out.shape[:-3], self._size), np.uint8) if self._renders else out
+        """Array to read the records of observations `out` into: uint8 (..., *R), or `out` if nothing is rendered."""
+        return np.empty((*out.shape[:-3], *self._record_shape), np.uint8) if self._renders else out
 
     def observe(self, histories: np.ndarray, records: np.ndarray, out: np.ndarray) -> None:
         """Render the observations of egos, unless the records were read into `out` directly.
 
         Args:
             histories: int (B,), positions in the selection.
-            records: the array from `records`, filled: uint8 (B, ..., S).
+            records: the array from `records`, filled: uint8 (B, ..., *R).
             out: (B, ..., 5, 5, C), float32 or uint8, C-contiguous.
         """
         threads = self._selection.threads
         if not self._renders:
             return
-        if len(self._layouts) == 1:
-            fast_observe(self._layouts[0], records, out, threads)
+        if len(self._layouts) == 1 and self._selection.has_states:
+            fast_observe(self._layouts[0], records, out, threads, self._canonical)
             return
-        steps_a_row = records[0].size // self._size
-        slab = max(1, _STEPS // steps_a_row)
+        slab = max(1, _STEPS // math.prod(out.shape[1:-3]))
         numbers = self._selection.layout_numbers[histories]
         for number in np.unique(numbers).tolist():
             layout, rows = self._layouts[number], np.flatnonzero(numbers == number)
@@ -93,7 +94,14 @@ class Observer:
             def render(start: int, stop: int, layout=layout, rows=rows) -> None:
                 for first in range(start, stop, slab):
                     part = rows[first : min(first + slab, stop)]
-                    shown = records[part, ..., : record_size(layout)]
-                    out[part] = fast_observe(layout, shown, np.empty((len(part), *out.shape[1:]), out.dtype))
+                    shown = np.zeros((len(part), *out.shape[1:]), out.dtype)
+                    out[part] = self._rendered(layout, records[part], shown)
 
             in_slices(render, len(rows), threads, least=slab)
+
+    def _rendered(self, layout: Layout, records: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Observations of records of one layout; `out` is zeros to write them into."""
+        if self._selection.has_states:
+            return fast_observe(layout, records[..., : record_size(layout)], out, canonical=self._canonical)
+        out[..., canonical_places(layout)] = records[..., : layout.channels]
+        return out

@@ -26,6 +26,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.schema import FIELDS, JSON_TYPES, Field, Kind
 from icrl4aht_data.overcooked import state
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_places
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
@@ -121,6 +122,12 @@ def reader(tmp_path_factory) -> dict[str, Any]:
     return run_snippets("format", tmp_path_factory.mktemp("format"))
 
 
+def _numbers(ranges: str) -> list[int]:
+    """Return the integers of a text such as "0 to 8, 44"."""
+    bounds = [list(map(int, part.split(" to "))) for part in ranges.split(", ")]
+    return [number for first, *last in bounds for number in range(first, (last or [first])[0] + 1)]
+
+
 class TestFormat:
     def assert_reads(self, reader, root: Path, histories=None) -> None:
         dataset = load_icrl4aht(root, obs="uint8")
@@ -178,6 +185,19 @@ class TestFormat:
                 np.testing.assert_array_equal(values, np.atleast_1d(ours[number]))
             for agent in (0, 1):
                 np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
+
+    def test_canonical_channels(self, reader):
+        listed = rows("format", "canonical places")
+        assert tuple(name for cells in listed for name in cells[2].split(", ")) == CANONICAL_CHANNELS
+        assert [place for cells in listed for place in _numbers(cells[0])] == list(range(len(CANONICAL_CHANNELS)))
+        by_layout = {name: cells[1:] for cells in rows("format", "layouts") for name in cells[0].split(", ")}
+        assert set(by_layout) == set(LAYOUTS)
+        for layout in LAYOUTS.values():
+            parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
+            places = canonical_places(layout).tolist()
+            assert reader["canonical_places"](parsed) == places
+            size, ranges = by_layout[layout.name]
+            assert (int(size), _numbers(ranges)) == (layout.channels, places)
 
     def test_field_lists_match_the_schema(self, lite):
         arrays = [cells[:5] for cells in rows("format", "array")]

@@ -72,8 +72,8 @@ def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
     two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
     params, found, protocol = random_parameters(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
 
-    def on_two_layers(method, params_of_run, context, tasks, planned):
-        assert (context, len(tasks), planned.episodes) == (30, 5, 3)
+    def on_two_layers(method, params_of_run, context, tasks, planned, channels):
+        assert (context, len(tasks), planned.episodes, channels) == (30, 5, 3, "own")
         found.extend(measure_drift(two_layer_ad, params, context, WIDE[:1], protocol))
         return found
 
@@ -90,8 +90,8 @@ def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
 def test_the_drift_command(runs, monkeypatch):
     """The command's plan and table, without playing."""
 
-    def play(method, params, context, tasks, planned):
-        assert (context, len(tasks), planned.episodes) == (30, 5, 2)
+    def play(method, params, context, tasks, planned, channels):
+        assert (context, len(tasks), planned.episodes, channels) == (30, 5, 2, "own")
         yield Drift(np.full((5, 100), 0.25), np.ones((5, 100), bool))
 
     monkeypatch.setattr("baselines.evaluate.drift.measure_drift", play)
@@ -122,7 +122,7 @@ class TestBadRuns:
             (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
             return str(tmp_path / name)
 
-        with pytest.raises(OptionError, match=r"run_format 99, expected 3: written by version .*; use that version"):
+        with pytest.raises(OptionError, match=r"run_format 99, expected 4: written by version .*; use that version"):
             find_agent(copy("newer", run_format=99))
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
         with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):

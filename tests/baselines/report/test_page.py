@@ -179,9 +179,10 @@ def test_models_of_different_layouts_are_one_agent():
 
 
 def test_trained_models_have_cards(tmp_path):
-    def trained(layout, tested_on, size, layers=4, **options):
+    def trained(layout, tested_on, size, layers=4, channels=None, **options):
         histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [layout], "data_version": "1.0.0"}
         histories["sizes"] = {"train": size}
+        histories |= {"channels": channels} if channels else {}
         config = {"model": {"layers": layers}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
         found = evaluated_run("AD", (tested_on,), **options)
         source = found.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12", "run_hash": layout})
@@ -197,7 +198,8 @@ def test_trained_models_have_cards(tmp_path):
         "| demo_wide | 14 of demo_wide; the release's manifest has SHA-256 `ab12` | demo_wide; with utility_greedy (1) "
         "| 3 | protocol seeded, 1 seed (0), 40 episodes of 100 steps, 5 instances in a cell |" in card
     )
-    assert "* layers: 4\n* seed: 3" in card
+    assert "* layers: 4\n* seed: 3\n* channels: own" in card, "as all models before channels could be chosen"
+    assert "* seed: 3\n* channels: canonical" in model_card(trained("all", "demo_wide", 1, channels="canonical"))
     assert "| H4 | 11.0 ± 0.0 †<br>" in card
     assert "| H3 | 11.0 ± 0.0<br>" in card
     assert "It is one run, of seed 3" in card

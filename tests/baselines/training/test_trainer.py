@@ -313,8 +313,9 @@ class TestHeldOut:
                 OptionError, match=r"context = 121: the shortest history of .* has 120 steps; take fewer"
             ):
                 prepare(name, MODEL, long, HistoryOptions(("demo_wide",), str(lite[0])))
-        with pytest.raises(OptionError, match="unequal shape"):
-            prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_wide", "coord_simple"), str(lite[0])))
+        two = HistoryOptions(("demo_wide", "coord_simple"), str(lite[0]), channels="own")
+        with pytest.raises(OptionError, match=r'unequal shape .*: take channels="canonical"'):
+            prepare("ad", MODEL, OPTIONS, two)
 
 
 DEVICES = """

@@ -8,7 +8,7 @@ import pytest
 
 from icrl4aht_data.overcooked.layouts import CENTRE, LAYOUTS, VISIBLE, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.overcooked.words import cell_words
 from tests.helpers.random_releases import random_history
 from tests.helpers.states import random_records
@@ -54,6 +54,22 @@ def test_records_of_several_layouts_in_one_batch(xp):
     size = max(np.flatnonzero(mixed.any(axis=(0, 1)))) + 1
     ids = words.ids(xp.asarray(mixed[..., :size]), xp.asarray(number))
     np.testing.assert_array_equal(words.channels[np.asarray(ids)].reshape(expected.shape), expected)
+
+
+@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+def test_records_of_all_layouts_in_one_batch_with_canonical_channels(xp):
+    layouts = list(LAYOUTS.values())
+    words, size = cell_words(layouts, canonical=True), max(map(record_size, layouts))
+    mixed = np.zeros((len(layouts), 40, size), np.uint8)
+    expected = np.zeros((len(layouts), 40, 5, 5, 46), np.uint8)
+    for row, layout in enumerate(layouts):
+        records = records_of(layout)[::20]
+        mixed[row, :, : records.shape[-1]], expected[row] = records, observe(layout, records, 0, canonical=True)
+    ids = words.ids(xp.asarray(mixed), xp.arange(len(layouts)))
+    np.testing.assert_array_equal(words.channels[np.asarray(ids)].reshape(expected.shape), expected)
+    seen = np.flatnonzero(expected.reshape(-1, VISIBLE * 46).any(axis=0))
+    assert np.isin(seen, words.entries()).all()
+    assert len(words.channels) < 700
 
 
 def test_words_are_few_and_the_first_shows_nothing():

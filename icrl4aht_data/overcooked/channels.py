@@ -1,0 +1,80 @@
+"""Names of observation channels, and the canonical channels, which observations of all layouts share.
+
+A layout's own channels depend on its number of ingredient types and on its delivery indicator, so observations of
+different layouts can differ in shape. The canonical channels are the union: each layout's own channels are put into
+their places among them, and channels that a layout does not have are 0.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, WINDOW, Layout
+from icrl4aht_data.overcooked.state import Array
+
+Channels = Literal["own", "canonical"]
+CHANNELS: tuple[Channels, ...] = ("own", "canonical")
+"""Channels of observations: each layout's own, or the canonical ones."""
+
+
+def _names(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
+    def item(owner: str) -> list[str]:
+        return [f"{owner}_{what}" for what in ("plate", "cooked", *ingredients)]
+
+    def agent(owner: str) -> list[str]:
+        return [f"{owner}_position", *(f"{owner}_facing_{facing}" for facing in FACINGS), *item(owner)]
+
+    ingredients = [f"ingredient_{number}" for number in range(ingredient_types)]
+    static = ["wall", "goal", "pot", "recipe_indicator", "button", "plate_pile"]
+    piles = [f"pile_{number}" for number in range(ingredient_types)]
+    last = ["pot_timer", "delivery"] if delivery else ["pot_timer"]
+    return (*agent("self"), *agent("other"), *static, *piles, *item("item"), *item("recipe"), *last)
+
+
+CANONICAL_CHANNELS: tuple[str, ...] = _names(max(layout.ingredient_types for layout in LAYOUTS.values()), True)
+"""Names of the 46 canonical channels, in order: four ingredient types and the delivery indicator."""
+
+
+def channel_names(layout: Layout) -> tuple[str, ...]:
+    """Return the names of a layout's own channels, in order, C of them; see `observe` for their meaning."""
+    return _names(layout.ingredient_types, layout.indicates_delivery)
+
+
+@lru_cache(maxsize=64)
+def canonical_places(layout: Layout) -> np.ndarray:
+    """Return the place of each own channel of a layout among the canonical channels, int64 (C,), ascending.
+
+    Raises:
+        OptionError: if the layout has a channel that is not canonical, of an ingredient that no registered layout has.
+    """
+    names = channel_names(layout)
+    missing = [name for name in names if name not in CANONICAL_CHANNELS]
+    if missing:
+        raise OptionError(
+            f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
+            f"take its own channels, or register the layout as docs/extending.md describes"
+        )
+    places = np.array([CANONICAL_CHANNELS.index(name) for name in names])
+    places.flags.writeable = False  # callers share it
+    return places
+
+
+def observation_shape(layout: Layout, canonical: bool = False) -> tuple[int, int, int]:
+    """Return the shape of an observation: (5, 5, C), or (5, 5, 46) with canonical channels."""
+    return (WINDOW, WINDOW, len(CANONICAL_CHANNELS)) if canonical else layout.obs_shape
+
+
+def to_canonical(layout: Layout, obs: Array) -> Array:
+    """Return observations (..., C) with a layout's own channels as (..., 46) with canonical channels, in NumPy or JAX.
+
+    Equal to what `observe` renders with canonical=True.
+    """
+    xp = obs.__array_namespace__()
+    # The channel after the last one is 0; every canonical channel that the layout does not have is taken from it.
+    source = np.full(len(CANONICAL_CHANNELS), layout.channels)
+    source[canonical_places(layout)] = np.arange(layout.channels)
+    return xp.take(xp.concat([obs, xp.zeros_like(obs[..., :1])], axis=-1), xp.asarray(source), axis=-1)

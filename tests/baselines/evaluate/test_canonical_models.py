@@ -1,0 +1,205 @@
+"""One model over several layouts: trained with canonical channels, and played on a layout of another shape."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines import experiments
+from baselines.agents.egos import find_agent, with_channels
+from baselines.agents.host import Percept, from_host
+from baselines.commands.cli import cli
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import PROTOCOLS
+from baselines.experiments import EXPERIMENTS, TESTED_ON, ExperimentPlan, run_experiment
+from baselines.methods.options import ModelOptions
+from baselines.report.model_card import model_card
+from baselines.report.results import note_results, read_run
+from baselines.training.histories import prepare, read_trained
+from baselines.training.options import HistoryOptions, TrainOptions
+from generation.learners.encoder import CompactView
+from generation.policy import Policy
+from generation.teammates.instances import published_task
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from tests.helpers.random_releases import random_release
+from tests.helpers.states import random_records
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=5)
+MODEL = ModelOptions(layers=1, width=8, heads=2)
+OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
+THIRD = get_layout("cramped_down")
+"""A layout of 35 channels; the training layouts have 40 and 45."""
+
+
+@pytest.fixture(scope="module")
+def trained(lite, tmp_path_factory) -> tuple[Path, str]:
+    """The run folder that the command makes for all layouts of a release, and what it prints."""
+    out = tmp_path_factory.mktemp("canonical") / "run"
+    sizes = ["--steps", "1", "--batch-size", "4", "--context", "6", "--layers", "1", "--width", "8", "--heads", "2"]
+    arguments = ["train", "ad", "--layout", "all", "--root", str(lite[0]), "--out", str(out)]
+    result = CliRunner().invoke(cli, [*arguments, *sizes, "--validation-batches", "0"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return out, result.output
+
+
+def test_the_run(trained):
+    folder, printed = trained
+    summary = "training on coord_simple, demo_wide; canonical channels, observations of 5 x 5 x 46"
+    assert summary in printed
+    histories = json.loads((folder / "config.json").read_text())["histories"]
+    expected = {"layouts": ["coord_simple", "demo_wide"], "channels": "canonical", "obs_shape": [5, 5, 46]}
+    assert histories.items() >= (expected | {"obs": "state"}).items()
+    run = read_trained(folder)
+    assert (run.channels, run.obs_shape, run.layouts) == ("canonical", (5, 5, 46), ("coord_simple", "demo_wide"))
+
+
+def test_it_plays_on_a_third_layout(trained, tmp_path):
+    folder, _ = trained
+    agent = find_agent(str(folder))
+    task = published_task(THIRD.name, "H4/t0")
+    results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
+    assert np.shape(results[0].returns) == (1, 1)
+    note_results(tmp_path, folder)
+    card = model_card(read_run(tmp_path))
+    assert "| cramped_down | 6 of coord_simple, demo_wide; the release's manifest" in card
+    assert "* channels: canonical\n" in card
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_an_ego_of_canonical_channels_sees_them_on_every_layout(layout):
+    """A policy that returns what it sees, in place of an action."""
+    shown = Policy((), lambda params, key: (), lambda params, memory, percept, key: (percept, memory), "percept")
+    (record,) = random_records(layout, 1, np.random.default_rng(4))
+    own = jnp.asarray(observe(layout, record, 0))
+    percept = Percept(own, 1, 2.0, 3, False)
+    seen, _ = jax.jit(with_channels(shown, "canonical", layout).act, static_argnums=(0, 1))((), (), percept, 0)
+    np.testing.assert_array_equal(seen.obs, observe(layout, record, 0, canonical=True))
+    assert seen._replace(obs=0) == percept._replace(obs=0)
+    assert with_channels(shown, "own", layout) is shown
+
+
+def test_an_ego_outside_jax_may_take_canonical_channels():
+    class Agent:
+        def reset(self, batch: int) -> None:
+            self.batch = batch
+
+        def act(self, percept: Percept) -> np.ndarray:
+            self.seen = percept.obs
+            return np.zeros(len(percept.obs), np.int32)
+
+    agent = Agent()
+    records = random_records(THIRD, 3, np.random.default_rng(5))
+    zero = jnp.zeros(3, jnp.int32)
+    percept = Percept(jnp.asarray(observe(THIRD, records, 0)), zero, zero, zero, zero)
+    for channels in ("own", "canonical"):
+        policy = from_host(agent, channels)(THIRD)
+        jax.block_until_ready(policy.act((), (), percept, jax.random.split(jax.random.key(0), 3))[0])
+        expected = observe(THIRD, records, 0, canonical=channels == "canonical")
+        np.testing.assert_array_equal(agent.seen, expected, strict=True)
+    with pytest.raises(UnknownNameError, match="unknown channels 'union'; valid: own, canonical"):
+        from_host(agent, "union")  # type: ignore[arg-type]
+
+
+def test_batches_of_states_show_what_batches_of_observations_hold(lite, reconverted_release):
+    """A release without state records trains on the same batches."""
+    options = dataclasses.replace(OPTIONS, batch_size=8)
+    jobs = [
+        prepare("ad", MODEL, options, HistoryOptions(("all",), str(root))) for root in (lite[0], reconverted_release)
+    ]
+    assert [job.about["histories"]["obs"] for job in jobs] == ["state", "uint8"]
+    assert jobs[0].about["histories"]["selections"] == jobs[1].about["histories"]["selections"]
+    states, stored = (job.data.train[0] for job in jobs)
+    layouts = [get_layout(name) for name in ("coord_simple", "demo_wide")]
+    assert set(states.layouts.tolist()) == {0, 1}
+    view = CompactView("paper", tuple(layouts), canonical=True)
+    rendered: Any = view(jnp.asarray(states.obs), jnp.asarray(states.layouts))
+    np.testing.assert_array_equal(np.asarray(rendered), stored.obs, strict=True)
+    shapes = [jax.eval_shape(job.method.init, jax.random.key(0)) for job in jobs]
+    assert jax.tree.map(jnp.shape, shapes[0]) == jax.tree.map(jnp.shape, shapes[1])
+
+
+@pytest.mark.parametrize(
+    ("layouts", "given", "channels", "size"),
+    [
+        (("demo_wide",), None, "own", 45),
+        (("demo_wide",), "canonical", "canonical", 46),
+        (("demo_wide", "coord_simple"), None, "canonical", 46),
+        (("all",), None, "canonical", 46),
+    ],
+)
+def test_default_channels(lite, layouts, given, channels, size):
+    about = prepare("ad", MODEL, OPTIONS, HistoryOptions(layouts, str(lite[0]), channels=given)).about["histories"]
+    assert (about["channels"], about["obs_shape"]) == (channels, [5, 5, size])
+
+
+def test_all_layouts_are_those_that_the_filters_leave(lite, tmp_path):
+    random_release(tmp_path, layouts=("asymm_both", "cramped_up"), teammates=1)
+    about = prepare("ad", MODEL, OPTIONS, HistoryOptions(("all",), str(tmp_path))).about["histories"]
+    assert (about["layouts"], about["channels"]) == (["asymm_both", "cramped_up"], "canonical"), "of one shape, 35"
+    own = HistoryOptions(("asymm_both", "cramped_up"), str(tmp_path))
+    assert prepare("ad", MODEL, OPTIONS, own).about["histories"]["channels"] == "own"
+    with pytest.raises(OptionError, match="layouts = all, demo_wide: expected names of layouts, or all alone"):
+        HistoryOptions(("all", "demo_wide"))
+    with pytest.raises(UnknownNameError, match="unknown channels 'mine'; valid: own, canonical"):
+        HistoryOptions(("all",), channels="mine")  # type: ignore[arg-type]
+
+
+def test_an_experiment_with_one_model_of_all_layouts(lite, tmp_path, monkeypatch):
+    """Trained once, and tested on the test layout of each; nothing is trained or played here."""
+    found: dict[str, Any] = {}
+    monkeypatch.setattr(
+        experiments, "train", lambda method, data, options, folder, about, **rest: found.update(about, folder=folder)
+    )
+
+    class PlayedError(Exception):
+        pass
+
+    def play(*arguments: Any) -> None:
+        found["tasks"] = arguments[2]
+        raise PlayedError
+
+    monkeypatch.setattr(experiments, "_evaluate_entry", play)
+    plan = ExperimentPlan(("ad",), ("all",), root=str(lite[0]), train={"context": 6}, model=dataclasses.asdict(MODEL))
+    with pytest.raises(PlayedError):
+        run_experiment("tracks", dataclasses.replace(plan, families=("H1",), tasks=2), tmp_path)
+    assert found["folder"] == tmp_path / "ad-plain" / "all" / "run"
+    assert (found["histories"]["layouts"], found["histories"]["channels"]) == (
+        ["coord_simple", "demo_wide"],
+        "canonical",
+    )
+    assert [(task.layout.name, task.teammate_family) for task in found["tasks"]] == [
+        (name, "H1") for name in ("coord_simple", "demo_wide") for _ in range(2)
+    ]
+    random_release(tmp_path / "two", layouts=("asymm_both", "cramped_up"), teammates=1)
+    plan = dataclasses.replace(plan, root=str(tmp_path / "two"))
+    tested = {task.layout.name for task in experiments._test_tasks(EXPERIMENTS["tracks"], plan, "all")}
+    assert tested == {TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]}
+
+
+def test_the_options_of_the_experiments(monkeypatch, tmp_path):
+    plans = []
+
+    def run_plan(name, plan, out, progress):
+        plans.append(plan)
+        return experiments.ExperimentOutcome([], [])
+
+    monkeypatch.setattr(experiments, "run_experiment", run_plan)
+    for given in (["--layout", "all"], ["--layout", "demo_wide", "--channels", "canonical"]):
+        result = CliRunner().invoke(cli, ["tracks", *given, "--out", str(tmp_path)], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    assert [(plan.layouts, plan.channels) for plan in plans] == [(("all",), None), (("demo_wide",), "canonical")]
+    wrong = CliRunner().invoke(cli, ["tracks", "--layout", "al"])
+    assert wrong.exit_code == 2
+    assert "unknown layout 'al'; valid: all, coord_simple" in wrong.output

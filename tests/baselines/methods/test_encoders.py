@@ -1,0 +1,149 @@
+"""Encoders of methods: `words` and `mlp` on batches of state records are what the plain observations give."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from baselines.methods.method import Method
+from baselines.methods.registry import get_method, overcooked_world
+from baselines.methods.tokens import batch_steps, plain_view
+from baselines.training.histories import prepare
+from baselines.training.options import HistoryOptions, TrainOptions
+from generation.learners import encoder
+from generation.learners.encoder import CompactView, GroupedWords
+from icrl4aht_data import get_layout, load_icrl4aht
+from tests.helpers.random_releases import random_release
+from tests.helpers.small_models import TINY, random_parameters
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+OPTIONS = dataclasses.replace(TINY, layers=1, dropout=0.0)
+
+
+@pytest.fixture(scope="module")
+def two_layouts(tmp_path_factory) -> Path:
+    """A release on two layouts with observations of one shape."""
+    root = tmp_path_factory.mktemp("releases") / "two"
+    random_release(root, layouts=("asymm_both", "cramped_up"))
+    return root
+
+
+def made(name: str, kind: Any, view: Any = None) -> Method:
+    return get_method(name)(
+        dataclasses.replace(OPTIONS, encoder=kind), overcooked_world([get_layout("demo_wide")], kind, view)
+    )
+
+
+@cache
+def batch_of(root: Path, name: str, obs: Any) -> Any:
+    dataset = load_icrl4aht(root, layout="demo_wide", obs=obs)
+    shared: Any = {"batch_size": 3, "teammate_actions": True}
+    return dataset.dpt(context=8, **shared)[2] if name == "dpt" else dataset.ad(length=9, **shared)[2]
+
+
+def loss_and_gradient(method: Method, params: Any, batch: Any) -> Any:
+    return jax.jit(jax.value_and_grad(lambda p: method.loss(p, params, batch, None), has_aux=True))(params)
+
+
+def assert_equal_results(one: Any, two: Any, params: Any) -> None:
+    """Compares losses, logged numbers and gradients, the latter to a share of the largest entry of a parameter."""
+    (loss, log), gradient = one
+    (other_loss, other_log), other_gradient = two
+    np.testing.assert_allclose(loss, other_loss, rtol=1e-5)
+    for number in log.keys() & other_log.keys():
+        np.testing.assert_allclose(log[number], other_log[number], rtol=1e-4, err_msg=number)
+
+    def compare(leaf: Any, other: Any) -> None:
+        np.testing.assert_allclose(leaf, other, rtol=1e-3, atol=2e-5 * np.abs(other).max())
+
+    jax.tree.map(compare, gradient, other_gradient)
+
+
+METHODS = ("ad", "dpt", *(pytest.param(name, marks=pytest.mark.slow) for name in ("hybrid_ad", "amago_offline")))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_words_give_the_loss_and_gradient_of_the_paper(lite, name):
+    """The batch of the paper's encoder holds observations, the other one state records."""
+    paper, words = made(name, "paper", plain_view), made(name, "words")
+    params = random_parameters(paper)
+    jax.tree.map(np.testing.assert_array_equal, params, random_parameters(words))
+    found = loss_and_gradient(words, params, batch_of(lite[0], name, "state"))
+    assert 0 < found[0][1]["distinct_observations"] < 1
+    assert_equal_results(found, loss_and_gradient(paper, params, batch_of(lite[0], name, "uint8")), params)
+
+
+def test_entries_give_the_loss_and_gradient_of_observations(lite):
+    plain, entries = made("ad", "mlp", plain_view), made("ad", "mlp")
+    params = random_parameters(plain)
+    found = loss_and_gradient(entries, params, batch_of(lite[0], "ad", "state"))
+    assert "distinct_observations" not in found[0][1]
+    assert_equal_results(found, loss_and_gradient(plain, params, batch_of(lite[0], "ad", "uint8")), params)
+
+
+def test_words_start_from_the_parameters_of_the_paper():
+    """One checkpoint serves both: names, shapes and initial values agree, and so acting, on plain observations."""
+    kinds: Any = ("paper", "words", "mlp")
+    paper, words, mlp = (encoder.WindowEncoder(8, kind, pointwise=(8,), spatial=(8,)) for kind in kinds)
+    obs = jnp.arange(25 * 45).reshape(5, 5, 45) % 3
+    params = paper.init(jax.random.key(3), obs)
+    jax.tree.map(np.testing.assert_array_equal, params, words.init(jax.random.key(3), obs))
+    np.testing.assert_array_equal(paper.apply(params, obs), words.apply(params, obs))
+    assert (25 * 45, 64) in [leaf.shape for leaf in jax.tree.leaves(jax.eval_shape(mlp.init, jax.random.key(0), obs))]
+
+
+@pytest.mark.parametrize("collide", [False, True])
+def test_equal_observations_are_in_one_group(monkeypatch, collide):
+    """If observations that differ have one hash, each observation is a group of its own."""
+    if collide:
+        monkeypatch.setattr(encoder, "_hash_words", lambda ids: (jnp.zeros(len(ids), jnp.uint32),) * 2)
+    ids = np.random.default_rng(0).integers(0, 300, (4, 25))[[[0, 1, 0, 2], [1, 1, 3, 0]]]
+    grouped: Any = encoder.group_equal(encoder.WindowWords(jnp.asarray(ids, jnp.int32)))
+    count = int(grouped.count)
+    assert count == (8 if collide else 4)
+    assert encoder.encoding_log(grouped)["distinct_observations"] == count / 8
+    assert sorted(set(grouped.group.ravel().tolist())) == list(range(count))
+    np.testing.assert_array_equal(ids.reshape(8, 25)[grouped.first[grouped.group]], ids)
+
+
+@pytest.mark.parametrize("canonical", [False, True])
+@pytest.mark.parametrize("kind", ["paper", "words", "mlp"])
+def test_inputs_of_several_layouts_are_their_observations(two_layouts, kind, canonical):
+    layouts = tuple(get_layout(name) for name in ("asymm_both", "cramped_up"))
+    view = CompactView(kind, layouts, canonical=canonical)
+    channels = "canonical" if canonical else "own"
+    shown, states = (
+        load_icrl4aht(two_layouts, layout=[layout.name for layout in layouts], obs=obs, channels=channels)
+        .ad(batch_size=8, length=5)[0]
+        for obs in ("uint8", "state")
+    )  # fmt: skip
+    assert set(states.layouts.tolist()) == {0, 1}
+    steps = batch_steps(jax.tree.map(jnp.asarray, states), view)
+    assert isinstance(steps.obs, GroupedWords) == (kind == "words")
+    np.testing.assert_array_equal(view.observations(steps.obs), shown.obs)
+
+
+def test_every_part_numbers_the_layouts_as_the_model_does(two_layouts):
+    """The held-out histories of a task, or all of a held-out one, may be on one of the layouts only."""
+    options = TrainOptions(steps=1, batch_size=6, context=5)
+    jobs = [
+        prepare("ad", OPTIONS, options, HistoryOptions(("asymm_both", "cramped_up"), str(two_layouts), obs=obs))
+        for obs in (None, "uint8")
+    ]
+    view = CompactView("paper", tuple(map(get_layout, jobs[0].about["histories"]["layouts"])))
+    parts = [{"train": job.data.train, **job.data.validation} for job in jobs]
+    numbered = set()
+    for part, sampler in parts[0].items():
+        batch = sampler.batch(0, sampler.empty())
+        numbered.add(tuple(sorted(set(batch.layouts.tolist()))))
+        found = view(jnp.asarray(batch.obs), jnp.asarray(batch.layouts))
+        np.testing.assert_array_equal(found, parts[1][part][0].obs)
+    assert len(numbered) > 1, "of parts with one layout and with both"

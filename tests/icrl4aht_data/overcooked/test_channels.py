@@ -1,0 +1,115 @@
+"""Canonical channels: each layout's own channels in their places, everything else 0."""
+
+from __future__ import annotations
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked import observe as observe_module
+from icrl4aht_data.overcooked.channels import (
+    CANONICAL_CHANNELS,
+    canonical_places,
+    channel_names,
+    observation_shape,
+    to_canonical,
+)
+from icrl4aht_data.overcooked.fast_observe import fast_observe
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_data.overcooked.observe import observe, observe_both
+from icrl4aht_data.overcooked.state import columns
+from tests.helpers.random_releases import random_history
+from tests.helpers.states import random_records
+
+each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+
+def placed(layout: Layout, own: np.ndarray) -> np.ndarray:
+    """Own observations put into the canonical places by name."""
+    out = np.zeros((*own.shape[:-1], 46), own.dtype)
+    for number, name in enumerate(channel_names(layout)):
+        out[..., CANONICAL_CHANNELS.index(name)] = own[..., number]
+    return out
+
+
+@each_layout
+def test_names_and_places(layout):
+    names, places = channel_names(layout), canonical_places(layout)
+    assert len(names) == layout.channels == len(set(names))
+    assert names == tuple(CANONICAL_CHANNELS[place] for place in places)
+    assert (np.diff(places) > 0).all(), "own channels keep their order"
+    assert observation_shape(layout) == layout.obs_shape
+    assert observation_shape(layout, canonical=True) == (5, 5, len(CANONICAL_CHANNELS)) == (5, 5, 46)
+
+
+def test_the_canonical_channels_are_the_union():
+    assert set(CANONICAL_CHANNELS) == {name for layout in LAYOUTS.values() for name in channel_names(layout)}
+    assert channel_names(get_layout("test_wide")) == CANONICAL_CHANNELS
+    assert CANONICAL_CHANNELS[:8] == (
+        "self_position", "self_facing_up", "self_facing_down", "self_facing_right", "self_facing_left",
+        "self_plate", "self_cooked", "self_ingredient_0",
+    )  # fmt: skip
+
+
+@each_layout
+def test_the_table_in_the_docstring_of_observe_lists_the_channels(layout):
+    table = re.findall(r"^    (\w+|pot timer) +([0-9n +]+?) {2,}\S", observe_module.__doc__ or "", re.MULTILINE)
+    starts = dict.fromkeys(["self", "other", "item", "recipe"]) | {
+        "static": ("wall", "goal", "pot", "recipe_indicator", "button", "plate_pile"),
+        "piles": "pile_",
+        "pot timer": "pot_timer",
+        "delivery": "delivery",
+    }
+    assert {group for group, _ in table} == set(starts)
+    names = list(channel_names(layout))
+    for group, size in table:
+        counts = [layout.ingredient_types if part == "n" else int(part) for part in size.split(" + ")]
+        count = sum(counts) if group != "delivery" else int(layout.indicates_delivery)
+        found, names = names[:count], names[count:]
+        assert all(name.startswith(starts[group] or f"{group}_") for name in found), (group, found)
+    assert names == []
+
+
+def test_a_channel_that_no_layout_has_is_refused():
+    layout = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
+    with pytest.raises(OptionError, match=r"layout mine: channels \['self_ingredient_4', .* are not among the 46"):
+        canonical_places(layout)
+
+
+@each_layout
+def test_own_channels_are_in_their_places_and_others_are_0(layout):
+    records = random_records(layout, 200, np.random.default_rng(5))
+    for agent in (0, 1):
+        expected = placed(layout, observe(layout, records, agent))
+        assert expected.any()
+        np.testing.assert_array_equal(to_canonical(layout, observe(layout, records, agent)), expected, strict=True)
+        np.testing.assert_array_equal(observe(layout, records, agent, canonical=True), expected, strict=True)
+        np.testing.assert_array_equal(observe_both(layout, records, canonical=True)[:, agent], expected, strict=True)
+        rendered = np.asarray(observe(layout, jnp.asarray(records[:20]), agent, canonical=True))
+        np.testing.assert_array_equal(rendered, expected[:20], strict=True)
+
+
+@each_layout
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_fast_rendering(layout, dtype):
+    played = random_history(layout, 10, 60, np.random.default_rng(6))["state"]
+    drawn = random_records(layout, 300, np.random.default_rng(7))
+    for states in (played, drawn):
+        out = np.full((len(states), 5, 5, 46), 9, dtype)
+        assert fast_observe(layout, states, out, threads=2, canonical=True) is out
+        np.testing.assert_array_equal(out, observe(layout, states, 0, canonical=True))
+        own = np.empty((len(states), *layout.obs_shape), dtype)  # both kinds of lookup tables are cached
+        np.testing.assert_array_equal(fast_observe(layout, states, own), observe(layout, states, 0))
+
+
+def test_records_that_the_rules_exclude():
+    layout = get_layout("cramped_up")
+    states = random_history(layout, 2, 20, np.random.default_rng(3))["state"]
+    states[3, columns(layout).pot_timers] = 99
+    out = np.empty((len(states), 5, 5, 46), np.uint8)
+    np.testing.assert_array_equal(
+        fast_observe(layout, states, out, canonical=True), placed(layout, observe(layout, states, 0))
+    )

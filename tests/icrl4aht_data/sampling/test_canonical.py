@@ -1,0 +1,200 @@
+"""Batches and histories of several layouts with canonical channels: of every kind of release, cache and loader."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.interop import hf_index, hf_windows, torch_loader
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, channel_names
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import record_size
+from tests.helpers.batches import CACHES, assert_equal
+
+LAYOUTS = ["coord_simple", "demo_wide"]
+"""The layouts of `lite`, `full` and `reconverted_release`: 40 and 45 channels."""
+RELEASES = ["lite", "full", "reconverted_release"]
+
+
+@pytest.fixture(params=RELEASES)
+def root(request):
+    """Releases of equal histories: with states, with states and observations, with observations only."""
+    made = request.getfixturevalue(request.param)
+    return made if request.param == "reconverted_release" else made[0]
+
+
+def canonical(root, **options) -> Any:
+    return load_icrl4aht(root, layout=LAYOUTS, channels="canonical", **{"obs": "uint8", "threads": 2} | options)
+
+
+def test_histories(root):
+    dataset = canonical(root)
+    own = dataset.with_options(channels="own")
+    for number in (0, len(dataset) - 1):
+        one, two = dataset[number], own[number]
+        names = channel_names(get_layout(two.entry.layout))
+        assert (one.obs.shape, one.obs.dtype) == ((120, 5, 5, 46), np.uint8)
+        assert one.obs[:].any()
+        for place, name in enumerate(CANONICAL_CHANNELS):
+            expected = two.obs[..., names.index(name)] if name in names else np.zeros((120, 5, 5))
+            np.testing.assert_array_equal(one.obs[..., place], expected, err_msg=name)
+        np.testing.assert_array_equal(one.obs[7:9], one.obs[:][7:9])
+        assert one.entry.obs_shape == two.obs.shape[1:], "the index has the shape of the own channels"
+        np.testing.assert_array_equal(one.read("obs", 3, 5), two.obs[3:5], err_msg="fields are read as stored")
+    shown = canonical(root, obs="float32")[0].obs
+    assert (shown.shape[1:], shown.dtype, shown[3:5].dtype) == ((5, 5, 46), np.float32, np.float32)
+
+
+def kinds(dataset):
+    return [
+        dataset.ad(batch_size=8, length=50, seed=3),
+        dataset.ad(batch_size=6, length=130, seed=3),  # longer than the histories
+        dataset.dpt(batch_size=8, context=17, seed=3),
+        dataset.dpt(batch_size=8, context=17, seed=3, order="random"),
+    ]
+
+
+def rendered(records, layouts):
+    """uint8 (B, ..., S) and layout numbers (B,) to canonical observations, row by row."""
+    views = []
+    for row, number in zip(records, layouts, strict=True):
+        layout = get_layout(LAYOUTS[number])
+        views.append(observe(layout, row[..., : record_size(layout)], 0, canonical=True))
+    return np.stack(views)
+
+
+@pytest.mark.parametrize("cache", CACHES)
+def test_batches_of_observations_are_those_of_state_records_rendered(lite, cache):
+    rows = set()
+    states = canonical(lite[0], obs="state", cache="ram")
+    assert [layout.name for layout in states.layouts] == LAYOUTS
+    for obs in ("uint8", "float32"):
+        dataset = canonical(lite[0], obs=obs, cache=cache)
+        for sampler, records in zip(kinds(dataset), kinds(states), strict=True):
+            batch, stored = sampler[2], records[2]
+            assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == (
+                sampler.specs
+            )
+            assert stored.layouts is not None
+            rows |= set(stored.layouts.tolist())
+            for name in (name for name in batch._fields if name.endswith("obs")):
+                shown = getattr(batch, name)
+                assert shown.dtype == obs
+                expected = rendered(getattr(stored, name), stored.layouts)
+                if name == "obs":
+                    expected[~stored.attention_mask] = 0
+                np.testing.assert_array_equal(shown, expected)
+            assert_equal(
+                batch._replace(layouts=stored.layouts, **{n: None for n in batch._fields if n.endswith("obs")}),
+                stored._replace(**{n: None for n in batch._fields if n.endswith("obs")}),
+            )
+    assert rows == {0, 1}, "both layouts in the batches"
+
+
+@pytest.mark.parametrize("cache", CACHES)
+@pytest.mark.parametrize("obs", ["uint8", "float32"])
+def test_stored_observations_are_put_into_their_places(lite, reconverted_release, cache, obs):
+    original, stored = canonical(lite[0], obs=obs), canonical(reconverted_release, obs=obs, cache=cache)
+    assert not stored.has_states
+    for length in (1, 40, 130):
+        options = {"batch_size": 8, "length": length, "seed": 5}
+        assert_equal(original.ad(**options)[3], stored.ad(**options)[3])
+    one = stored.filter(layout="demo_wide")
+    own = one.with_options(channels="own")
+    for order in ("contiguous", "random"):
+        batch, plain = (dataset.dpt(batch_size=5, context=9, order=order)[1] for dataset in (one, own))
+        places = [CANONICAL_CHANNELS.index(name) for name in channel_names(get_layout("demo_wide"))]
+        for name in ("query_obs", "context_obs", "context_next_obs"):
+            assert getattr(batch, name).sum() == getattr(plain, name).sum() > 0
+            np.testing.assert_array_equal(getattr(batch, name)[..., places], getattr(plain, name))
+    mixed = stored.dpt(batch_size=32, context=9)[0]
+    assert mixed.context_obs.shape == (32, 9, 5, 5, 46)
+    assert {"delivery"}.isdisjoint(np.array(CANONICAL_CHANNELS)[mixed.context_obs.any(axis=(0, 1, 2, 3))])
+
+
+def test_buffers_and_processes(lite):
+    sampler = canonical(lite[0]).ad(batch_size=8, length=30)
+    buffer = sampler.empty()
+    assert sampler.batch(4, buffer) is buffer
+    assert_equal(buffer, sampler[4])
+    parts = [canonical(lite[0]).ad(batch_size=8, length=30, process_index=k, process_count=2)[4].obs for k in range(2)]
+    np.testing.assert_array_equal(np.concatenate(parts), buffer.obs)
+
+
+def test_selections(root):
+    dataset = canonical(root)
+    assert (dataset.channels, dataset.obs_shape) == ("canonical", (5, 5, 46))
+    assert "obs uint8 with canonical channels;" in repr(dataset)
+    for part in (dataset.filter(layout="demo_wide"), dataset[:2], pickle.loads(pickle.dumps(dataset))):
+        assert (part.channels, part.obs_shape) == ("canonical", (5, 5, 46))
+    own = dataset.with_options(channels="own")
+    assert own.channels == load_icrl4aht(root).channels == "own"
+    assert "canonical" not in repr(own)
+    assert own.filter(layout="demo_wide").obs_shape == (5, 5, 45)
+    message = (
+        r"spans layouts coord_simple, demo_wide, whose own observations are of unequal shape \(\(5, 5, 40\), "
+        r'\(5, 5, 45\)\): take channels="canonical", .* or add layout=\'coord_simple\''
+    )
+    for make in (lambda: own.obs_shape, lambda: own.ad(batch_size=2, length=5), lambda: kinds(own)):
+        with pytest.raises(OptionError, match=message):
+            make()
+    with pytest.raises(UnknownNameError, match=r"unknown channels 'canonic'; valid: own, canonical\..*'canonical'"):
+        load_icrl4aht(root, channels="canonic")  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match="unknown channels 46"):
+        own.with_options(channels=46)  # type: ignore[arg-type]
+
+
+def test_state_records_with_own_channels_of_unequal_number(lite):
+    with pytest.raises(OptionError, match='take channels="canonical"'):
+        load_icrl4aht(lite[0], layout=LAYOUTS, obs="state").ad(batch_size=2, length=5)
+
+
+def test_positions_of_other_channels_are_not_resumed(lite):
+    one = canonical(lite[0]).filter(layout="demo_wide").ad(batch_size=2, length=5)
+    two = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=2, length=5)
+    with one.batches() as batches, two.batches() as other:
+        next(batches)
+        with pytest.raises(OptionError, match="channels = 'canonical', not 'own'"):
+            other.load_state_dict(batches.state_dict())
+        earlier = other.state_dict()
+        del earlier["channels"]  # as before there were canonical channels
+        other.load_state_dict(earlier)
+        with pytest.raises(OptionError, match="channels = 'own', not 'canonical'"):
+            batches.load_state_dict(earlier)
+
+
+def test_memory_that_a_batch_takes(lite, reconverted_release):
+    """Arrays, and what they are rendered from: state records, or observations with own channels."""
+    longest = max(record_size(get_layout(name)) for name in LAYOUTS)
+    for root, record in ((lite[0], longest), (reconverted_release, 25 * 45)):
+        dataset = canonical(root)
+        sampler = dataset.ad(batch_size=3, length=7)
+        scalars = 4 + 4 + 4 + 1 + 1 + 1
+        assert sampler._bytes == 21 * (25 * 46 + record + scalars)
+    with pytest.raises(OptionError, match=r"obs uint8 \(1000000000000, 7, 5, 5, 46\)"):
+        dataset.ad(batch_size=10**12, length=7)[0]
+
+
+def test_loaders_of_other_libraries(root):
+    import grain
+
+    dataset = canonical(root)
+    sampler = dataset.ad(batch_size=4, length=12)
+    expected = sampler[1]
+    assert expected.describe().splitlines()[0].split() == ["obs", "uint8", "(4,", "12,", "5,", "5,", "46)"]
+    tensors = next(iter(torch_loader(sampler, start=1, stop=2)))
+    np.testing.assert_array_equal(tensors.obs.numpy(), expected.obs)
+    (batch,) = grain.MapDataset.source(sampler)[1:2]
+    assert_equal(batch, expected)
+    rows = list(hf_windows(sampler, 1, 2))
+    np.testing.assert_array_equal(np.array([row["obs"] for row in rows]), expected.obs)
+    with sampler.batches(1, 2, device=jax.devices()[0]) as batches:
+        np.testing.assert_array_equal(np.asarray(next(batches).obs), expected.obs)
+    assert set(map(tuple, hf_index(dataset)["obs_shape"])) == {(5, 5, 40), (5, 5, 45)}
