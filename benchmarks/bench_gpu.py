@@ -449,7 +449,7 @@ def main(
 
 
 def child_environment() -> dict[str, str]:
-    """Returns the environment of child processes, in which JAX may use most of a GPU's memory; default: three quarters."""
+    """Returns the environment of child processes, in which JAX may use most of a GPU's memory, not three quarters."""
     names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX refuses both together
     return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
 
