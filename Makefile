@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test test-slow check format bench-env bench-eval bench-learner bench-curves bench-collect bench-loader bench-remote bench-faults bench-train clean
+.PHONY: help install demo generate teammates verify control test test-slow check format bench-env bench-eval bench-learner bench-curves bench-collect bench-gpu bench-loader bench-remote bench-faults bench-train clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -82,6 +82,9 @@ bench-faults: install ## faults of servers, disks, processes and files: tried, s
 
 bench-train: install ## training steps/s, compared with a reader of the published format; cached and exact acting, JSON lines
 	$(BIN)/python -m benchmarks.bench_train $(OPTIONS)
+
+bench-gpu: install ## learners, training, loader, acting on a GPU in at most 9 minutes; tiny sizes on a CPU, JSON lines
+	$(BIN)/python -m benchmarks.bench_gpu $(OPTIONS)
 
 bench-collect: install ## collection: speed, memory, bytes a transition, compared with the paper's format, JSON lines
 	$(BIN)/python -m benchmarks.bench_collect

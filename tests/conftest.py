@@ -37,6 +37,8 @@ COMPILATION_CACHE: dict[str, Any] = {
 
 def pytest_configure() -> None:
     """Keep compiled programs of this process and its subprocesses in a folder, for other workers and later runs."""
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")  # bits and tolerances are a CPU's, and workers share no GPU
+    jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
     os.environ.setdefault("PJRT_NPROC", "1")  # what the profiles of the tests choose, before JAX is first used
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)

@@ -1,0 +1,477 @@
+"""Speed of learning, training and evaluation on a GPU: `make bench-gpu`; in tiny sizes on a CPU, to try the command.
+
+    device     what the figures were made on
+    product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU, unless told otherwise
+    learner    steps/s of an ego's PPO beside teammate H4: 1,024 environments, the paper's network and minibatches
+    train      training step of AD: B = 1024, L = 500 for the paper's small; seconds waited for the loader
+    loader     batches/s alone, from the bundled release to the device
+    act        the evaluator's steps/s with cached acting, on the tasks of one layout
+    attention  forward and backward pass of attention as in training, compared with JAX's and cuDNN's
+
+One JSON line for each case. Cases run in child processes, in a new one after each failure; when the time is over, the
+running case is stopped and the others are skipped, both with a line. Learners run in a process of their own, with XLA's
+deterministic operations, as in `generate`. Models are untrained.
+
+`mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
+(`benchmarks.flops.product_flops`, backward pass included) by the time of a step, divided by what the large product
+reaches with the same dtype, or by `--peak-tflops`. With `words` in training, the operations are those of a batch whose
+observations all differ; equal ones are computed once.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cache, partial
+from itertools import groupby, islice
+from pathlib import Path
+from typing import Any
+
+import click
+import jax
+import jax.numpy as jnp
+from jax.extend.backend import get_backend
+from jaxlib import version as jaxlib_version
+
+from baselines.agents.egos import learned
+from baselines.evaluate.evaluator import play_episodes, prepare_rollout
+from baselines.evaluate.protocols import PROTOCOLS
+from baselines.methods.attention import causal_attention
+from baselines.methods.method import Method
+from baselines.methods.options import ModelOptions
+from baselines.methods.registry import get_method, overcooked_world
+from baselines.training.options import TrainOptions
+from baselines.training.trainer import Trainer
+from benchmarks.common import print_line
+from benchmarks.flops import compile_measured, device_memory, gib
+from benchmarks.isolated import run_isolated
+from generation.collection.options import request_determinism
+from generation.env import Environment
+from generation.learners.config import EncoderKind, PPOConfig, Widths
+from generation.learners.ego import Learner, compiled_update
+from generation.learners.resume import xla_threads
+from generation.teammates.instances import published_tasks
+from generation.teammates.registry import build_teammate
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.threads import usable_cores
+
+_LAYOUT = "demo_wide"
+_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
+_HEADS_SHAPE = (4, 64)  # of the paper's small
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of everything that is measured.
+
+    Attributes:
+        product: rows and columns of the matrices of the large product.
+        ppo: environments, roll-out and minibatches of the learner.
+        batch: B of training.
+        length: L in training and K in acting, at most; `tiny` has 200.
+        models: size name -> layers and width.
+        episode_steps: steps of an episode in acting.
+        tasks: most tasks in acting.
+        seconds: least time of a measurement, after compiling.
+    """
+
+    product: int
+    ppo: dict[str, int]
+    batch: int
+    length: int
+    models: dict[str, tuple[int, int]]
+    episode_steps: int
+    tasks: int
+    seconds: float
+
+
+FULL_SIZES = Sizes(
+    product=8192,
+    ppo={"environments": 1024, "rollout": 256, "minibatches": 64},
+    batch=1024,
+    length=500,
+    models={"small": (4, 256), "tiny": (2, 64)},
+    episode_steps=100,
+    tasks=20,
+    seconds=4.0,
+)
+SMALL_SIZES = Sizes(
+    product=256,
+    ppo={"environments": 4, "rollout": 8, "minibatches": 2},
+    batch=2,
+    length=16,
+    models={"small": (1, 32), "tiny": (1, 16)},
+    episode_steps=10,
+    tasks=2,
+    seconds=0.05,
+)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Settings of a child process.
+
+    Attributes:
+        sizes: see `Sizes`.
+        peaks: name of a dtype -> TFLOP/s to divide by; measured where it is missing.
+    """
+
+    sizes: Sizes
+    peaks: dict[str, float]
+
+    def mfu(self, flops: float, seconds: float, dtype: str) -> float:
+        """Returns the share of the peak that `flops` in `seconds` are."""
+        peak = self.peaks.get(dtype) or product_tflops(self.sizes.product, dtype, None, self.sizes.seconds / 4)
+        return round(flops / seconds / peak / 1e12, 4)
+
+
+def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) -> list[float]:
+    """Returns the seconds of each of some calls, which together take `seconds` or more; the first one is left out."""
+    jax.block_until_ready(call())
+    found: list[float] = []
+    while len(found) < least or sum(found) < seconds:
+        started = time.perf_counter()
+        jax.block_until_ready(call())
+        found.append(time.perf_counter() - started)
+    return found
+
+
+@cache
+def product_tflops(size: int, dtype: str, precision: str | None, seconds: float) -> float:
+    """Returns the TFLOP/s of the product of two normally distributed square matrices."""
+    one, two = jax.random.normal(jax.random.key(0), (2, size, size), dtype)
+    multiply = jax.jit(partial(jnp.matmul, precision=precision))
+
+    def several() -> Any:
+        return [multiply(one, two) for _ in range(5)]  # so that starting a product does not count
+
+    return 5 * 2 * size**3 / min(seconds_of_calls(several, seconds)) / 1e12
+
+
+def describe_device(bench: Bench) -> dict[str, Any]:
+    """Facts on machine, software and settings."""
+    devices = jax.devices()
+    root = Path(__file__).resolve().parent
+    commit = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return {
+        "device": devices[0].device_kind,
+        "devices": len(devices),
+        "platform": " ".join(get_backend().platform_version.split()),
+        "jax": jax.__version__,
+        "jaxlib": jaxlib_version.__version__,
+        "commit": commit.stdout.strip() or None,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "cores": usable_cores(),
+        "xla_threads": xla_threads(),
+        "sizes": "full" if bench.sizes.product == FULL_SIZES.product else "small",
+        **device_memory(),
+    }
+
+
+def measure_product(bench: Bench) -> dict[str, Any]:
+    """TFLOP/s of the large product: as float32 products are computed by default, exactly, and in bfloat16."""
+    size, seconds = bench.sizes.product, bench.sizes.seconds / 4
+    kinds = {"float32": ("float32", None), "float32_highest": ("float32", "highest"), "bfloat16": ("bfloat16", None)}
+    found = {f"tflops_{name}": product_tflops(size, *kind, seconds) for name, kind in kinds.items()}
+    return {"size": size, **{name: round(value, 3) for name, value in found.items()}}
+
+
+def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
+    """Environment steps/s of complete updates of an ego beside teammate H4."""
+    learner = ego_learner(bench.sizes, encoder)
+    config = learner.config
+    state = jax.jit(learner.init)(jax.random.key(0))
+    program = compile_measured(compiled_update(learner), state)
+
+    def update() -> Any:
+        nonlocal state
+        state, _, metrics = program.call(state)
+        return metrics
+
+    seconds = statistics.median(seconds_of_calls(update, bench.sizes.seconds))
+    return {
+        **bench.sizes.ppo,
+        "epochs": config.epochs,
+        "steps_per_second": round(config.steps_per_update / seconds, 1),
+        "update_seconds": round(seconds, 4),
+        "compile_seconds": round(program.compile_seconds, 1),
+        "mflop_per_step": round(program.flops / config.steps_per_update / 1e6, 2),
+        "mfu": bench.mfu(program.flops, seconds, "float32"),
+        "program_gib": gib(program.bytes),
+        **device_memory(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    }
+
+
+def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) -> dict[str, Any]:
+    """Training steps of AD, in as many parts (`accumulate`) as the memory asks for."""
+    parts, reason = 1, ""
+    while bench.sizes.batch % parts == 0:
+        try:
+            return _training_steps(bench, size, encoder, dtype, parts)
+        except (jax.errors.JaxRuntimeError, MemoryError) as error:
+            if not isinstance(error, MemoryError) and _OUT_OF_MEMORY not in str(error):
+                raise
+            reason = str(error)
+        parts *= 2  # after the block above, which keeps the arrays of the failed attempt alive
+    raise MemoryError(f"no number of parts fits: {reason}")
+
+
+def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
+    sizes, model = bench.sizes, architecture(bench.sizes, size, encoder, dtype)
+    length = context_length(sizes, size)
+    dataset = load_icrl4aht(layout=_LAYOUT, obs="state")
+    options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
+    trainer = Trainer(ad_method(model, dataset.layouts), options)
+    state = trainer.init()
+    with trainer.batches(dataset.ad(batch_size=sizes.batch, length=length, seed=0), 0, sys.maxsize) as batches:
+        batch = next(batches)
+        program = compile_measured(trainer.step, state, batch)
+        limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", program.bytes)
+        if program.bytes > limit:
+            raise MemoryError(f"{gib(program.bytes)} GiB in {parts} parts, of {gib(limit)}")
+
+        def step(take: Callable[[], Any]) -> Any:
+            nonlocal state
+            state, log = program.call(state, take())
+            return log
+
+        seconds = statistics.median(seconds_of_calls(partial(step, lambda: batch), sizes.seconds))
+        before = batches.waited
+        loaded = seconds_of_calls(partial(step, partial(next, batches)), sizes.seconds)
+        waited = (batches.waited - before) / (len(loaded) + 1)
+    transitions = sizes.batch * length
+    return {
+        "batch": sizes.batch,
+        "length": length,
+        "accumulate": parts,
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(state.params)),
+        "step_seconds": round(seconds, 4),
+        "transitions_per_second": round(transitions / seconds),
+        "step_seconds_with_loader": round(statistics.median(loaded), 4),
+        "loader_wait_seconds_per_step": round(waited, 4),
+        "compile_seconds": round(program.compile_seconds, 1),
+        "mflop_per_transition": round(program.flops / transitions / 1e6, 2),
+        "mfu": bench.mfu(program.flops, seconds, dtype),
+        "program_gib": gib(program.bytes),
+        **device_memory(),
+    }
+
+
+def measure_loader(bench: Bench, size: str) -> dict[str, Any]:
+    """Seconds for a batch of state records, from the bundled release to the device, with no work between."""
+    sizes, device = bench.sizes, jax.devices()[0]
+    sampler = load_icrl4aht(layout=_LAYOUT, obs="state").ad(
+        batch_size=sizes.batch, length=context_length(sizes, size), seed=0
+    )
+    with sampler.batches(device=device) as batches:
+        seconds = statistics.median(seconds_of_calls(partial(next, batches), sizes.seconds))
+    return {
+        "batch": sizes.batch,
+        "length": sampler.length,
+        "batch_seconds": round(seconds, 5),
+        "transitions_per_second": round(sizes.batch * sampler.length / seconds),
+    }
+
+
+def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) -> dict[str, Any]:
+    """The evaluator's steps/s with full windows, over all streams (tasks times seeds), and per stream."""
+    sizes, context = bench.sizes, context_length(bench.sizes, size)
+    layout = get_layout(_LAYOUT)
+    tasks = tasks_beside_h4()[: sizes.tasks]
+    method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
+    policy = learned(method, method.init(jax.random.key(0)), context, "cached")
+    protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps)
+    started = time.perf_counter()
+    prepared = prepare_rollout(lambda layout: policy, tasks, protocol, range(seeds))
+    compile_seconds = time.perf_counter() - started
+    episodes = play_episodes(prepared, sys.maxsize)
+    filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
+    for _ in islice(episodes, filling):  # from here on the oldest fifth is dropped again and again
+        pass
+    seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
+    streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)
+    return {
+        "context": context,
+        "streams": streams,
+        "steps_per_second": round(streams * sizes.episode_steps / episode_seconds, 1),
+        "milliseconds_per_step": round(1e3 * episode_seconds / sizes.episode_steps, 4),
+        "compile_seconds": round(compile_seconds, 1),
+        **device_memory(),
+    }
+
+
+def measure_attention(bench: Bench) -> dict[str, Any]:
+    """Milliseconds of attention, forward and backward in bfloat16: as the models compute it, by JAX, and by cuDNN."""
+    shape = (bench.sizes.batch, bench.sizes.length, *_HEADS_SHAPE)
+    q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
+    library = partial(jax.nn.dot_product_attention, is_causal=True)
+    ways: dict[str, Callable[..., Any]] = {
+        "models": causal_attention,
+        "jax": library,
+        "cudnn": partial(library, implementation="cudnn"),
+    }
+    facts: dict[str, Any] = {"shape": shape}
+    for name, attend in ways.items():
+        gradient = jax.jit(jax.grad(lambda *x, attend=attend: attend(*x).astype(jnp.float32).sum(), (0, 1, 2)))
+        try:
+            seconds = seconds_of_calls(partial(gradient, q, k, v), bench.sizes.seconds / 4)
+            facts[f"{name}_milliseconds"] = round(1e3 * statistics.median(seconds), 4)
+        except Exception as error:  # cuDNN is missing, too old or refuses the shape
+            if name == "models":
+                raise
+            facts[f"{name}_error"] = short_message(error)
+    return facts
+
+
+def tasks_beside_h4() -> list[Task]:
+    """Returns the test tasks beside teammates of family H4, on the layout that everything is measured on."""
+    tasks = published_tasks("teammate")
+    return [task for task in tasks if task.layout.name == _LAYOUT and task.teammate_family == "H4"]
+
+
+def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
+    """Returns the learner of an ego beside teammate H4, with the paper's network but for the encoder."""
+    task = tasks_beside_h4()[0]
+    config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
+    return Learner(Environment(task.layout), build_teammate(task.layout, task.teammate, noise="seeded"), config)
+
+
+def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
+    """Returns the architecture of a size of AD."""
+    layers, width = sizes.models[size]
+    positions = "rope" if size == "tiny" else "none"
+    return ModelOptions(layers, width, encoder=encoder, positions=positions, bfloat16=dtype == "bfloat16")
+
+
+def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
+    """Returns AD for batches of state records of these layouts."""
+    return get_method("ad")(model, overcooked_world(layouts, model.encoder))
+
+
+def context_length(sizes: Sizes, size: str) -> int:
+    """Returns L in training and K in acting of a size of AD."""
+    return min(sizes.length, 200) if size == "tiny" else sizes.length
+
+
+def short_message(error: BaseException) -> str:
+    """Returns class and start of the message of an error."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
+
+
+CASES: dict[str, Callable[[Bench], dict[str, Any]]] = {
+    "device": describe_device,
+    "product": measure_product,
+    "learner/paper": partial(measure_learner, encoder="paper"),
+    "learner/words": partial(measure_learner, encoder="words"),
+    "learner/mlp": partial(measure_learner, encoder="mlp"),
+    "train/small/paper/bfloat16": partial(measure_training, size="small", encoder="paper", dtype="bfloat16"),
+    "train/small/paper/float32": partial(measure_training, size="small", encoder="paper", dtype="float32"),
+    "act/small": partial(measure_acting, size="small", encoder="paper", seeds=1),
+    "act/tiny": partial(measure_acting, size="tiny", encoder="mlp", seeds=1),
+    "loader/small": partial(measure_loader, size="small"),
+    "loader/tiny": partial(measure_loader, size="tiny"),
+    "train/small/words/bfloat16": partial(measure_training, size="small", encoder="words", dtype="bfloat16"),
+    "train/small/words/float32": partial(measure_training, size="small", encoder="words", dtype="float32"),
+    "train/tiny/mlp/bfloat16": partial(measure_training, size="tiny", encoder="mlp", dtype="bfloat16"),
+    "train/tiny/mlp/float32": partial(measure_training, size="tiny", encoder="mlp", dtype="float32"),
+    "act/tiny/16": partial(measure_acting, size="tiny", encoder="mlp", seeds=16),
+    "attention": measure_attention,
+}
+"""Cases by name, "part" or "part/..", in the order in which they run: what a time limit cuts off is needed least."""
+
+PARTS = tuple(dict.fromkeys(name.split("/")[0] for name in CASES))
+
+
+def run_here(names: Sequence[str], bench: Callable[[], Bench]) -> bool:
+    """Run cases in this process up to the first that fails, and print their lines; returns whether all succeeded."""
+    for name in names:
+        try:
+            facts = CASES[name](bench())
+        except Exception as error:
+            print_case(name, {"error": short_message(error)})
+            return False
+        print_case(name, facts)
+    return True
+
+
+def print_case(case: str, facts: Mapping[str, Any]) -> None:
+    """Print the line of a case."""
+    print_line(**{"benchmark": "gpu", "case": case, **facts})
+    sys.stdout.flush()
+
+
+@click.command()
+@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS), default=PARTS, help="Measure these parts.")
+@click.option("--case", "cases", multiple=True, type=click.Choice(list(CASES)), help="Measure these cases only.")
+@click.option("--minutes", type=float, default=9.0, show_default=True, help="Time limit of the command.")
+@click.option("--case-minutes", type=float, default=3.0, show_default=True, help="Time limit of a case.")
+@click.option("--small", is_flag=True, help="Use tiny sizes, as always on a CPU.")
+@click.option("--seconds", type=float, help="Least time of a measurement.  [default: 4, or 0.05 for tiny sizes]")
+@click.option(
+    "--peak-tflops",
+    "peaks",
+    multiple=True,
+    type=(click.Choice(["float32", "bfloat16"]), float),
+    help="Divide by this speed of a dtype, such as `bfloat16 989`, instead of the measured one.",
+)
+@click.option("--here", is_flag=True, help="Measure in this process, up to the first failure; no time limits.")
+def main(
+    parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, case_minutes: float, here: bool, **settings: Any
+) -> None:
+    """Measure the speed of learning, training and evaluation on a GPU; one JSON line for each case."""
+    started = time.monotonic()
+    names = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
+    learning = [name for name in names if name.startswith("learner/")]
+    if here:
+        if learning == names:
+            request_determinism()  # as `generate` does
+        sys.exit(0 if run_here(names, partial(make_bench, **settings)) else 1)
+    failures = 0
+    for _, group in groupby(names, key=lambda name: name in learning):
+        failures += run_isolated(
+            list(group),
+            lambda names: [sys.executable, "-m", "benchmarks.bench_gpu", "--here", *child_options(names, **settings)],
+            print_case,
+            until=started + 60 * minutes,
+            case_seconds=60 * case_minutes,
+            environment=child_environment(),
+        )
+    sys.exit(1 if failures else 0)
+
+
+def child_environment() -> dict[str, str]:
+    """Returns the environment of child processes, in which JAX may use most of a GPU's memory, not three quarters."""
+    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX refuses both together
+    return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
+
+
+def make_bench(small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]) -> Bench:
+    """Returns the settings of this process, in which JAX is used from here on."""
+    sizes = FULL_SIZES
+    if small or jax.default_backend() == "cpu":
+        sizes = SMALL_SIZES
+        jax.config.update("jax_disable_most_optimizations", True)  # compiling would be nearly all of the time
+    return Bench(replace(sizes, seconds=sizes.seconds if seconds is None else seconds), dict(peaks))
+
+
+def child_options(
+    names: Sequence[str], small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]
+) -> list[str]:
+    """Returns the options by which a child process measures some cases under the same settings."""
+    options = [word for name in names for word in ("--case", name)]
+    options += [word for dtype, peak in peaks for word in ("--peak-tflops", dtype, str(peak))]
+    options += ["--seconds", str(seconds)] if seconds is not None else []
+    return options + ["--small"] * small
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""The benchmark for GPUs in tiny sizes on a CPU, and what can be known of a GPU without one: that programs lower."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import partial
+from typing import Any
+
+import jax
+import pytest
+from click.testing import CliRunner
+
+from baselines.agents.egos import learned
+from baselines.evaluate.protocols import PROTOCOLS
+from baselines.evaluate.rollout import EvaluationRollout
+from baselines.training.options import TrainOptions
+from baselines.training.trainer import Trainer
+from benchmarks import bench_gpu
+from benchmarks.bench_gpu import (
+    CASES,
+    FULL_SIZES,
+    PARTS,
+    SMALL_SIZES,
+    Bench,
+    ad_method,
+    architecture,
+    context_length,
+    ego_learner,
+    main,
+    measure_training,
+    tasks_beside_h4,
+)
+from benchmarks.flops import product_flops
+from generation.learners.ego import compiled_update
+from generation.teammates.registry import build_teammate
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+MEASURED = {
+    "device": {"device", "jax", "commit", "date", "xla_threads"},
+    "product": {"tflops_float32", "tflops_float32_highest", "tflops_bfloat16"},
+    "learner": {"steps_per_second", "compile_seconds", "mfu", "program_gib"},
+    "train": {"step_seconds", "transitions_per_second", "loader_wait_seconds_per_step", "mfu", "accumulate"},
+    "loader": {"batch_seconds"},
+    "act": {"steps_per_second", "streams"},
+    "attention": {"models_milliseconds"},
+}
+"""Part -> some keys of its lines."""
+
+
+def lines_of(output: str) -> dict[str, dict[str, Any]]:
+    return {line["case"]: line for line in map(json.loads, output.splitlines())}
+
+
+@pytest.mark.slow
+def test_the_command():
+    """One case of each part."""
+    cases = ["device", "product", "learner/mlp", "act/tiny", "loader/tiny", "train/tiny/mlp/bfloat16", "attention"]
+    assert {case.split("/")[0] for case in cases} == set(PARTS)
+    options = [word for case in cases for word in ("--case", case)]
+    command = [sys.executable, "-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01", "--peak-tflops"]
+    done = subprocess.run([*command, "float32", "1e-3"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = lines_of(done.stdout)
+    assert list(found) == cases
+    for case, line in found.items():
+        assert MEASURED[case.split("/")[0]] <= line.keys(), case
+    assert found["device"]["sizes"] == "small"
+    assert found["learner/mlp"]["xla_flags"].count("xla_gpu_deterministic_ops") == 1
+    speed, work = found["learner/mlp"]["steps_per_second"], found["learner/mlp"]["mflop_per_step"]
+    assert found["learner/mlp"]["mfu"] == pytest.approx(speed * work / 1e3, rel=0.02)
+
+
+def test_what_there_is_no_time_for_is_skipped_with_a_line():
+    result = CliRunner().invoke(main, ["--minutes", "0"], catch_exceptions=False)
+    assert result.exit_code == 0
+    found = lines_of(result.output)
+    assert found.keys() == CASES.keys()
+    assert all(line["skipped"] for line in found.values())
+
+
+def test_an_error_has_a_line_and_ends_the_process(monkeypatch):
+    monkeypatch.setitem(CASES, "product", lambda bench: 1 / 0)
+    result = CliRunner().invoke(main, ["--here", "--part", "product", "--part", "loader"], catch_exceptions=False)
+    assert result.exit_code == 1
+    assert lines_of(result.output) == {
+        "product": {"benchmark": "gpu", "case": "product", "error": "ZeroDivisionError: division by zero"}
+    }
+
+
+def test_a_batch_that_does_not_fit_is_computed_in_parts(monkeypatch):
+    tried = []
+
+    def steps(bench, size, encoder, dtype, parts):
+        tried.append(parts)
+        if parts < 4:
+            raise (MemoryError("96 GiB"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: .."))[parts - 1]
+        return {"accumulate": parts}
+
+    monkeypatch.setattr(bench_gpu, "_training_steps", steps)
+    measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
+    assert measure(Bench(FULL_SIZES, {})) == {"accumulate": 4}
+    assert tried == [1, 2, 4]
+    with pytest.raises(MemoryError, match="no number of parts fits: RESOURCE_EXHAUSTED"):
+        measure(Bench(SMALL_SIZES, {}))  # of 2 rows
+
+
+def test_other_errors_of_training_are_errors(monkeypatch):
+    def steps(*arguments):
+        raise jax.errors.JaxRuntimeError("INTERNAL: ..")
+
+    monkeypatch.setattr(bench_gpu, "_training_steps", steps)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
+        measure_training(Bench(FULL_SIZES, {}), "small", "paper", "float32")
+
+
+@pytest.mark.parametrize("encoder", ["paper", "words", "mlp"])
+def test_learners_lower_for_cuda(encoder):
+    """In the sizes that the benchmark has on a GPU; nothing is compiled."""
+    learner = ego_learner(FULL_SIZES, encoder)
+    update: Any = compiled_update(learner)
+    traced = update.trace(jax.eval_shape(learner.init, jax.random.key(0)))
+    traced.lower(lowering_platforms=("cuda",))
+    assert product_flops(traced.jaxpr) > 1e6 * learner.steps_per_update
+
+
+@pytest.mark.parametrize("case", ["small/paper/bfloat16", "small/words/float32", "tiny/mlp/bfloat16"])
+def test_training_steps_lower_for_cuda(case):
+    """In the sizes that the benchmark has on a GPU; nothing is compiled."""
+    size, encoder, dtype = case.split("/")
+    dataset, length = load_icrl4aht(layout="demo_wide", obs="state"), context_length(FULL_SIZES, size)
+    method = ad_method(architecture(FULL_SIZES, size, encoder, dtype), dataset.layouts)  # type: ignore[arg-type]
+    trainer = Trainer(method, TrainOptions(batch_size=FULL_SIZES.batch, context=length))
+    batch = dataset.ad(batch_size=1, length=length, seed=0)[0]
+
+    def of_full_size(leaf: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((FULL_SIZES.batch, *leaf.shape[1:]), leaf.dtype)
+
+    traced = trainer.step.trace(trainer.state_like(), jax.tree.map(of_full_size, batch))
+    traced.lower(lowering_platforms=("cuda",))
+    assert product_flops(traced.jaxpr) > 1e5 * FULL_SIZES.batch * length
+
+
+def test_acting_lowers_for_cuda():
+    tasks = tasks_beside_h4()[:2]
+    method = ad_method(architecture(SMALL_SIZES, "tiny", "mlp", "float32"), [tasks[0].layout])
+    params = jax.eval_shape(method.init, jax.random.key(0))
+    mates = [build_teammate(task.layout, task.teammate, TEAMMATE, "seeded") for task in tasks]
+    rollout = EvaluationRollout(tasks[0].layout, learned(method, params, 10), mates, PROTOCOLS["seeded"])
+    params_and_keys = params, jax.eval_shape(lambda: jax.random.split(jax.random.key(0)))
+    state = jax.eval_shape(lambda params, keys: rollout.start(keys), *params_and_keys)
+    jax.jit(rollout.episode).trace(params, rollout.teammate_params, state).lower(lowering_platforms=("cuda",))

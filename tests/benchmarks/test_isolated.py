@@ -1,0 +1,86 @@
+"""Cases in processes that crash, fail, talk or hang."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import pytest
+
+from benchmarks.isolated import run_isolated
+
+CHILD = """
+import json, os, sys, time
+print("warming up")
+for case in sys.argv[1:]:
+    if case == "crash":
+        os._exit(7)
+    if case == "hang":
+        time.sleep(60)
+    facts = {"error": "too large"} if case == "fail" else {"process": os.getpid()}
+    print(json.dumps({"benchmark": "x", "case": case, **facts}), flush=True)
+    if "error" in facts:
+        sys.exit(1)
+"""
+
+
+def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int, dict]:
+    """The number of failures, and the facts of each case in the order of their lines."""
+    found = {}
+
+    def note(case, facts):
+        assert case not in found
+        found[case] = facts
+
+    failures = run_isolated(
+        cases,
+        lambda names: [sys.executable, "-c", CHILD, *names],
+        note,
+        until=time.monotonic() + seconds,
+        case_seconds=case_seconds,
+    )
+    assert list(found) == list(cases)
+    return failures, found
+
+
+def test_cases_share_a_process_until_one_fails():
+    failures, found = run("one", "two", "fail", "three", "crash", "four")
+    assert failures == 2
+    assert found["one"] == found["two"]
+    assert found["fail"] == {"benchmark": "x", "error": "too large"}
+    assert found["crash"] == {"error": "the process ended with code 7"}
+    assert len({found[case]["process"] for case in ("one", "three", "four")}) == 3
+
+
+def test_a_case_that_hangs_is_stopped_and_the_next_one_runs():
+    failures, found = run("one", "hang", "two", case_seconds=1)
+    assert failures == 1
+    assert found["hang"] == {"error": "stopped after 1 s"}
+    assert found["one"]["process"] != found["two"]["process"]
+
+
+def test_the_time_limit_stops_the_running_case_and_skips_the_others():
+    failures, found = run("one", "hang", "two", seconds=1)
+    assert failures == 1
+    assert found["hang"] == {"error": "stopped: no time left"}
+    assert found["two"] == {"skipped": "no time left"}
+
+
+def test_nothing_starts_without_time():
+    assert run("one", "two", seconds=0) == (0, {case: {"skipped": "no time left"} for case in ("one", "two")})
+
+
+def test_an_error_here_ends_the_process():
+    def fail(case, facts):
+        raise ZeroDivisionError
+
+    started = time.monotonic()
+    with pytest.raises(ZeroDivisionError):
+        run_isolated(
+            ["one", "hang"],
+            lambda names: [sys.executable, "-c", CHILD, *names],
+            fail,
+            until=started + 50,
+            case_seconds=50,
+        )
+    assert time.monotonic() - started < 40
