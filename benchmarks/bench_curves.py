@@ -44,7 +44,8 @@ class Curves(NamedTuple):
     """Curves of all seeds.
 
     Attributes:
-        returns: float64 (seeds, points), mean return of the episodes that ended in each part of the training.
+        returns: float64 (seeds, points), mean return of the episodes that ended in each part of the training; NaN where
+            none did.
         steps_per_second: environment steps/s of each run, without compiling, float64 (seeds,).
     """
 
@@ -57,7 +58,7 @@ class Curves(NamedTuple):
 
     def end(self) -> tuple[float, float]:
         """Mean return in the last tenth of the training, and half the width of its interval."""
-        mean, half = self._interval(self.returns[:, -_POINTS // 10 :].mean(axis=1, keepdims=True))
+        mean, half = self._interval(np.nanmean(self.returns[:, -_POINTS // 10 :], axis=1, keepdims=True))
         return float(mean[0]), float(half[0])
 
     def _interval(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,6 +150,7 @@ def main(out: Path, names: tuple[str, ...], layouts: tuple[str, ...], seeds: int
     curves = collect(out, configs, layouts, seeds)
     for (layout, name), found in curves.items():
         (mean, half), (first_mean, first_half) = found.band(), curves.get((layout, first.name), found).band()
+        overlaps = np.abs(mean - first_mean) <= half + first_half
         end, width = found.end()
         print_line(
             "curves",
@@ -159,7 +161,7 @@ def main(out: Path, names: tuple[str, ...], layouts: tuple[str, ...], seeds: int
             return_at_end=round(end, 1),
             interval=[round(end - width, 1), round(end + width, 1)],
             mean_return=round(float(np.nanmean(found.returns)), 1),
-            share_of_points_overlapping=round(float((np.abs(mean - first_mean) <= half + first_half).mean()), 3),
+            share_of_points_overlapping=round(float(overlaps[np.isfinite(mean + first_mean)].mean()), 3),
         )
     draw_curves(curves, layouts, first.ego.total_steps, out / "curves.png")
     click.echo(f"wrote {out / 'curves.png'}", err=True)

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import optax
 
 from benchmarks.common import elapsed, print_line, rates_in_turn, ratio_facts
+from benchmarks.flops import compile_measured
 from generation.env import Environment
 from generation.learners.config import PPOConfig
 from generation.learners.ego import Learner, compiled_update
@@ -41,7 +42,6 @@ from generation.learners.rollout import roll_out
 from generation.profiles import load_profile
 from generation.teammates.registry import build_teammate, heuristic_teammate
 from icrl4aht_data.commands.options import COUNT, LAYOUT
-from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _UPDATES, _PEER_UPDATES, _CALLS, _MATRIX = 3, 2, 10, 2048
@@ -102,13 +102,13 @@ class Part(NamedTuple):
 
     Attributes:
         seconds: of one call.
+        flops: floating-point operations of its matrix products.
         calls: calls in an update.
-        flops: floating-point operations of a call; 0 if they do not matter.
     """
 
     seconds: float
+    flops: float = 0.0
     calls: int = 1
-    flops: float = 0
 
 
 def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Part]]:
@@ -133,13 +133,16 @@ def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Pa
     recurrent = GRU(widths.gru)
 
     def encode(params: Any) -> Any:
-        return jnp.vdot(encoder.apply({"params": params}, seen), features)
+        encoded: Any = encoder.apply({"params": params}, seen)
+        return jnp.vdot(encoded, features)
 
     def recur(params: Any, features: Any) -> Any:
-        return (recurrent.apply({"params": params}, hidden, features, reset)[1] ** 2).sum()
+        states: Any = recurrent.apply({"params": params}, hidden, features, reset)
+        return (states[1] ** 2).sum()
 
     def apply_network(params: Any) -> Any:
-        _, logits, value = learner.network.apply({"params": params}, hidden, seen, reset)  # type: ignore[misc]
+        result: Any = learner.network.apply({"params": params}, hidden, seen, reset)
+        _, logits, value = result
         return (jax.nn.log_softmax(logits)[..., 0] ** 2).sum() + (value**2).sum()
 
     optimizer = ppo_optimizer(config)
@@ -148,20 +151,19 @@ def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Pa
         change, memory = optimizer.update(params, memory, params)
         return optax.apply_updates(params, change), memory
 
-    calls, steps = config.epochs * config.minibatches, batch * config.rollout
-    of_encoder, encoder_flops = _timed(jax.grad(encode), params["encoder"])
-    of_recurrent, _ = _timed(jax.grad(recur, argnums=(0, 1)), params["gru"], features)
-    of_network, _ = _timed(jax.grad(apply_network), params)
-    # Forward, and backward to inputs and weights: three products of two operations an entry.
-    weights = 3 * widths.gru * (widths.dense + widths.gru)
-    heads = 2 * widths.gru * widths.head + widths.head * (len(ACTIONS) + 1)
+    calls = config.epochs * config.minibatches
+    of_encoder = _timed(jax.grad(encode), params["encoder"])
+    of_recurrent = _timed(jax.grad(recur, argnums=(0, 1)), params["gru"], features)
+    of_network = _timed(jax.grad(apply_network), params)
+    others = zip(of_network, of_encoder, of_recurrent, strict=True)
+    seconds, flops = (max(0.0, whole - one - other) for whole, one, other in others)
     parts = {
-        "roll-out": Part(_timed(play, state)[0]),
-        "rendering": Part(_timed(learner.view, rollout.record)[0]),
-        "encoder": Part(of_encoder, calls, encoder_flops),
-        "recurrent layer": Part(of_recurrent, calls, 6 * steps * weights),
-        "heads": Part(max(0.0, of_network - of_encoder - of_recurrent), calls, 6 * steps * heads),
-        "optimiser": Part(_timed(optimise, state.params, state.optimizer)[0], calls),
+        "roll-out": Part(*_timed(play, state)),
+        "rendering": Part(*_timed(learner.view, rollout.record)),
+        "encoder": Part(*of_encoder, calls),
+        "recurrent layer": Part(*of_recurrent, calls),
+        "heads": Part(seconds, flops, calls),
+        "optimiser": Part(*_timed(optimise, state.params, state.optimizer), calls),
     }
     return elapsed(runner.run) / _UPDATES, parts
 
@@ -195,11 +197,10 @@ def print_parts(layout: Layout, name: str, config: PPOConfig) -> None:
 
 
 def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
-    """Seconds of a call, the fastest of some, and the floating-point operations that XLA counts."""
-    compiled = jax.jit(function).lower(*arguments).compile()
-    cost = compiled.cost_analysis() or {}
-    calls = [elapsed(lambda: jax.block_until_ready(compiled(*arguments))) for _ in range(_CALLS)]
-    return min(calls), cost.get("flops", 0.0)
+    """Seconds of a call, the fastest of some, and the floating-point operations of its matrix products."""
+    program = compile_measured(jax.jit(function), *arguments)
+    calls = [elapsed(lambda: jax.block_until_ready(program.call(*arguments))) for _ in range(_CALLS)]
+    return min(calls), program.flops
 
 
 def load_peer(path: Path) -> ModuleType:
