@@ -86,6 +86,13 @@ def train_once(layout: str, config: PPOConfig, seed: int) -> dict[str, Any]:
     }
 
 
+def shortened(config: PPOConfig, steps: int) -> PPOConfig:
+    """The hyper-parameters of a training of this length; shaped rewards end at the same share of it."""
+    return replace(
+        config, total_steps=steps, shaping_horizon=max(1, config.shaping_horizon * steps // config.total_steps)
+    )
+
+
 def collect(
     out: Path, configs: dict[str, PPOConfig], layouts: tuple[str, ...], seeds: int
 ) -> dict[tuple[str, str], Curves]:
@@ -146,7 +153,7 @@ def main(out: Path, names: tuple[str, ...], layouts: tuple[str, ...], seeds: int
     first = profiles[0]
     if first.xla_threads:
         limit_xla_threads(first.xla_threads)
-    configs = {profile.name: replace(profile.ego, total_steps=first.ego.total_steps) for profile in profiles}
+    configs = {profile.name: shortened(profile.ego, first.ego.total_steps) for profile in profiles}
     curves = collect(out, configs, layouts, seeds)
     for (layout, name), found in curves.items():
         (mean, half), (first_mean, first_half) = found.band(), curves.get((layout, first.name), found).band()
