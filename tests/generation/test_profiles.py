@@ -102,8 +102,9 @@ def test_paper_profile_keeps_146_episodes():
     assert load_profile("paper").ego.episodes == 146
 
 
-def test_mini_profile_has_histories_of_full_length():
-    assert load_profile("mini").ego.episodes == 146
+@pytest.mark.parametrize("name", ["mini", "cpu"])
+def test_histories_of_full_length(name):
+    assert load_profile(name).ego.episodes == 146
 
 
 def test_ego_hash_is_of_the_ego_alone(changed):
