@@ -27,6 +27,8 @@ from baselines.commands.options import (
     root_option,
     save_minutes_option,
     seeds_option,
+    size_option,
+    sized_settings,
     suite_option,
     tasks_option,
     tensorboard_option,
@@ -34,8 +36,7 @@ from baselines.commands.options import (
     training_summary,
     variant_names,
 )
-from baselines.methods.options import SIZES, ModelOptions
-from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.options import HistoryOptions
 from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
@@ -317,12 +318,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 )
 @root_option
 @click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
-@click.option(
-    "--size",
-    type=Names("size", lambda: SIZES),
-    default="small",
-    help="small, medium or large: layers, width and steps.",
-)
+@size_option
 @training_options
 @model_options
 @dataclass_options(HistoryOptions, "histories")
@@ -337,7 +333,7 @@ def train_command(
     layouts: tuple[str, ...],
     root: Any,
     out: Path | None,
-    size: str,
+    size: str | None,
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
@@ -368,13 +364,11 @@ def train_command(
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
-    layers, width, steps = SIZES[size]
-    options = replace_given(TrainOptions(steps=steps), {"batch_size": default_batch_size()} | train)
+    sized, options, description = sized_settings(size, model, train)
     choice = replace_given(HistoryOptions(layouts, root and str(root), **filters), histories)
-    sized: dict[str, Any] = {"layers": layers, "width": width}
-    job = prepare(method, ModelOptions(**(sized | model)), options, choice)
+    job = prepare(method, sized, options, choice)
     folder = out or Path("runs") / method
-    _console.print(training_summary(job.about["histories"]), highlight=False)
+    _console.print(f"{description}\n{training_summary(job.about['histories'])}", highlight=False)
     with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
@@ -459,12 +453,14 @@ def _run_experiment(
     train: dict[str, Any],
     histories: dict[str, Any],
     suite: Path | None = None,
+    size: str | None = None,
     **options: Any,
 ) -> None:
     from baselines.experiments import ExperimentPlan, run_experiment
 
-    training = {"batch_size": default_batch_size()} | train
-    plan = ExperimentPlan(root=root and str(root), suite=suite, train=training, **histories, **options)
+    size = size or "small"
+    training = {"batch_size": default_batch_size(size)} | train
+    plan = ExperimentPlan(root=root and str(root), suite=suite, size=size, train=training, **histories, **options)
     with bars(edges=True) as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:
