@@ -182,8 +182,8 @@ def sized_settings(
     training = TrainOptions(**SIZES[name].train | {"batch_size": default_batch_size(name)} | dict(train))
     reason = "" if size else f", the default {'on a CPU' if default == 'tiny' else 'on this device'}"
     text = (
-        f"size {name}{reason}: {options.layers} layers, width {options.width}, encoder {options.encoder}, positions "
-        f"{options.positions}, K = {training.context}, {training.steps} steps of {training.batch_size} windows"
+        f"size {name}{reason}: layers {options.layers}, width {options.width}, encoder {options.encoder}, positions "
+        f"{options.positions}, K = {training.context}, steps {training.steps}, batch size {training.batch_size}"
     )
     return options, training, text
 
