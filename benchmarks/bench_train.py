@@ -107,7 +107,8 @@ def compare_training(dataset: Dataset, size: str, options: TrainOptions, plan: T
     One way is the paper's encoder on observations from a reader of the published format, the others are encoders on
     batches of state records.
     """
-    encoders: dict[str, EncoderKind] = {"published": "paper"} | {name: name for name in plan.encoders}
+    encoders: dict[str, EncoderKind] = {"published": "paper"}
+    encoders.update({name: name for name in plan.encoders})
     trainers = {}
     for way, encoder in encoders.items():
         model = ModelOptions(**SIZES[size].model | {"encoder": encoder, "bfloat16": plan.dtype == "bfloat16"})

@@ -14,7 +14,6 @@ from baselines.commands.options import (
     METHOD_NAME,
     PROTOCOL_NAME,
     TRAINING_LAYOUT,
-    HostPort,
     acting_option,
     default_batch_size,
     episodes_option,
@@ -22,7 +21,9 @@ from baselines.commands.options import (
     find_ego,
     gifs_option,
     history_filters,
+    join_processes,
     model_options,
+    process_options,
     protocol_option,
     root_option,
     save_minutes_option,
@@ -44,7 +45,6 @@ from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
-    COUNT_OR_NONE,
     LAYOUT,
     SEED,
     SETTINGS,
@@ -325,9 +325,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @history_filters
 @save_minutes_option
 @tensorboard_option
-@click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines.")
-@click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes.")
-@click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process.")
+@process_options
 def train_command(
     method: str,
     layouts: tuple[str, ...],
@@ -350,16 +348,7 @@ def train_command(
     the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second
     Ctrl-C does not wait for it.
     """
-    import jax
-
-    if not coordinator and (processes, process) != (1, 0):
-        raise click.UsageError(
-            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
-        )
-    if process >= processes:
-        raise click.UsageError(f"--process {process}: expected a number below {processes}")
-    if coordinator:
-        jax.distributed.initialize(coordinator, processes, process)
+    join_processes(coordinator, processes, process)
     from baselines.training.histories import prepare
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training

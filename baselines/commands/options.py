@@ -14,7 +14,7 @@ from baselines.methods.options import SIZES, ModelOptions
 from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
-from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
+from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 
@@ -186,6 +186,36 @@ def sized_settings(
         f"{options.positions}, K = {training.context}, steps {training.steps}, batch size {training.batch_size}"
     )
     return options, training, text
+
+
+def process_options(command: Any) -> Any:
+    """Add the options of training on several machines; `join_processes` takes their values."""
+    options = [
+        click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
+        click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
+        click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def join_processes(coordinator: str | None, processes: int, process: int) -> None:
+    """Connect this process with the others of a training; nothing to do without a coordinator.
+
+    Raises:
+        click.UsageError: if the options do not agree.
+    """
+    import jax
+
+    if not coordinator and (processes, process) != (1, 0):
+        raise click.UsageError(
+            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
+        )
+    if process >= processes:
+        raise click.UsageError(f"--process {process}: expected a number below {processes}")
+    if coordinator:
+        jax.distributed.initialize(coordinator, processes, process)
 
 
 def variant_names(command: str) -> Names:
