@@ -363,16 +363,8 @@ def train_command(
         def done(step: int, loss: float | None) -> None:
             show(method, step, options.steps, format_loss(loss))
 
-        run_training(
-            job.method,
-            job.data,
-            job.options,
-            folder,
-            job.about,
-            tensorboard=tensorboard,
-            save_minutes=save_minutes,
-            done=done,
-        )
+        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
+        run_training(job.method, job.data, job.options, folder, job.about, **watched)
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"

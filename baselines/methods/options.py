@@ -44,7 +44,7 @@ class ModelSize(NamedTuple):
 
 
 SIZES = {
-    "tiny": ModelSize(2, 64, 20_000, context=200, positions="rope", encoder="mlp", cpu_batch=16),
+    "tiny": ModelSize(2, 64, 20_000, heads=2, context=200, positions="rope", encoder="mlp", cpu_batch=16),
     "small": ModelSize(4, 256, 20_000),
     "medium": ModelSize(8, 512, 50_000),
     "large": ModelSize(12, 768, 100_000),
