@@ -12,7 +12,7 @@ from rich.console import Console
 from baselines.agents.egos import AGENTS, find_agent
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
-from baselines.methods.options import ModelOptions
+from baselines.methods.options import SIZES, ModelOptions
 from baselines.report.overlap import overlap_legend, overlap_marks
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import EvaluationRun, note_results, read_run
@@ -33,9 +33,9 @@ from icrl4aht_data.plotting import plot_learning_curves
 from icrl4aht_data.utils.new_file import check_new_file
 
 DEMO_LAYOUT = "demo_wide"
-DEMO_MODEL = ModelOptions(layers=2, width=64)
-DEMO_TRAINING = TrainOptions(steps=300, batch_size=16, context=100, validate_every=100)
-"""Small enough for two cores; the defaults of both option classes are the paper's."""
+DEMO_MODEL = ModelOptions(**SIZES["tiny"].model)
+DEMO_TRAINING = TrainOptions(steps=1000, batch_size=16, context=SIZES["tiny"].context, validate_every=250)
+"""Size tiny, and fewer steps than its own."""
 
 _STEPS = 6
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from baselines.agents.egos import Acting, find_agent
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import get_protocol, limit_tasks
-from baselines.methods.options import SIZES, ModelOptions
+from baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from baselines.methods.registry import get_method
 from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
 from baselines.report.page import write_page_with_episodes
@@ -87,8 +87,8 @@ class Experiment(NamedTuple):
 
 
 def _size_entry(name: str) -> ExperimentEntry:
-    layers, width, steps = SIZES[name]
-    return ExperimentEntry(name, {"layers": layers, "width": width}, {"steps": steps}, {"size": name})
+    size = SIZES[name]
+    return ExperimentEntry(name, {"layers": size.layers, "width": size.width}, {"steps": size.steps}, {"size": name})
 
 
 EXPERIMENTS = {
@@ -102,7 +102,7 @@ EXPERIMENTS = {
     ),
     "sweep size": Experiment(
         "Model scale and training budget",
-        tuple(map(_size_entry, SIZES)),
+        tuple(map(_size_entry, PAPER_SIZES)),
         tuple(TESTED_ON),
         varies=("layers", "width"),
     ),
@@ -135,6 +135,7 @@ class ExperimentPlan:
         channels: channels of the models' observations, see `HistoryOptions`.
         root: folder or address of a release; None for the bundled mini release.
         suite: folder of learned teammates; required for "heldout-rl".
+        size: name of the models' size; "sweep size" varies it.
         train: values of `TrainOptions` for all entries, such as steps.
         model: values of `ModelOptions` for all entries.
         filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
@@ -155,6 +156,7 @@ class ExperimentPlan:
     channels: Channels | None = None
     root: str | None = None
     suite: Path | None = None
+    size: str = "small"
     train: dict[str, Any] = field(default_factory=dict)
     model: dict[str, Any] = field(default_factory=dict)
     filters: dict[str, Any] = field(default_factory=dict)
@@ -242,7 +244,10 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
     for value in plan.values:
         if value not in names:
             raise unknown(f"setting of {name}", value, names)
-    for option, value in (plan.train | plan.model).items():
+    if plan.size not in SIZES:
+        raise unknown("size", plan.size, SIZES)
+    given = plan.train | plan.model | ({"layers": SIZES[plan.size].layers} if plan.size != "small" else {})
+    for option, value in given.items():
         if option in experiment.varies:
             raise OptionError(f"{option} = {value}: `{name}` varies it; choose by --only, such as {names[0]}")
     return [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
@@ -363,8 +368,9 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
 
 
 def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
-    options = TrainOptions(**{**entry.train, **plan.train})
-    model = ModelOptions(**{**entry.model, **plan.model})
+    size = SIZES[plan.size]
+    options = TrainOptions(**{**size.train, **entry.train, **plan.train})
+    model = ModelOptions(**{**size.model, **entry.model, **plan.model})
     histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters)
     try:
         return prepare(method, model, options, histories)

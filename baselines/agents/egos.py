@@ -128,7 +128,7 @@ def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
         check_fits(run, layout, folder)
         return with_channels(policy, run.channels, layout)
 
-    details = {"run": run.hash, "step": run.step, "context": run.context, "acting": acting}
+    details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, "acting": acting}
     return NamedEgo(run.label, make, {**details, "trained_on": run.trained_on})
 
 

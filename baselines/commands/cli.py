@@ -14,7 +14,6 @@ from baselines.commands.options import (
     METHOD_NAME,
     PROTOCOL_NAME,
     TRAINING_LAYOUT,
-    HostPort,
     acting_option,
     default_batch_size,
     episodes_option,
@@ -22,11 +21,15 @@ from baselines.commands.options import (
     find_ego,
     gifs_option,
     history_filters,
+    join_processes,
     model_options,
+    process_options,
     protocol_option,
     root_option,
     save_minutes_option,
     seeds_option,
+    size_option,
+    sized_settings,
     suite_option,
     tasks_option,
     tensorboard_option,
@@ -34,8 +37,7 @@ from baselines.commands.options import (
     training_summary,
     variant_names,
 )
-from baselines.methods.options import SIZES, ModelOptions
-from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.options import HistoryOptions
 from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
@@ -43,7 +45,6 @@ from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
-    COUNT_OR_NONE,
     LAYOUT,
     SEED,
     SETTINGS,
@@ -317,27 +318,20 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 )
 @root_option
 @click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
-@click.option(
-    "--size",
-    type=Names("size", lambda: SIZES),
-    default="small",
-    help="small, medium or large: layers, width and steps.",
-)
+@size_option
 @training_options
 @model_options
 @dataclass_options(HistoryOptions, "histories")
 @history_filters
 @save_minutes_option
 @tensorboard_option
-@click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines.")
-@click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes.")
-@click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process.")
+@process_options
 def train_command(
     method: str,
     layouts: tuple[str, ...],
     root: Any,
     out: Path | None,
-    size: str,
+    size: str | None,
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
@@ -354,42 +348,23 @@ def train_command(
     the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second
     Ctrl-C does not wait for it.
     """
-    import jax
-
-    if not coordinator and (processes, process) != (1, 0):
-        raise click.UsageError(
-            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
-        )
-    if process >= processes:
-        raise click.UsageError(f"--process {process}: expected a number below {processes}")
-    if coordinator:
-        jax.distributed.initialize(coordinator, processes, process)
+    join_processes(coordinator, processes, process)
     from baselines.training.histories import prepare
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
-    layers, width, steps = SIZES[size]
-    options = replace_given(TrainOptions(steps=steps), {"batch_size": default_batch_size()} | train)
+    sized, options, description = sized_settings(size, model, train)
     choice = replace_given(HistoryOptions(layouts, root and str(root), **filters), histories)
-    sized: dict[str, Any] = {"layers": layers, "width": width}
-    job = prepare(method, ModelOptions(**(sized | model)), options, choice)
+    job = prepare(method, sized, options, choice)
     folder = out or Path("runs") / method
-    _console.print(training_summary(job.about["histories"]), highlight=False)
+    _console.print(f"{description}\n{training_summary(job.about['histories'])}", highlight=False)
     with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
             show(method, step, options.steps, format_loss(loss))
 
-        run_training(
-            job.method,
-            job.data,
-            job.options,
-            folder,
-            job.about,
-            tensorboard=tensorboard,
-            save_minutes=save_minutes,
-            done=done,
-        )
+        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
+        run_training(job.method, job.data, job.options, folder, job.about, **watched)
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
@@ -459,12 +434,14 @@ def _run_experiment(
     train: dict[str, Any],
     histories: dict[str, Any],
     suite: Path | None = None,
+    size: str | None = None,
     **options: Any,
 ) -> None:
     from baselines.experiments import ExperimentPlan, run_experiment
 
-    training = {"batch_size": default_batch_size()} | train
-    plan = ExperimentPlan(root=root and str(root), suite=suite, train=training, **histories, **options)
+    size = size or "small"
+    training = {"batch_size": default_batch_size(size)} | train
+    plan = ExperimentPlan(root=root and str(root), suite=suite, size=size, train=training, **histories, **options)
     with bars(edges=True) as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import click
 
-from baselines.methods.options import ModelOptions
+from baselines.methods.options import SIZES, ModelOptions
 from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
-from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, Folder, Names, Root
+from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 
@@ -132,11 +132,23 @@ def history_filters(command: Any) -> Any:
     return decorated
 
 
-_PAPER_OR_CPU = "1024 as in the paper, or 8 on a CPU"
-training_options = dataclass_options(
-    TrainOptions, "train", default_text={"steps": "the size's", "batch_size": _PAPER_OR_CPU}
+_SIZE_NAME = Names("size", lambda: SIZES)
+size_option = click.option(
+    "--size",
+    type=_SIZE_NAME,
+    help="tiny, for a CPU, or the paper's small, medium or large: sets what has `the size's` as its default.",
+    show_default="tiny on a CPU, small elsewhere",
 )
-model_options = dataclass_options(ModelOptions, "model", default_text={"layers": "the size's", "width": "the size's"})
+_experiment_size_option = click.option(
+    "--size",
+    type=_SIZE_NAME,
+    help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
+    show_default="small, as in the paper",
+)
+_PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
+_BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
+training_options = dataclass_options(TrainOptions, "train", default_text={**_BY_SIZE, "batch_size": _PAPER_OR_CPU})
+model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
 def training_summary(histories: dict[str, Any]) -> str:
@@ -145,11 +157,65 @@ def training_summary(histories: dict[str, Any]) -> str:
     return f"training on {', '.join(histories['layouts'])}; {histories['channels']} channels, observations of {shape}"
 
 
-def default_batch_size() -> int:
-    """Returns the paper's batch size, or on a CPU one that makes a step take seconds."""
+def default_batch_size(size: str = "small") -> int:
+    """Returns the paper's batch size, or on a CPU one that makes a step take a second or less."""
     import jax
 
-    return 8 if jax.default_backend() == "cpu" else TrainOptions.batch_size
+    return SIZES[size].cpu_batch if jax.default_backend() == "cpu" else TrainOptions.batch_size
+
+
+def sized_settings(
+    size: str | None, model: Mapping[str, Any], train: Mapping[str, Any]
+) -> tuple[ModelOptions, TrainOptions, str]:
+    """Returns the settings of a size, in which given values take precedence, and a line that describes them.
+
+    Args:
+        size: name of the size; None for tiny on a CPU and small elsewhere.
+        model: given values of `ModelOptions`.
+        train: given values of `TrainOptions`.
+    """
+    import jax
+
+    default = "tiny" if jax.default_backend() == "cpu" else "small"
+    name = size or default
+    options = ModelOptions(**SIZES[name].model | dict(model))
+    training = TrainOptions(**SIZES[name].train | {"batch_size": default_batch_size(name)} | dict(train))
+    reason = "" if size else f", the default {'on a CPU' if default == 'tiny' else 'on this device'}"
+    text = (
+        f"size {name}{reason}: layers {options.layers}, width {options.width}, encoder {options.encoder}, positions "
+        f"{options.positions}, K = {training.context}, steps {training.steps}, batch size {training.batch_size}"
+    )
+    return options, training, text
+
+
+def process_options(command: Any) -> Any:
+    """Add the options of training on several machines; `join_processes` takes their values."""
+    options = [
+        click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
+        click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
+        click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def join_processes(coordinator: str | None, processes: int, process: int) -> None:
+    """Connect this process with the others of a training; nothing to do without a coordinator.
+
+    Raises:
+        click.UsageError: if the options do not agree.
+    """
+    import jax
+
+    if not coordinator and (processes, process) != (1, 0):
+        raise click.UsageError(
+            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
+        )
+    if process >= processes:
+        raise click.UsageError(f"--process {process}: expected a number below {processes}")
+    if coordinator:
+        jax.distributed.initialize(coordinator, processes, process)
 
 
 def variant_names(command: str) -> Names:
@@ -193,6 +259,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             multiple=True,
             help="Evaluate only with teammates of this family, such as H4; repeat for several.",
         ),
+        _experiment_size_option,
         history_filters,
         dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs")),
         tasks_option,

@@ -46,8 +46,8 @@ def _attention(q: Array, k: Array, v: Array, seen_by_first: int, *own: Array) ->
         seen_by_first: number of keys that the first row sees.
         own: a key and a value for each query (B, N, H, Dh), or nothing.
     """
-    q, k, v, *own = (x.swapaxes(1, 2) for x in (q / q.shape[-1] ** 0.5, k, v, *own))
-    length, rows = q.shape[2], (q, *own)
+    q, k, v = (x.swapaxes(1, 2) for x in (q / q.shape[-1] ** 0.5, k, v))
+    length, rows = q.shape[2], (q, *(x.swapaxes(1, 2) for x in own))
     if length > LONG_ROWS:
         return _map_long_blocks(seen_by_first, k, v, *rows).swapaxes(1, 2)
     blocks = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 from generation.learners.config import EncoderKind
 from icrl4aht_data.errors import OptionError
@@ -12,8 +12,46 @@ from icrl4aht_data.utils.option_fields import check_fields, option_field
 Positions = Literal["none", "rope"]
 """Position embedding of tokens: none, as published, or rotary (Su et al. 2021)."""
 
-SIZES = {"small": (4, 256, 20_000), "medium": (8, 512, 50_000), "large": (12, 768, 100_000)}
-"""Size name -> layers, width, training steps (paper, Sec. 5.3, "Model Scale and Training Budget")."""
+
+class ModelSize(NamedTuple):
+    """Values of `ModelOptions`, and of a training, that make up a size.
+
+    Attributes:
+        steps: training steps.
+        context: K, steps of a window or transitions of a context.
+        cpu_batch: rows of a batch on a CPU.
+        layers, width, heads, positions, encoder: see `ModelOptions`.
+    """
+
+    layers: int
+    width: int
+    steps: int
+    heads: int = 4
+    context: int = 500
+    positions: Positions = "none"
+    encoder: EncoderKind = "paper"
+    cpu_batch: int = 8
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """Values of `ModelOptions`."""
+        return {name: getattr(self, name) for name in ("layers", "width", "heads", "positions", "encoder")}
+
+    @property
+    def train(self) -> dict[str, Any]:
+        """Values of `TrainOptions`, without the batch size, which depends on the device."""
+        return {"steps": self.steps, "context": self.context}
+
+
+SIZES = {
+    "tiny": ModelSize(2, 64, 20_000, heads=2, context=200, positions="rope", encoder="mlp", cpu_batch=16),
+    "small": ModelSize(4, 256, 20_000),
+    "medium": ModelSize(8, 512, 50_000),
+    "large": ModelSize(12, 768, 100_000),
+}
+"""Sizes by name: one for two cores of a CPU, and the paper's (Sec. 5.3, "Model Scale and Training Budget")."""
+
+PAPER_SIZES = ("small", "medium", "large")
 
 
 @dataclass(frozen=True)

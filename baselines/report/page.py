@@ -45,7 +45,7 @@ from icrl4aht_data.utils.files import atomic_write, json_hash
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
 _SHOWN_TRAINING = ("steps", "batch_size", "context", "learning_rate", "seed")
-_SHOWN_MODEL = ("layers", "width", "positions")
+_SHOWN_MODEL = ("layers", "width", "encoder", "positions")
 _PAPER_CONDITIONS = f"Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
 _SWEEPS = {"K": "Context length", "size": "Model scale and training budget"}
 _STYLE = """

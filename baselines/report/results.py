@@ -79,6 +79,11 @@ class ResultSource(NamedTuple):
         return self.settings.get("details", {}).get("acting", "")
 
     @property
+    def encoder(self) -> str:
+        """Kind of a trained model's encoder, see `methods.options.ModelOptions`; empty for other agents."""
+        return self.settings.get("details", {}).get("encoder", "")
+
+    @property
     def conditions(self) -> str:
         """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of acting."""
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
@@ -319,9 +324,9 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
 
 
 def _rules(run: EvaluationRun) -> tuple[Any, ...]:
-    """Returns what merged results must agree in: protocol with episodes and steps, seeds, and way of acting."""
+    """Returns what merged results must agree in: protocol with episodes and steps, seeds, acting, and encoder."""
     source = run.sources[0]
-    return source.settings["protocol"], source.settings["seeds"], source.acting
+    return source.settings["protocol"], source.settings["seeds"], source.acting, source.encoder
 
 
 def cell_order(cell: Cell) -> tuple[int, int, str]:

@@ -93,6 +93,7 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
                 "steps": settings["protocol"]["steps"],
                 "overlap": " ".join(run.overlaps([cell])),
                 "acting": run.source(cell).acting,
+                "encoder": run.source(cell).encoder,
                 "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
             }
         )

@@ -20,6 +20,7 @@ from baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, Tra
 from baselines.training.run_folder import CHECKPOINTS, read_config
 from baselines.training.seen import TRAINED_ON, teammate_ids
 from baselines.training.trainer import TrainingData
+from generation.learners.config import EncoderKind
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
@@ -279,6 +280,7 @@ class TrainedModel(NamedTuple):
         channels: channels of the observations that it takes: the layouts' own, or the canonical ones.
         obs_shape: shape of these observations.
         label: as reports show it.
+        encoder: kind of the encoder.
         hash: of the run's settings.
         trained_on: the histories that it was trained on, see `training_cells`.
     """
@@ -291,6 +293,7 @@ class TrainedModel(NamedTuple):
     channels: Channels
     obs_shape: tuple[int, ...]
     label: str
+    encoder: EncoderKind
     hash: str
     trained_on: list[dict[str, Any]]
 
@@ -322,6 +325,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
+    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
     names = tuple(layout.name for layout in layouts)
     digest = json_hash(config)
-    return TrainedModel(method, params, step, context, names, channels, obs_shape, label, digest, cells)
+    return TrainedModel(method, params, step, context, names, channels, obs_shape, label, model.encoder, digest, cells)

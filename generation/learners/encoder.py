@@ -58,13 +58,13 @@ class GroupedWords(NamedTuple):
         ids: int32 (*B, 25), see `CellWords.ids`.
         first: int32 (N,), for each group the number of one of its observations, then zeros.
         group: int32 (*B,), the group of each observation.
-        count: int32 (), number of groups.
+        groups: int32 (), number of groups.
     """
 
     ids: Int[Array, "*B 25"]
     first: Int[Array, " N"]
     group: Int[Array, "*B"]
-    count: Int[Array, ""]
+    groups: Int[Array, ""]
 
 
 Seen = Num[Array, "*B 5 5 C"] | WindowWords | GroupedWords | WindowEntries
@@ -159,7 +159,7 @@ def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
 
 def encoding_log(seen: Seen) -> dict[str, Array]:
     """Returns what a training log says of an encoder's input: the share of observations that differ, if known."""
-    return {"distinct_observations": seen.count / seen.group.size} if isinstance(seen, GroupedWords) else {}
+    return {"distinct_observations": seen.groups / seen.group.size} if isinstance(seen, GroupedWords) else {}
 
 
 class WindowEncoder(nn.Module):
@@ -215,12 +215,12 @@ class WindowEncoder(nn.Module):
         def encode_block(_: None, block: tuple[Array, Array]) -> tuple[None, Array]:
             number, ids = block
             nothing = jnp.zeros(shape.shape, shape.dtype)
-            return None, jax.lax.cond(number * size < seen.count, encode, lambda *_: nothing, variables, ids)
+            return None, jax.lax.cond(number * size < seen.groups, encode, lambda *_: nothing, variables, ids)
 
         _, features = jax.lax.scan(encode_block, None, (jnp.arange(_BLOCKS), ids))
         return features.reshape(-1, self.features)[seen.group]
 
-    def _encode_cells(self, seen: Seen) -> Float[Array, "*B 25 F"]:
+    def _encode_cells(self, seen: Num[Array, "*B 5 5 C"] | WindowWords | WindowEntries) -> Float[Array, "*B 25 F"]:
         """Applies the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""
         if isinstance(seen, WindowWords):
             x = jnp.asarray(_required(self.view).words.channels, self.dtype)
@@ -242,7 +242,7 @@ class FlatDense(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Seen) -> Float[Array, "*B F"]:
-        if isinstance(seen, WindowWords):
+        if isinstance(seen, (WindowWords, GroupedWords)):
             raise TypeError("encoder mlp: expected observations or entries, found words")
         if isinstance(seen, WindowEntries):
             x, rows = seen.values, VISIBLE * _required(self.view).channels

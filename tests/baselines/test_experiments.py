@@ -255,8 +255,29 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
     }
     rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "gifs": False, "root": str(release)}
     assert plan == ExperimentPlan(**options, **rest)
-    assert CliRunner().invoke(cli, ["tracks", *small], catch_exceptions=False).exit_code == 0
+    assert CliRunner().invoke(cli, ["tracks", *small, "--size", "tiny"], catch_exceptions=False).exit_code == 0
     assert (calls[1][0], calls[1][2]) == ("tracks", Path("runs/tracks"))
+    assert (plan.size, calls[1][1].size) == ("small", "tiny")
+
+
+def test_a_size_applies_to_all_entries_and_sweeps_vary_it(release, tmp_path, monkeypatch):
+    monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
+    seen = []
+
+    def prepare(method, model, options, histories):
+        seen.append((model, options))
+        raise OptionError("enough")
+
+    monkeypatch.setattr(experiments, "prepare", prepare)
+    plan = dataclasses.replace(SMALL, root=str(release), layouts=("demo_wide",), size="tiny", model={}, train={})
+    for name in ("tracks", "sweep context"):
+        with pytest.raises(OptionError, match="enough"):
+            run_experiment(name, plan, tmp_path)
+    (model, options), (_, swept) = seen
+    assert (model.layers, model.width, model.encoder, model.positions) == (2, 64, "mlp", "rope")
+    assert (options.context, swept.context) == (200, 250)
+    with pytest.raises(OptionError, match=r"layers = 2: `sweep size` varies it; choose by --only, such as small"):
+        run_experiment("sweep size", plan, tmp_path)
 
 
 # Held-out teammates.

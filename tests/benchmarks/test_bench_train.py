@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from baselines.methods.options import SIZES, ModelSize
 from benchmarks import bench_train
 from benchmarks.bench_train import main, published_batches
 from generation.teammates.instances import published_tasks
@@ -29,31 +30,41 @@ def test_the_peer_gets_the_same_batches(lite, tmp_path):
             np.testing.assert_array_equal(ours, theirs)
 
 
-SMALLEST = "--histories 1 --batch 2 --length 6 --steps 1 --acting-steps 2 --episodes 1 --tasks 1 --rounds 1 --layers 1"
+SMALLEST = (
+    "--size tiny --encoder mlp --histories 1 --batch 2 --length 6 --steps 1 --acting-steps 2 --episodes 1 --tasks 1"
+)
 
 
-def run_part(part: str) -> dict[str, Any]:
-    """The line of one part on the smallest scale."""
-    result = CliRunner().invoke(main, [*SMALLEST.split(), "--width", "8", "--part", part], catch_exceptions=False)
+@pytest.fixture(autouse=True)
+def one_layer(monkeypatch) -> None:
+    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, context=6, encoder="mlp"))
+
+
+def run_part(part: str) -> list[dict[str, Any]]:
+    """The lines of one part on the smallest scale."""
+    result = CliRunner().invoke(main, [*SMALLEST.split(), "--part", part], catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    return json.loads(result.output)
+    return [json.loads(line) for line in result.output.splitlines()]
 
 
 def test_training():
-    line = run_part("train")
-    assert line["transitions_per_second"] == pytest.approx(12 * line["steps_per_second"], rel=0.01)
-    assert line["ratio"] > 0
+    lines = run_part("train")
+    assert [(line["size"], line["way"]) for line in lines] == [("tiny", "published"), ("tiny", "mlp")]
+    for line in lines:
+        assert line["transitions_per_second"] == pytest.approx(12 * line["steps_per_second"], rel=0.01)
+    assert lines[0]["ratio_to_published"] == 1
+    assert lines[1]["ratio_to_published"] > 0
 
 
 @pytest.mark.slow
 def test_acting():
-    assert run_part("act")["ratio"] > 0
+    assert run_part("act")[0]["ratio"] > 0
 
 
 @pytest.mark.slow
 def test_all_tasks(monkeypatch):
     tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
     monkeypatch.setattr(bench_train, "published_tasks", lambda track: tasks)
-    line = run_part("all")
+    (line,) = run_part("all")
     assert (line["tasks"], line["episodes"]) == (2, 1)
     assert line["minutes"] > 0

@@ -17,7 +17,7 @@ from baselines.commands.cli import cli
 from baselines.evaluate.drift import Drift, measure_drift
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
-from baselines.methods.options import SIZES, ModelOptions
+from baselines.methods.options import SIZES, ModelOptions, ModelSize
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.training.histories import prepare, read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
@@ -60,7 +60,8 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
     (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(result.returns) == (1, 2)
     run = read_trained(runs / name)
-    settings = {"run": run.hash, "step": 2, "context": 30, "acting": acting, "trained_on": run.trained_on}
+    settings = {"run": run.hash, "step": 2, "context": 30, "encoder": "paper", "acting": acting}
+    settings["trained_on"] = run.trained_on
     assert result.settings["details"] == settings
     with pytest.raises(OptionError, match=r"of other settings \(details.acting: it has .*; details.step: it has 2"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
@@ -136,7 +137,7 @@ class TestBadRuns:
 
 def test_the_train_command(lite, tmp_path, monkeypatch):
     """Trains from the address of a release."""
-    monkeypatch.setitem(SIZES, "small", (1, 16, 5))
+    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 16, 5, heads=2, encoder="words"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]
     with http_server(lite[0]) as server:
@@ -147,6 +148,10 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
         assert re.search(r"ad, loss \d\.\d+: 1 of 1 step after", result.output)  # no terminal: plain lines
         again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
     config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["model"].items() >= {"layers": 1, "width": 16, "heads": 2, "encoder": "words"}.items()
+    assert (config["train"]["steps"], config["train"]["batch_size"]) == (1, 2)
+    assert "size tiny, the default on a CPU: layers 1, width 16, encoder words" in result.output
+    assert "K = 4, steps 1, batch size 2" in result.output
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
     (cell,) = config["trained_on"]
     named = {"layout": "demo_wide", "split": "train", "family": "H4", "algorithm": "utility_greedy", "source": "ppo"}

@@ -463,5 +463,5 @@ def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, mo
 def test_unknown_profile_is_one_line(tmp_path):
 
     result = CliRunner().invoke(cli, ["generate", "--profile", "huge", "--out", str(tmp_path)])
-    assert "unknown profile 'huge'; valid: mini, paper, smoke" in str(result.exception)
+    assert "unknown profile 'huge'; valid: cpu, mini, paper, smoke" in str(result.exception)
     assert callable(main)
