@@ -143,7 +143,7 @@ def check_fields(options: Any) -> None:
         value = getattr(options, field.name)
         if value is None and field.optional:
             continue
-        values = value if field.repeated else (value,)
+        values: Any = value if field.repeated else (value,)
         if not values and not field.bounds.may_be_empty:
             raise OptionError(f"{field.name} = {value}: expected one value or more")
         for item in values:

@@ -34,7 +34,7 @@ def with_gradient(module: WindowEncoder) -> Any:
     """Features, and the gradient of a weighted sum of them."""
 
     def total(params, seen):
-        features = module.apply(params, seen)
+        features: Any = module.apply(params, seen)
         return jnp.vdot(features, jnp.arange(features.size, dtype=jnp.float32).reshape(features.shape)), features
 
     return compiled(jax.grad(total, has_aux=True))
@@ -57,7 +57,7 @@ def test_compact_inputs_give_the_results_of_observations(kind):
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE * float(jnp.abs(other).max()))
     # The same parameters also take plain observations, as when acting.
-    again = compact.apply(params, obs)
+    again: Any = compact.apply(params, obs)
     np.testing.assert_allclose(again, expected, rtol=0, atol=TOLERANCE * float(jnp.abs(expected).max()))
 
 
