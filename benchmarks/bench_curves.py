@@ -125,8 +125,10 @@ def draw_curves(curves: dict[tuple[str, str], Curves], layouts: tuple[str, ...],
         for (where, name), found in curves.items():
             if where == layout:
                 mean, half = found.band()
-                (line,) = axes.plot(middle, mean, label=f"{name} ({len(found.returns)} seeds)")
-                axes.fill_between(middle, mean - half, mean + half, alpha=0.25, linewidth=0, color=line.get_color())
+                seen = np.isfinite(mean)  # environments that start together end together, so some parts have no end
+                mean, half, steps_of = mean[seen], half[seen], middle[seen]
+                (line,) = axes.plot(steps_of, mean, label=f"{name} ({len(found.returns)} seeds)")
+                axes.fill_between(steps_of, mean - half, mean + half, alpha=0.25, linewidth=0, color=line.get_color())
         axes.set_title(f"{layout}, teammate H4", fontsize=9)
         axes.set_xlabel("environment steps")
         axes.grid(alpha=0.3)
