@@ -101,9 +101,9 @@ class Part(NamedTuple):
     """A part of an update.
 
     Attributes:
-        seconds: of one call.
-        flops: floating-point operations of its matrix products.
-        calls: calls in an update.
+        seconds: in an update.
+        flops: floating-point operations of its matrix products in an update.
+        calls: how often it is computed in an update.
     """
 
     seconds: float
@@ -114,29 +114,32 @@ class Part(NamedTuple):
 def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Part]]:
     """Seconds of an update, and its parts.
 
-    Encoder, recurrent layer and all layers are timed forward and backward on a minibatch of a real roll-out. What all
-    layers take in addition to the first two are the heads.
+    Encoder, recurrent layer and all layers are timed forward and backward on a minibatch of a real roll-out, as often
+    as in an update, in one program each. What all layers take in addition to the first two are the heads.
     """
     runner = Runner(layout, config)
     learner, state, widths = runner.learner, runner.state, config.widths
-    play = jax.jit(
-        lambda s: roll_out(learner.env, learner.players(s.params, s.teammate), s.carry, config.rollout, s.key)[1]
-    )
-    rollout = play(state)
-    batch = config.environments // config.minibatches
+
+    def play(state: Any) -> Any:
+        players = learner.players(state.params, state.teammate)
+        return roll_out(learner.env, players, state.carry, config.rollout, state.key)[1]
+
+    rollout = jax.jit(play)(state)
+    batch, calls = config.environments // config.minibatches, config.epochs * config.minibatches
     seen = jax.tree.map(lambda leaf: leaf[:, :batch], learner.view(rollout.record))
-    params, reset, hidden = state.params["params"], rollout.reset[:, :batch], jnp.zeros((batch, widths.gru))
+    reset, hidden = rollout.reset[:, :batch], jnp.zeros((batch, widths.gru))
     features = jax.random.normal(jax.random.key(1), (config.rollout, batch, widths.dense))
     encoder = WindowEncoder(
         widths.dense, widths.encoder, widths.pointwise, widths.spatial, normalize=True, view=learner.view
     )
-    recurrent = GRU(widths.gru)
+    recurrent, optimizer = GRU(widths.gru), ppo_optimizer(config)
 
     def encode(params: Any) -> Any:
         encoded: Any = encoder.apply({"params": params}, seen)
         return jnp.vdot(encoded, features)
 
-    def recur(params: Any, features: Any) -> Any:
+    def recur(inputs: Any) -> Any:
+        params, features = inputs
         states: Any = recurrent.apply({"params": params}, hidden, features, reset)
         return (states[1] ** 2).sum()
 
@@ -145,27 +148,27 @@ def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Pa
         _, logits, value = result
         return (jax.nn.log_softmax(logits)[..., 0] ** 2).sum() + (value**2).sum()
 
-    optimizer = ppo_optimizer(config)
-
-    def optimise(params: Any, memory: Any) -> Any:
+    def optimise(carry: Any) -> Any:
+        params, memory = carry
         change, memory = optimizer.update(params, memory, params)
         return optax.apply_updates(params, change), memory
 
-    calls = config.epochs * config.minibatches
-    of_encoder = _timed(jax.grad(encode), params["encoder"])
-    of_recurrent = _timed(jax.grad(recur, argnums=(0, 1)), params["gru"], features)
-    of_network = _timed(jax.grad(apply_network), params)
-    others = zip(of_network, of_encoder, of_recurrent, strict=True)
-    seconds, flops = (max(0.0, whole - one - other) for whole, one, other in others)
+    params = state.params["params"]
+    of_encoder = _time_loop(_descend(encode), params["encoder"], calls)
+    of_recurrent = _time_loop(_descend(recur), (params["gru"], features), calls)
+    of_network = _time_loop(_descend(apply_network), params, calls)
+    heads = (
+        max(0.0, whole - one - other) for whole, one, other in zip(of_network, of_encoder, of_recurrent, strict=True)
+    )
     parts = {
-        "roll-out": Part(*_timed(play, state)),
-        "rendering": Part(*_timed(learner.view, rollout.record)),
+        "roll-out": Part(*_time_call(play, state)),
+        "rendering": Part(*_time_call(learner.view, rollout.record)),
         "encoder": Part(*of_encoder, calls),
         "recurrent layer": Part(*of_recurrent, calls),
-        "heads": Part(seconds, flops, calls),
-        "optimiser": Part(*_timed(optimise, state.params, state.optimizer), calls),
+        "heads": Part(*heads, calls),
+        "optimiser": Part(*_time_loop(optimise, (state.params, state.optimizer), calls), calls),
     }
-    return elapsed(runner.run) / _UPDATES, parts
+    return min(elapsed(lambda: runner.run(1)) for _ in range(_CALLS)), parts
 
 
 def print_parts(layout: Layout, name: str, config: PPOConfig) -> None:
@@ -175,13 +178,13 @@ def print_parts(layout: Layout, name: str, config: PPOConfig) -> None:
     small operations.
     """
     matrix = jax.random.normal(jax.random.key(0), (_MATRIX, _MATRIX))
-    seconds, flops = _timed(lambda a: a @ a, matrix)
+    seconds, flops = _time_call(lambda a: a @ a, matrix)
     print_line(
         "learner", part="matrix product", size=_MATRIX, threads=xla_threads(), gflops=round(flops / seconds / 1e9, 1)
     )
     total, parts = update_parts(layout, config)
-    known = sum(part.seconds * part.calls for part in parts.values())
-    for what, part in (parts | {"rest": Part(total - known)}).items():
+    rest = Part(total - sum(part.seconds for part in parts.values()))
+    for what, part in (parts | {"rest": rest, "update": Part(total)}).items():
         rate = {"gflops": round(part.flops / part.seconds / 1e9, 1)} if part.flops and part.seconds else {}
         print_line(
             "learner",
@@ -190,17 +193,27 @@ def print_parts(layout: Layout, name: str, config: PPOConfig) -> None:
             layout=layout.name,
             what=what,
             calls=part.calls,
-            milliseconds=round(1000 * part.seconds * part.calls, 3),
-            share=round(part.seconds * part.calls / total, 3),
+            milliseconds=round(1000 * part.seconds, 3),
+            share=round(part.seconds / total, 3),
             **rate,
         )
 
 
-def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
+def _time_call(function: Callable[..., Any], *arguments: Any) -> tuple[float, float]:
     """Seconds of a call, the fastest of some, and the floating-point operations of its matrix products."""
     program = compile_measured(jax.jit(function), *arguments)
     calls = [elapsed(lambda: jax.block_until_ready(program.call(*arguments))) for _ in range(_CALLS)]
     return min(calls), program.flops
+
+
+def _time_loop(step: Callable[[Any], Any], carry: Any, calls: int) -> tuple[float, float]:
+    """Seconds and operations of calls that each take the result of the one before, in one program."""
+    return _time_call(lambda carry: jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=calls)[0], carry)
+
+
+def _descend(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A step down the gradient, which makes every call depend on the one before."""
+    return lambda point: jax.tree.map(lambda x, slope: x - 1e-6 * slope, point, jax.grad(function)(point))
 
 
 def load_peer(path: Path) -> ModuleType:

@@ -53,9 +53,9 @@ def test_speed_and_parts_of_each_profile(profiles):
     assert all(line["steps_per_second"] > 0 for line in speed)
     parts = [line for line in lines if line["part"] == "parts" and line["profile"] == "mlp"]
     assert [line["what"] for line in parts] == [
-        "roll-out", "rendering", "encoder", "recurrent layer", "heads", "optimiser", "rest"
+        "roll-out", "rendering", "encoder", "recurrent layer", "heads", "optimiser", "rest", "update"
     ]  # fmt: skip
-    assert sum(line["share"] for line in parts) == pytest.approx(1, abs=0.01)
+    assert sum(line["share"] for line in parts[:-1]) == pytest.approx(1, abs=0.01)
     assert {line["what"] for line in parts if "gflops" in line} >= {"encoder", "recurrent layer"}
 
 
