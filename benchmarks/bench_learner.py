@@ -165,7 +165,7 @@ def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Pa
         "rendering": Part(*_time_call(learner.view, rollout.record)),
         "encoder": Part(*of_encoder, calls),
         "recurrent layer": Part(*of_recurrent, calls),
-        "heads": Part(*heads, calls),
+        "heads": Part(seconds, flops, calls),
         "optimiser": Part(*_time_loop(optimise, (state.params, state.optimizer), calls), calls),
     }
     return min(elapsed(lambda: runner.run(1)) for _ in range(_CALLS)), parts
