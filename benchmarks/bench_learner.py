@@ -157,9 +157,8 @@ def update_parts(layout: Layout, config: PPOConfig) -> tuple[float, dict[str, Pa
     of_encoder = _time_loop(_descend(encode), params["encoder"], calls)
     of_recurrent = _time_loop(_descend(recur), (params["gru"], features), calls)
     of_network = _time_loop(_descend(apply_network), params, calls)
-    heads = (
-        max(0.0, whole - one - other) for whole, one, other in zip(of_network, of_encoder, of_recurrent, strict=True)
-    )
+    others = zip(of_network, of_encoder, of_recurrent, strict=True)
+    seconds, flops = (max(0.0, whole - one - other) for whole, one, other in others)
     parts = {
         "roll-out": Part(*_time_call(play, state)),
         "rendering": Part(*_time_call(learner.view, rollout.record)),
