@@ -234,7 +234,11 @@ class WindowEncoder(nn.Module):
 
 
 class FlatDense(nn.Module):
-    """A dense layer of flat observations; its kernel has rows for all 25 * C entries, whatever the input has."""
+    """A dense layer of flat observations; its kernel has rows for all 25 * C entries, whatever the input has.
+
+    Initial rows of entries that are always 0 in `view` are zeros: they never learn, and random ones would add noise on
+    other layouts.
+    """
 
     features: int
     view: CompactView | None = None
@@ -249,11 +253,19 @@ class FlatDense(nn.Module):
         else:
             x = seen.reshape(*seen.shape[:-3], -1)
             rows = x.shape[-1]
-        kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (rows, self.features))
+        kernel = self.param("kernel", self._initial_kernel, (rows, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
         if isinstance(seen, WindowEntries):
             kernel = kernel[_required(self.view).entries]
         return x.astype(self.dtype) @ kernel + bias
+
+    def _initial_kernel(self, key: Array, shape: tuple[int, int]) -> Array:
+        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)
+        if self.view is None:
+            return kernel
+        varies = np.zeros((shape[0], 1), bool)
+        varies[self.view.entries] = True
+        return jnp.where(varies, kernel, 0)
 
 
 class Conv3x3(nn.Module):

@@ -43,10 +43,10 @@ def with_gradient(module: WindowEncoder) -> Any:
 @pytest.mark.parametrize("kind", ["words", "mlp"])
 def test_compact_inputs_give_the_results_of_observations(kind):
     obs = jnp.asarray(observe(LAYOUT, RECORDS, 0))
-    plain, view = encoder("paper" if kind == "words" else kind), CompactView(kind, (LAYOUT,))
+    view = CompactView(kind, (LAYOUT,))
     seen = view(jnp.asarray(RECORDS))
     assert isinstance(seen, WindowWords if kind == "words" else WindowEntries)
-    compact = encoder(kind, view)
+    plain, compact = encoder("paper" if kind == "words" else kind, view), encoder(kind, view)
     params = plain.init(jax.random.key(1), obs)
     own = compact.init(jax.random.key(1), seen)
     jax.tree.map(np.testing.assert_array_equal, params, own)
@@ -59,6 +59,24 @@ def test_compact_inputs_give_the_results_of_observations(kind):
     # The same parameters also take plain observations, as when acting.
     again: Any = compact.apply(params, obs)
     np.testing.assert_allclose(again, expected, rtol=0, atol=TOLERANCE * float(jnp.abs(expected).max()))
+
+
+def test_only_entries_of_the_layouts_have_random_initial_weights():
+    """On another layout with as many channels, an entry that was never seen in training adds nothing."""
+    obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
+    kernels = {}
+    for name, module, seen in (
+        ("plain", encoder("mlp"), obs),
+        ("view", encoder("mlp", view), obs),
+        ("compact", encoder("mlp", view), view(jnp.asarray(RECORDS))),
+    ):
+        params: Any = module.init(jax.random.key(1), seen)
+        kernels[name] = np.asarray(params["params"]["FlatDense_0"]["kernel"])
+    expected = np.zeros_like(kernels["plain"])
+    expected[view.entries] = kernels["plain"][view.entries]
+    assert 0 < len(view.entries) < len(expected)
+    np.testing.assert_array_equal(kernels["view"], expected)
+    np.testing.assert_array_equal(kernels["compact"], expected)
 
 
 def test_agents_of_both_rooms_need_the_entries_of_both():
