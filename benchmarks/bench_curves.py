@@ -145,7 +145,7 @@ def draw_curves(curves: dict[tuple[str, str], Curves], layouts: tuple[str, ...],
     "layouts",
     type=LAYOUT,
     multiple=True,
-    default=("demo_wide", "asymm_both", "cramped_up"),
+    default=_LAYOUTS,
     show_default=True,
 )
 @click.option("--seeds", type=COUNT, default=8, show_default=True)

@@ -44,7 +44,7 @@ from baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.methods.attention import causal_attention
 from baselines.methods.method import Method
-from baselines.methods.options import ModelOptions
+from baselines.methods.options import SIZES, ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.training.options import TrainOptions
 from baselines.training.trainer import Trainer
@@ -65,7 +65,6 @@ from icrl4aht_data.utils.threads import usable_cores
 
 _LAYOUT = "demo_wide"
 _OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
-_HEADS_SHAPE = (4, 64)  # of the paper's small
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,8 @@ class Sizes:
         product: rows and columns of the matrices of the large product.
         ppo: environments, roll-out and minibatches of the learner.
         batch: B of training.
-        length: L in training and K in acting, at most; `tiny` has 200.
-        models: size name -> layers and width.
+        length: L in training and K in acting, at most.
+        shrunk: size name -> values that replace those of `SIZES`.
         episode_steps: steps of an episode in acting.
         tasks: most tasks in acting.
         seconds: least time of a measurement, after compiling.
@@ -87,7 +86,7 @@ class Sizes:
     ppo: dict[str, int]
     batch: int
     length: int
-    models: dict[str, tuple[int, int]]
+    shrunk: dict[str, dict[str, int]]
     episode_steps: int
     tasks: int
     seconds: float
@@ -98,7 +97,7 @@ FULL_SIZES = Sizes(
     ppo={"environments": 1024, "rollout": 256, "minibatches": 64},
     batch=1024,
     length=500,
-    models={"small": (4, 256), "tiny": (2, 64)},
+    shrunk={},
     episode_steps=100,
     tasks=20,
     seconds=4.0,
@@ -108,7 +107,7 @@ SMALL_SIZES = Sizes(
     ppo={"environments": 4, "rollout": 8, "minibatches": 2},
     batch=2,
     length=16,
-    models={"small": (1, 32), "tiny": (1, 16)},
+    shrunk={"small": {"layers": 1, "width": 32}, "tiny": {"layers": 1, "width": 16}},
     episode_steps=10,
     tasks=2,
     seconds=0.05,
@@ -311,7 +310,8 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
 
 def measure_attention(bench: Bench) -> dict[str, Any]:
     """Milliseconds of attention, forward and backward in bfloat16: as the models compute it, by JAX, and by cuDNN."""
-    shape = (bench.sizes.batch, bench.sizes.length, *_HEADS_SHAPE)
+    small = SIZES["small"]
+    shape = (bench.sizes.batch, bench.sizes.length, small.heads, small.width // small.heads)
     q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
     library = partial(jax.nn.dot_product_attention, is_causal=True)
     ways: dict[str, Callable[..., Any]] = {
@@ -347,9 +347,8 @@ def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
 
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
     """Returns the architecture of a size of AD."""
-    layers, width = sizes.models[size]
-    positions = "rope" if size == "tiny" else "none"
-    return ModelOptions(layers, width, encoder=encoder, positions=positions, bfloat16=dtype == "bfloat16")
+    model = SIZES[size].model | sizes.shrunk.get(size, {})
+    return ModelOptions(**model | {"encoder": encoder, "bfloat16": dtype == "bfloat16"})
 
 
 def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
@@ -359,7 +358,7 @@ def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
 
 def context_length(sizes: Sizes, size: str) -> int:
     """Returns L in training and K in acting of a size of AD."""
-    return min(sizes.length, 200) if size == "tiny" else sizes.length
+    return min(sizes.length, SIZES[size].context)
 
 
 def short_message(error: BaseException) -> str:

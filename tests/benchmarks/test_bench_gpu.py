@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -15,6 +16,7 @@ from click.testing import CliRunner
 from baselines.agents.egos import learned
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.rollout import EvaluationRollout
+from baselines.methods.options import SIZES
 from baselines.training.options import TrainOptions
 from baselines.training.trainer import Trainer
 from benchmarks import bench_gpu
@@ -117,6 +119,15 @@ def test_other_errors_of_training_are_errors(monkeypatch):
     monkeypatch.setattr(bench_gpu, "_training_steps", steps)
     with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
         measure_training(Bench(FULL_SIZES, {}), "small", "paper", "float32")
+
+
+def test_models_are_those_of_the_sizes():
+    """A size has the values of `train --size`, but for encoder and dtype, which are the case's."""
+    for name in ("tiny", "small"):
+        size = SIZES[name]
+        model = architecture(FULL_SIZES, name, "words", "bfloat16")
+        assert asdict(model).items() >= (size.model | {"encoder": "words", "bfloat16": True}).items()
+        assert context_length(FULL_SIZES, name) == size.context
 
 
 @pytest.mark.parametrize("encoder", ["paper", "words", "mlp"])
