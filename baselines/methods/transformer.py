@@ -49,8 +49,8 @@ class TransformerMemory(NamedTuple):
 class TransformerBlock(nn.Module):
     """Attention, then a feed-forward layer of width 4 D with GELU, each behind a layer norm and added to its input.
 
-    Dropout is where the paper has it, with one exception: `jax.nn.dot_product_attention` offers none on its weights, so
-    it is applied to the outputs of the heads.
+    Dropout is where the paper has it, with one exception: it is applied to the outputs of the heads, not to the weights
+    of attention.
     """
 
     width: int
