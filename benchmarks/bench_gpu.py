@@ -86,7 +86,7 @@ class Sizes:
     ppo: dict[str, int]
     batch: int
     length: int
-    shrunk: dict[str, dict[str, int]]
+    shrunk: dict[str, dict[str, Any]]
     episode_steps: int
     tasks: int
     seconds: float
