@@ -246,8 +246,9 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
             raise unknown(f"setting of {name}", value, names)
     if plan.size not in SIZES:
         raise unknown("size", plan.size, SIZES)
-    given = plan.train | plan.model | ({"layers": SIZES[plan.size].layers} if plan.size != "small" else {})
-    for option, value in given.items():
+    if "layers" in experiment.varies and plan.size != ExperimentPlan.size:
+        raise OptionError(f"size = {plan.size}: `{name}` varies it; choose by --only, such as {names[0]}")
+    for option, value in (plan.train | plan.model).items():
         if option in experiment.varies:
             raise OptionError(f"{option} = {value}: `{name}` varies it; choose by --only, such as {names[0]}")
     return [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]

@@ -314,7 +314,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     type=TRAINING_LAYOUT,
     multiple=True,
     required=True,
-    help="Training layout, such as demo_wide; repeat for several, or all: those that the release has in the split.",
+    help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
 )
 @root_option
 @click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")

@@ -45,7 +45,7 @@ FILTERS = {"teammate_family": "teammate_family", "algorithm": "teammate_kind", "
 
 
 ALL_LAYOUTS = "all"
-"""In place of the names of layouts: all layouts that the release has in the split."""
+"""In place of the names of layouts: all layouts on which the release has histories that pass the other filters."""
 
 
 @dataclass(frozen=True)

@@ -276,7 +276,7 @@ def test_a_size_applies_to_all_entries_and_sweeps_vary_it(release, tmp_path, mon
     (model, options), (_, swept) = seen
     assert (model.layers, model.width, model.encoder, model.positions) == (2, 64, "mlp", "rope")
     assert (options.context, swept.context) == (200, 250)
-    with pytest.raises(OptionError, match=r"layers = 2: `sweep size` varies it; choose by --only, such as small"):
+    with pytest.raises(OptionError, match=r"size = tiny: `sweep size` varies it; choose by --only, such as small"):
         run_experiment("sweep size", plan, tmp_path)
 
 
