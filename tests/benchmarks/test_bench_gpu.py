@@ -130,6 +130,7 @@ def test_models_are_those_of_the_sizes():
         assert context_length(FULL_SIZES, name) == size.context
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["paper", "words", "mlp"])
 def test_learners_lower_for_cuda(encoder):
     """In the sizes that the benchmark has on a GPU; nothing is compiled."""
@@ -140,6 +141,7 @@ def test_learners_lower_for_cuda(encoder):
     assert product_flops(traced.jaxpr) > 1e6 * learner.steps_per_update
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["small/paper/bfloat16", "small/words/float32", "tiny/mlp/bfloat16"])
 def test_training_steps_lower_for_cuda(case):
     """In the sizes that the benchmark has on a GPU; nothing is compiled."""

@@ -47,6 +47,7 @@ def run_part(part: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in result.output.splitlines()]
 
 
+@pytest.mark.slow
 def test_training():
     lines = run_part("train")
     assert [(line["size"], line["way"]) for line in lines] == [("tiny", "published"), ("tiny", "mlp")]

@@ -68,7 +68,7 @@ reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist
 reader: combine {MINI} --out file | 'file' is a file
 reader: release build a b --out c | unexpected extra argument
 reader: upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
-generation: generate --out g --profile smke | unknown profile 'smke'; valid: mini, paper, smoke. Did you mean
+generation: generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, paper, smoke. Did you mean
 generation: generate --out file | 'file' is a file
 generation: generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generation: generate --out g --workers 2 | --address and --workers need --executor ray
@@ -76,7 +76,7 @@ generation: plan --devices 0 | 0 is not in the range x>=1
 generation: speed --layout x | unknown layout 'x'; valid: coord_simple,
 generation: teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
 baselines: train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline.
-baselines: train ad --layout demo_wide --size smal | unknown size 'smal'; valid: small, medium, large.
+baselines: train ad --layout demo_wide --size smal | unknown size 'smal'; valid: tiny, small, medium, large.
 baselines: train ad --layout demo_wide --order rnd | 'rnd' is not one of 'contiguous', 'random'.
 baselines: train ad --layout demo_wide --batch-size 0 | 0 is not in the range x>=1
 baselines: train ad --layout demo_wide --learning-rate nan | nan is not a finite number

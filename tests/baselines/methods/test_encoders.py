@@ -67,7 +67,8 @@ def assert_equal_results(one: Any, two: Any, params: Any) -> None:
     jax.tree.map(compare, gradient, other_gradient)
 
 
-METHODS = ("ad", "dpt", *(pytest.param(name, marks=pytest.mark.slow) for name in ("hybrid_ad", "amago_offline")))
+SLOW_METHODS = (pytest.param(name, marks=pytest.mark.slow) for name in ("dpt", "hybrid_ad", "amago_offline"))
+METHODS = ("ad", *SLOW_METHODS)
 
 
 @pytest.mark.parametrize("name", METHODS)
