@@ -1,8 +1,8 @@
 """Speed of learning, training and evaluation on a GPU: `make bench-gpu`; in tiny sizes on a CPU, to try the command.
 
     device     what the figures were made on
-    product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU, unless told otherwise
-    learner    steps/s of an ego's PPO beside teammate H4: 1,024 environments, the paper's network and minibatches
+    product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
+    learner    steps/s of an ego's PPO with teammate H4: 1,024 environments, the paper's network and minibatches
     train      training step of AD: B = 1024, L = 500 for the paper's small; seconds waited for the loader
     loader     batches/s alone, from the bundled release to the device
     act        the evaluator's steps/s with cached acting, on the tasks of one layout
@@ -48,16 +48,15 @@ from baselines.methods.options import SIZES, ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.training.options import TrainOptions
 from baselines.training.trainer import Trainer
+from benchmarks.bench_learner import heuristic_learner
 from benchmarks.common import print_line
 from benchmarks.flops import compile_measured, device_memory, gib
 from benchmarks.isolated import run_isolated
 from generation.collection.options import request_determinism
-from generation.env import Environment
 from generation.learners.config import EncoderKind, PPOConfig, Widths
 from generation.learners.ego import Learner, compiled_update
 from generation.learners.resume import xla_threads
 from generation.teammates.instances import published_tasks
-from generation.teammates.registry import build_teammate
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -184,7 +183,7 @@ def measure_product(bench: Bench) -> dict[str, Any]:
 
 
 def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
-    """Environment steps/s of complete updates of an ego beside teammate H4."""
+    """Environment steps/s of complete updates of an ego with teammate H4."""
     learner = ego_learner(bench.sizes, encoder)
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
@@ -285,7 +284,7 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     """The evaluator's steps/s with full windows, over all streams (tasks times seeds), and per stream."""
     sizes, context = bench.sizes, context_length(bench.sizes, size)
     layout = get_layout(_LAYOUT)
-    tasks = tasks_beside_h4()[: sizes.tasks]
+    tasks = h4_tasks()[: sizes.tasks]
     method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
     policy = learned(method, method.init(jax.random.key(0)), context, "cached")
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps)
@@ -332,17 +331,16 @@ def measure_attention(bench: Bench) -> dict[str, Any]:
     return facts
 
 
-def tasks_beside_h4() -> list[Task]:
-    """Returns the test tasks beside teammates of family H4, on the layout that everything is measured on."""
+def h4_tasks() -> list[Task]:
+    """Returns the test tasks with teammates of family H4 on the layout of the benchmark."""
     tasks = published_tasks("teammate")
     return [task for task in tasks if task.layout.name == _LAYOUT and task.teammate_family == "H4"]
 
 
 def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
-    """Returns the learner of an ego beside teammate H4, with the paper's network but for the encoder."""
-    task = tasks_beside_h4()[0]
+    """Returns the learner of an ego with teammate H4, with the paper's network except for the kind of encoder."""
     config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
-    return Learner(Environment(task.layout), build_teammate(task.layout, task.teammate, noise="seeded"), config)
+    return heuristic_learner(get_layout(_LAYOUT), config)
 
 
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:

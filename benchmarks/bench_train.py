@@ -51,7 +51,7 @@ _TARGET_RATIO, _TARGET_MINUTES = 20, 6
 
 
 class TrainingPlan(NamedTuple):
-    """What is trained, and for how long.
+    """Settings of a comparison of ways to train.
 
     Attributes:
         encoders: kinds of encoders on state records.

@@ -78,7 +78,7 @@ class Learner:
 
     @cached_property
     def view(self) -> CompactView:
-        """What makes the network's inputs."""
+        """View that converts state records to inputs of the network."""
         return CompactView(self.config.widths.encoder, (self.env.layout,))
 
     @cached_property

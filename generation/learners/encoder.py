@@ -171,7 +171,7 @@ class WindowEncoder(nn.Module):
         pointwise: widths of the 1 x 1 convolutions of kinds `paper` and `words`.
         spatial: widths of their 3 x 3 convolutions.
         normalize: whether ReLU and a layer norm follow the last dense layer, as in learners.
-        view: what makes the compact inputs, if there are any.
+        view: view that makes the compact inputs; None if all inputs are observations.
         dtype: of the arithmetic.
     """
 

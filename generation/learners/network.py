@@ -112,7 +112,7 @@ class ActorCritic(nn.Module):
         partners: number of policies among which the critic distinguishes the partner (BRDiv, Rahman et al. 2023,
             Sec. 5); 0 for a critic without that input. The actor never has it.
         critic: False for policies that only act; their values are 0.
-        view: what makes compact inputs, if there are any.
+        view: view that makes the compact inputs; None if all inputs are observations.
     """
 
     widths: Widths = Widths()

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from generation.env import Environment, EnvState
+from generation.learners.encoder import CompactView
 from generation.learners.network import ActorCritic
 from generation.policy import Policy
-from icrl4aht_data.overcooked.actions import ACTIONS, EGO
-from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.state import swapped
 
 
@@ -179,6 +179,7 @@ def network_player(
         greedy: take the most probable action instead of drawing one; bool (), if compiled code decides it.
     """
     flat, shape = agent_slots.reshape(-1), agent_slots.shape
+    view = network.view or CompactView("paper", (env.layout,))
 
     def forward(params, hidden, seen, partner) -> tuple[Array, Array, Array]:
         one_step = jax.tree.map(lambda leaf: leaf[None], seen)
@@ -189,8 +190,7 @@ def network_player(
         return jnp.zeros((flat.size, network.widths.gru), jnp.float32)
 
     def act(hidden, state: EnvState, key):
-        records = slot_records(state.record, flat)
-        seen = network.view(records) if network.view else observe(env.layout, records, EGO)
+        seen = view(slot_records(state.record, flat))
         hidden, seen = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (hidden, seen))
         apply: Any = jax.vmap(forward) if agent_slots.ndim == 2 else forward
         results = apply(params, hidden, seen, partner)

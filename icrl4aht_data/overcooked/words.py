@@ -57,8 +57,8 @@ class CellWords:
     Attributes:
         layouts: the layouts; their observations have the same channels.
         canonical: whether these are the canonical channels, or the layouts' own.
-        channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, stands for what the
-            rules cannot produce.
+        channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, is the word
+            of contents that the rules cannot produce.
     """
 
     def __init__(self, layouts: Sequence[Layout], canonical: bool = False) -> None:

@@ -30,9 +30,9 @@ from benchmarks.bench_gpu import (
     architecture,
     context_length,
     ego_learner,
+    h4_tasks,
     main,
     measure_training,
-    tasks_beside_h4,
 )
 from benchmarks.flops import product_flops
 from generation.learners.ego import compiled_update
@@ -122,7 +122,7 @@ def test_other_errors_of_training_are_errors(monkeypatch):
 
 
 def test_models_are_those_of_the_sizes():
-    """A size has the values of `train --size`, but for encoder and dtype, which are the case's."""
+    """A case has the values of `train --size`, except for its own encoder and dtype."""
     for name in ("tiny", "small"):
         size = SIZES[name]
         model = architecture(FULL_SIZES, name, "words", "bfloat16")
@@ -160,7 +160,7 @@ def test_training_steps_lower_for_cuda(case):
 
 
 def test_acting_lowers_for_cuda():
-    tasks = tasks_beside_h4()[:2]
+    tasks = h4_tasks()[:2]
     method = ad_method(architecture(SMALL_SIZES, "tiny", "mlp", "float32"), [tasks[0].layout])
     params = jax.eval_shape(method.init, jax.random.key(0))
     mates = [build_teammate(task.layout, task.teammate, TEAMMATE, "seeded") for task in tasks]

@@ -190,7 +190,7 @@ class Population:
 
     @cached_property
     def view(self) -> CompactView:
-        """What makes the network's inputs."""
+        """View that converts state records to inputs of the network."""
         return CompactView(self.config.widths.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
 
     @cached_property
