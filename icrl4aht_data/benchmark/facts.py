@@ -8,17 +8,27 @@ _TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "
 _LAYOUT_LAYOUTS = ("asymm_both", "cramped_up")
 
 TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
-    "teammate": {"train": _TEAMMATE_LAYOUTS, "test": _TEAMMATE_LAYOUTS, "heldout": _TEAMMATE_LAYOUTS},
-    "layout": {"train": _LAYOUT_LAYOUTS, "test": ("asymm_right", "cramped_down"), "heldout": _LAYOUT_LAYOUTS},
+    "teammate": {
+        "train": _TEAMMATE_LAYOUTS,
+        "validation": _TEAMMATE_LAYOUTS,
+        "test": _TEAMMATE_LAYOUTS,
+        "heldout": _TEAMMATE_LAYOUTS,
+    },
+    "layout": {
+        "train": _LAYOUT_LAYOUTS,
+        "validation": _LAYOUT_LAYOUTS,
+        "test": ("asymm_right", "cramped_down"),
+        "heldout": _LAYOUT_LAYOUTS,
+    },
 }
 """Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
 """Every layout of the benchmark, in the paper's order; the position in this tuple enters seeds."""
 
-SPLITS = ("train", "test", "heldout")
-"""Splits of the tasks. `heldout` combines training layouts with learned teammates that are not in `train` (paper, App.
-F)."""
+SPLITS = ("train", "validation", "test", "heldout")
+"""Splits of the tasks. `validation` combines training layouts with heuristic teammates that are neither in `train` nor in
+`test`, for choosing models; `heldout` with learned teammates that are not in `train` (paper, App. F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
 """Families of teammates: "rl" (learned policies) and the heuristics "H1".."H4" (paper, App. B)."""

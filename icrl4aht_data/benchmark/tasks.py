@@ -34,7 +34,7 @@ class Task:
     Args:
         task_id: name of the task, made from the other fields by `task_id`.
         track: "teammate" or "layout".
-        split: "train", "test" or "heldout".
+        split: "train", "validation", "test" or "heldout".
         layout_name: the layout's environment name, as in the published manifests.
         seed: seed of the ego's training.
         teammate: kind, family, theta_id, base_seed and theta. For kind "heuristic", theta contains the parameters; for

@@ -196,7 +196,7 @@ def filter_options(command: Any) -> Any:
     """Add the options that select histories."""
     options = [
         click.option("--layout", multiple=True, type=LAYOUT, help="Only this layout; repeat it for more."),
-        click.option("--split", multiple=True, type=SPLIT, help="Only this split: train, test or heldout."),
+        click.option("--split", multiple=True, type=SPLIT, help="Only this split: train, validation, test or heldout."),
         click.option("--track", multiple=True, type=TRACK, help="Only this track: teammate or layout."),
         click.option(
             "--teammate-family", multiple=True, type=FAMILY, help="Only this family: rl (learned), H1, H2, H3 or H4."

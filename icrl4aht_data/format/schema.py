@@ -160,7 +160,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         obs_shape: (5, 5, C) of one observation.
         action_dim: number of actions.
         track: "teammate" or "layout".
-        split: "train", "test" or "heldout".
+        split: "train", "validation", "test" or "heldout".
         layout: the layout's short name.
         teammate_family: "rl" or "H1".."H4".
         teammate_kind: the algorithm's or the heuristic's name.

@@ -48,7 +48,7 @@ def say(capsys, monkeypatch, tmp_path):
 MISUSED = """
 reader: lst | No such command 'lst'. Did you mean 'list'?
 reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
-reader: list --split tran | unknown split 'tran'; valid: train, test, heldout. Did you mean 'train'?
+reader: list --split tran | unknown split 'tran'; valid: train, validation, test, heldout. Did you mean 'train'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, fcp
 reader: verify --deeep | No such option
