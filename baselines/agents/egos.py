@@ -9,10 +9,10 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from baselines.agents.oracle import oracle
 from baselines.methods.method import Method
 from baselines.methods.tokens import percept_step
 from baselines.training.histories import TrainedModel, read_trained
+from generation.experts.oracle import oracle
 from generation.policy import Policy
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY

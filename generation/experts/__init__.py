@@ -1,0 +1,1 @@
+"""Scripted experts: egos that see the complete state and need no training."""
