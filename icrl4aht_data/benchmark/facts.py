@@ -47,6 +47,9 @@ ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
 KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 """teammate kind -> family, for algorithms and heuristics."""
 
+SOURCES = ("ppo", "noise")
+"""How histories are made: by an ego that learns, or by an expert whose actions are less and less random."""
+
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""
 
