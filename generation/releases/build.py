@@ -12,6 +12,7 @@ from generation.collection.job import CollectionError
 from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
 from generation.populations.build import build_suite
+from generation.populations.headroom import learned_headroom
 from generation.populations.select import THRESHOLD, make_tasks
 from generation.profiles import Profile
 from generation.profiles.work import Work
@@ -90,7 +91,12 @@ def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) 
     if not profile.algorithms:
         return profile.works()
     selections = build_suite(profile, suite, profile.algorithms, seed, console)
-    works = profile.works(make_tasks(suite, selections, "train"))
+    learned = make_tasks(suite, selections, "train")
+    headroom = learned_headroom(learned, suite)
+    for task in learned:
+        if not headroom[task.task_id].matters:
+            console.print(f"{task.task_id}: left out, the ego does not matter: {headroom[task.task_id].describe()}")
+    works = profile.works([task for task in learned if headroom[task.task_id].matters])
     if not works:
         names = dict.fromkeys(chain(*profile.algorithms.values()))
         raise CollectionError(
