@@ -73,18 +73,19 @@ def select_streams(
     return [streams[: chosen.count(learner)] for learner, streams in enumerate(candidates)]
 
 
-def filter_report(before: np.ndarray, after: np.ndarray) -> StreamFilter:
+def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
     """Mean returns at the start and at the end of learning, before the filter and after it.
 
     Args:
         before: (N, E), episode returns of all streams.
         after: (n, E), those of the selected streams.
+        least_improvement: what the selected streams had to improve by.
     """
     sides = []
     for part in (before, after):
         start, end = (round(float(values.mean()), 3) for values in curve_ends(part))
         sides.append(StreamReturns(len(part), start, end))
-    return StreamFilter(before=sides[0], after=sides[1])
+    return StreamFilter(before=sides[0], after=sides[1], least_improvement=least_improvement)
 
 
 def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -> None:

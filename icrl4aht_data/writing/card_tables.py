@@ -7,6 +7,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
 
 from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LABEL_EPISODES, SOURCES, SPLITS
 from icrl4aht_data.benchmark.tasks import Task
@@ -309,3 +312,17 @@ def left_out_table(left_out: Sequence[LeftOutTask]) -> str:
         rows.append([task.layout, task.teammate, task.source, *counts, *returns, task.reason])
     header = ["layout", "teammate", "source", "learners", "streams", "first", "last", "reason"]
     return f"{sentence('left_out')}\n\n{markdown_table(header, rows)}"
+
+
+def print_learning(release: CardContent, console: Console) -> None:
+    """Print how much the histories of a release rise, by layout and source, and what is not in the release."""
+    header, rows = curves_rows(release)
+    table = Table(*header[:4], box=box.MARKDOWN, title="learning")
+    for name in header[4:]:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(*(cell.replace("*", "") for cell in row))
+    console.print(table, width=max(console.width, 30 + 12 * len(header)), crop=False)
+    for task in release.info.left_out:
+        source = f" ({task.source})" if task.source else ""
+        console.print(f"left out: {task.layout} with {task.teammate}{source}: {task.reason}", markup=False)

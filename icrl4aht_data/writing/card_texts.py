@@ -14,7 +14,8 @@ def card_texts(section: str) -> dict[str, str]:
     """Return a section of the file, name -> text.
 
     Args:
-        section: "sentences", "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`) or "index" (fields of `schema.Entry`).
+        section: "sentences", "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`) or "index"
+            (fields of `schema.Entry`).
     """
     return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
 

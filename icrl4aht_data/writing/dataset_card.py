@@ -95,7 +95,7 @@ def render_card(release: CardContent) -> str:
         curves=_figure(release, CURVES_FIGURE, "Learning curves") + curves_table(release),
         teammates=teammates_table(release),
         left_out=left_out_table(info.left_out),
-        labels=labels_table(release),
+        labels=_labels(release),
         layouts=_figure(release, LAYOUTS_FIGURE, layouts_caption) + _layouts_table(release),
         protocol=HEADROOM_PROTOCOL,
         headroom=_figure(release, HEADROOM_FIGURE, "Headroom") + headroom,
@@ -276,6 +276,12 @@ def _smaller_scale(release: CardContent) -> Iterable[str]:
 
 def _figure(release: CardContent, path: str, caption: str) -> str:
     return f"![{caption}]({path})\n\n" if path in release.files else ""
+
+
+def _labels(release: CardContent) -> str:
+    text = labels_table(release)
+    has_oracle = any(entry.has_oracle_actions for entry in release.entries)
+    return f"{text}\n\n{sentence('oracle_labels')}" if has_oracle else text
 
 
 def _labellers(release: CardContent) -> str:
