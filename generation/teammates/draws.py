@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
-from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -24,12 +24,6 @@ from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
 
 DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
 """Table of all draws."""
-
-SAME_BEHAVIOUR = 0.02
-"""Hamming distance below which two teammates count as one behaviour."""
-
-LEAST_HEADROOM = 5.0
-"""Difference of the reference egos' returns from which the ego matters."""
 
 DRAWS_PER_SEED = {0: 32, 1: 8}
 """base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""

@@ -1,0 +1,153 @@
+"""Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
+
+Of drawn teammates the table `teammates/draws.jsonl` has it; others are measured.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from generation.populations.headroom import LearnedHeadroom, learned_headroom
+from generation.teammates.distances import nearest_test
+from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, read_draws
+from generation.teammates.references import REFERENCE_EPISODES, reference_returns
+from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LEAST_HEADROOM, TESTED_ON
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.info import LeftOutTask
+from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+
+_DIGITS = 4
+
+
+class TeammateFacts(NamedTuple):
+    """What is known of a task's teammate.
+
+    Attributes:
+        references: returns of the reference egos with it.
+        nearest: the test teammate that acts most like it; None on layouts without training tasks.
+        matters: whether the ego matters: some ego, or the partner that it was trained with, earns another return.
+    """
+
+    references: ReferenceEgos
+    nearest: NearestTest | None
+    matters: bool
+
+
+def teammate_facts(
+    tasks: Iterable[Task], suite: Path, headroom: Mapping[str, LearnedHeadroom] | None = None
+) -> dict[str, TeammateFacts]:
+    """Look up or measure the teammates of tasks, each once.
+
+    Args:
+        tasks: the tasks.
+        suite: folder of the learned teammates.
+        headroom: task id -> measurements of learned teammates that were made before.
+
+    Returns:
+        task id -> facts.
+    """
+    headroom = headroom or {}
+    groups: dict[tuple[str, str], list[Task]] = {}
+    for task in tasks:
+        groups.setdefault((task.layout.name, json.dumps(task.teammate, sort_keys=True)), []).append(task)
+    draws = {key: find_draw(key[0], members[0].teammate) for key, members in groups.items()}
+    found = {key: _facts_of_draw(draw) for key, draw in draws.items() if draw is not None}
+    for layout in dict.fromkeys(layout for (layout, _), draw in draws.items() if draw is None):
+        keys = [key for key, draw in draws.items() if draw is None and key[0] == layout]
+        chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
+        measured = _measure(get_layout(layout), chosen, suite, headroom)
+        found |= {key: measured[task.task_id] for key, task in zip(keys, chosen, strict=True)}
+    return {task.task_id: found[key] for key, members in groups.items() for task in members}
+
+
+def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
+    """Returns the draw of the table that a teammate entry is, or None."""
+    family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
+    if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
+        return None
+    draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
+    same = draws and _sampled(str(family), draws[0].theta_id, seed)["theta"] == teammate["theta"]
+    return draws[0] if same else None
+
+
+@cache
+def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
+    return sample_teammate(family, theta_id, "train", base_seed)
+
+
+def _facts_of_draw(draw: Draw) -> TeammateFacts:
+    nearest = NearestTest(draw.nearest, draw.distance, draw.behaviour)
+    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), nearest, draw.headroom)
+
+
+def _measure(
+    layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, LearnedHeadroom]
+) -> dict[str, TeammateFacts]:
+    """Measure teammates of one layout. Only learned ones, which no table numbers, get numbers of behaviours here."""
+    learned = [task for task in tasks if task.teammate_family == "rl"]
+    heuristics = [task for task in tasks if task.teammate_family != "rl"]
+    missing = [task for task in learned if task.task_id not in headroom]
+    returns: dict[str, Sequence[float]] = {
+        task.task_id: headroom[task.task_id] for task in learned if task not in missing
+    }
+    returns |= learned_headroom(missing, suite) if missing else {}
+    if heuristics:
+        egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
+        for k, task in enumerate(heuristics):
+            returns[task.task_id] = [float(egos[ego][k]) for ego in ("stay", "random", "oracle")]
+    nearest = _nearest(layout, learned, suite, numbered=True) | _nearest(layout, heuristics, suite, numbered=False)
+    return {
+        task_id: TeammateFacts(
+            ReferenceEgos(*(round(value, _DIGITS) for value in earned[:3]), REFERENCE_EPISODES),
+            nearest.get(task_id),
+            max(earned) - min(earned) >= LEAST_HEADROOM,
+        )
+        for task_id, earned in returns.items()
+    }
+
+
+def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path, *, numbered: bool) -> dict[str, NearestTest]:
+    """task id -> nearest test teammate; nothing on layouts without training tasks."""
+    if not tasks or layout.name not in TESTED_ON:
+        return {}
+    near = nearest_test(layout, [_build(task, suite) for task in tasks])
+    return {
+        task.task_id: NearestTest(found.name, round(found.distance, _DIGITS), found.behaviour if numbered else None)
+        for task, found in zip(tasks, near, strict=True)
+    }
+
+
+def _build(task: Task, suite: Path) -> Any:
+    return build_teammate(task.layout, task.teammate, TEAMMATE, suite=suite)
+
+
+def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
+    """Returns the heuristic families of which no draw may be a training teammate, by layout, with the reasons."""
+    found = []
+    for layout in (layout for layout in layouts if layout in TESTED_ON):
+        hosted = hosted_families(layout)
+        for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
+            draws = read_draws(layout, family)
+            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, _why_unhosted(draws)))
+    return found
+
+
+def _why_unhosted(draws: Sequence[Draw]) -> str:
+    admissible = [draw for draw in draws if draw.admissible]
+    if not admissible:
+        farthest = max((draw.distance for draw in draws), default=0.0)
+        return f"all {len(draws)} draws act like a test teammate (distance {farthest:.3f} at most)"
+    widest = max(
+        max(draw.stay, draw.random, draw.oracle) - min(draw.stay, draw.random, draw.oracle) for draw in admissible
+    )
+    return (
+        f"with none of the {len(admissible)} draws unlike the test does the ego matter (returns differ by {widest:.1f} "
+        f"at most)"
+    )
