@@ -1,6 +1,7 @@
 """Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
 
-Of drawn teammates the table `teammates/draws.jsonl` has it; others are measured.
+Of drawn teammates the table `teammates/draws.jsonl` has it. Others are measured, and the measurements are kept next to
+the artefacts, in hidden files `.<layout>.teammates.json`, and not repeated there.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from generation.learners.resume import software_versions
 from generation.populations.headroom import LearnedHeadroom, learned_headroom
 from generation.teammates.distances import nearest_test
 from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, read_draws
@@ -18,10 +21,12 @@ from generation.teammates.references import EPISODES, reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LEAST_HEADROOM, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
 
 _DIGITS = 4
 
@@ -41,12 +46,13 @@ class TeammateFacts(NamedTuple):
 
 
 def teammate_facts(
-    tasks: Iterable[Task], suite: Path, headroom: Mapping[str, LearnedHeadroom] | None = None
+    tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, LearnedHeadroom] | None = None
 ) -> dict[str, TeammateFacts]:
     """Look up or measure the teammates of tasks, each once.
 
     Args:
         tasks: the tasks.
+        artefacts: folder of their artefacts, where measurements are kept.
         suite: folder of the learned teammates.
         headroom: task id -> measurements of learned teammates that were made before.
 
@@ -62,9 +68,32 @@ def teammate_facts(
     for layout in dict.fromkeys(layout for (layout, _), draw in draws.items() if draw is None):
         keys = [key for key, draw in draws.items() if draw is None and key[0] == layout]
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
-        measured = _measure(get_layout(layout), chosen, suite, headroom)
-        found |= {key: measured[task.task_id] for key, task in zip(keys, chosen, strict=True)}
+        kept, settings = artefacts / f".{layout}.teammates.json", _settings(layout, chosen)
+        measured = _read(kept, settings)
+        if measured is None:
+            by_task = _measure(get_layout(layout), chosen, suite, headroom)
+            measured = [by_task[task.task_id] for task in chosen]
+            with atomic_write(kept) as partial:
+                partial.write_bytes(msgspec.json.encode({"settings": settings, "facts": measured}))
+        found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
+
+
+def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
+    """What measurements depend on."""
+    known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": EPISODES}
+    return software_versions() | {"version": version("icrl4aht-data")} | known
+
+
+def _read(path: Path, settings: dict[str, Any]) -> list[TeammateFacts] | None:
+    """The measurements in a file; None if there are none, or others than these."""
+    try:
+        content = parse_json(read_text(path))
+        if content["settings"] != json.loads(json.dumps(settings)):
+            return None
+        return msgspec.convert(content["facts"], list[TeammateFacts])
+    except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
+        return None
 
 
 def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
