@@ -13,6 +13,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
+import numpy as np
+
 from generation.learners.resume import software_versions
 from generation.populations.headroom import LearnedHeadroom, learned_headroom
 from generation.teammates.distances import nearest_test
@@ -123,9 +126,8 @@ def _measure(
     learned = [task for task in tasks if task.teammate_family == "rl"]
     heuristics = [task for task in tasks if task.teammate_family != "rl"]
     missing = [task for task in learned if task.task_id not in headroom]
-    returns: dict[str, Sequence[float]] = {
-        task.task_id: headroom[task.task_id] for task in learned if task not in missing
-    }
+    known = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
+    returns: dict[str, Sequence[float]] = {**known}
     returns |= learned_headroom(missing, suite) if missing else {}
     if heuristics:
         egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
@@ -148,7 +150,7 @@ def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path, *, numbered: bo
         return {}
     near = nearest_test(layout, [_build(task, suite) for task in tasks])
     return {
-        task.task_id: NearestTest(found.name, round(found.distance, _DIGITS), found.behaviour if numbered else None)
+        task.task_id: NearestTest(found.teammate, round(found.distance, _DIGITS), found.behaviour if numbered else None)
         for task, found in zip(tasks, near, strict=True)
     }
 
@@ -173,9 +175,7 @@ def _why_unhosted(draws: Sequence[Draw]) -> str:
     if not admissible:
         farthest = max((draw.distance for draw in draws), default=0.0)
         return f"all {len(draws)} draws act like a test teammate (distance {farthest:.3f} at most)"
-    widest = max(
-        max(draw.stay, draw.random, draw.oracle) - min(draw.stay, draw.random, draw.oracle) for draw in admissible
-    )
+    widest = max(float(np.ptp([draw.stay, draw.random, draw.oracle])) for draw in admissible)
     return (
         f"with none of the {len(admissible)} draws unlike the test does the ego matter (returns differ by {widest:.1f} "
         f"at most)"

@@ -169,7 +169,8 @@ def test_learning_is_printed(content):
     output = StringIO()
     card_tables.print_learning(content, Console(file=output, width=80))
     text = output.getvalue()
-    assert "with headroom" in text
+    assert "without" in text
+    assert "| demo_wide" in text
     assert "*" not in text
     assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in text
     assert "left out: demo_wide with H4: all 32 draws act like a test teammate" in text
