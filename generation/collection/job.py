@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
+from generation.collection.noise import is_noise_finished, run_noise
 from generation.collection.task import UpdateCallback, run_task
 from generation.collection.task_folder import is_task_finished
 from generation.learners.resume import BusyError
@@ -41,7 +42,7 @@ class Collector(NamedTuple):
 
 def collector(source: str) -> Collector:
     """Returns what makes the histories of a source."""
-    return {"ppo": Collector(run_task, is_task_finished)}[source]
+    return {"ppo": Collector(run_task, is_task_finished), "noise": Collector(run_noise, is_noise_finished)}[source]
 
 
 @dataclass(frozen=True)

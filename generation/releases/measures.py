@@ -20,7 +20,7 @@ from generation.learners.resume import software_versions
 from generation.populations.headroom import LearnedHeadroom, learned_headroom
 from generation.teammates.distances import nearest_test
 from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, read_draws
-from generation.teammates.references import EPISODES, reference_returns
+from generation.teammates.references import REFERENCE_EPISODES, reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LEAST_HEADROOM, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
@@ -116,7 +116,7 @@ def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
 
 def _facts_of_draw(draw: Draw) -> TeammateFacts:
     nearest = NearestTest(draw.nearest, draw.distance, draw.behaviour)
-    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, EPISODES), nearest, draw.headroom)
+    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), nearest, draw.headroom)
 
 
 def _measure(
@@ -136,7 +136,7 @@ def _measure(
     nearest = _nearest(layout, learned, suite, numbered=True) | _nearest(layout, heuristics, suite, numbered=False)
     return {
         task_id: TeammateFacts(
-            ReferenceEgos(*(round(value, _DIGITS) for value in earned[:3]), EPISODES),
+            ReferenceEgos(*(round(value, _DIGITS) for value in earned[:3]), REFERENCE_EPISODES),
             nearest.get(task_id),
             max(earned) - min(earned) >= LEAST_HEADROOM,
         )
