@@ -12,8 +12,8 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.errors import NotStoredError, unknown
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
-from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import INFO, PROVENANCE, TASKS
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import INFO, TASKS
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Labels, Obs
@@ -125,10 +125,6 @@ class Dataset(Selection):
     def _tasks(self) -> dict[str, Task]:
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
-    @cached_property
-    def _provenance(self) -> dict[str, Provenance]:
-        return read_provenance(self.origin.file(PROVENANCE))
-
     def recover_environment(self, history_id: int) -> dict[str, Any]:
         """Return the parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
 
@@ -166,7 +162,7 @@ class Dataset(Selection):
             )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        provenance = self._provenance.get(entry.task_id, Provenance())
+        provenance = self.provenance.get(entry.task_id, Provenance())
         return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:

@@ -12,7 +12,8 @@ import numpy as np
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, Entry
+from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import LABELS, OBS, History, Obs
@@ -160,6 +161,11 @@ class Selection:
     def info(self) -> ReleaseInfo:
         """The release's versions, kind, environment and totals, as in meta/info.json."""
         return self.index.info
+
+    @cached_property
+    def provenance(self) -> dict[str, Provenance]:
+        """How the histories of each task of the release were made, as in meta/provenance.json: task id -> record."""
+        return read_provenance(self.origin.file(PROVENANCE))
 
     @property
     def has_states(self) -> bool:

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, Unpack
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, OptionError, WeakLabelsWarning, unknown
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import are_labels_weak
 from icrl4aht_data.reading.history import LABELS, Labels
 from icrl4aht_data.reading.selection import Selection
@@ -79,8 +80,8 @@ class DPTSampler(Sampler[DPTBatch]):
             `process_count`.
 
     Warns:
-        WeakLabelsWarning: for tasks whose expert actions come from a policy that earns less than half of what their
-            histories earn at the end, as far as the release says what it earns.
+        WeakLabelsWarning: for tasks whose labels are actions of a policy, or of the oracle, that earns less than half
+            of what their histories earn at the end, as far as the release says what it earns.
 
     Raises:
         LabelsMissingError: if a history does not have these labels; says which labels the selection has.
@@ -110,8 +111,7 @@ class DPTSampler(Sampler[DPTBatch]):
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
         self.order: ContextOrder = order
-        if labels == "expert":
-            _warn_of_weak_labels(dataset)
+        _warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
         excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
@@ -249,27 +249,33 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
 _NAMED = 5  # tasks that a warning names
 
 
-def _warn_of_weak_labels(dataset: Selection) -> None:
+def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     """Warn of tasks whose labels come from a policy that earns less than half of what their histories earn at the end.
 
     The end is the mean of `return_end` over a task's selected histories, see `schema.are_labels_weak`.
     """
     codes, first, task = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     ends = np.bincount(task, dataset.column("return_end")) / np.bincount(task)
-    greedy, sampled = (dataset.column(name)[first] for name in ("expert_return", "expert_return_sampled"))
-    weak = np.flatnonzero(are_labels_weak(greedy, ends))
+    values = dataset.index.values("task_id")
+    names = [values[code] for code in codes.tolist()]
+    if labels == "expert":
+        earned, sampled = (dataset.column(name)[first] for name in ("expert_return", "expert_return_sampled"))
+        texts = [f"labels {one:.1f}, sampled {other:.1f}" for one, other in zip(earned, sampled, strict=True)]
+        advice = "leave these tasks out by min_expert_return, or select by ds.column('expert_return')"
+    else:
+        references = [(dataset.provenance.get(name) or Provenance()).references for name in names]
+        earned = np.array([np.nan if one is None else one.oracle for one in references])
+        texts = [f"labels {one:.1f}" for one in earned]
+        advice = "leave these tasks out, or take expert as labels"
+    weak = np.flatnonzero(are_labels_weak(earned, ends))
     if not len(weak):
         return
-    names = dataset.index.values("task_id")
-    named = ", ".join(
-        f"{names[codes[k]]} (labels {greedy[k]:.1f}, sampled {sampled[k]:.1f}, histories {ends[k]:.1f})"
-        for k in weak[:_NAMED].tolist()
-    )
+    named = ", ".join(f"{names[k]} ({texts[k]}, histories {ends[k]:.1f})" for k in weak[:_NAMED].tolist())
     more = f" and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
+    player = "a policy that earns, acting greedily," if labels == "expert" else "the oracle, which earns"
     warnings.warn(
-        f"the expert actions of {len(weak)} of {len(codes)} tasks come from a policy that earns, acting greedily, less "
-        f"than half of what their histories earn at the end: {named}{more}. A model would learn to play worse than its "
-        f"contexts: leave these tasks out by min_expert_return, or select by ds.column('expert_return')",
+        f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} less than half of what their "
+        f"histories earn at the end: {named}{more}. A model would learn to play worse than its contexts: {advice}",
         WeakLabelsWarning,
         stacklevel=4,  # the call of Dataset.dpt
     )
