@@ -148,11 +148,13 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
 
 def _validation_part(release: Dataset, chosen: Dataset, histories: HistoryOptions) -> Dataset | None:
     """Returns the histories of split validation on the chosen layouts that pass the filters, if there are any."""
-    wanted = {"split": (VALIDATION,), "layout": tuple(layout.name for layout in chosen.layouts)}
-    filters = {FILTERS[name]: values for name, values in histories.filters.items()}
-    passing = [np.isin(release.column(name), values) for name, values in (wanted | filters).items()]
-    ids = release.ids[np.logical_and.reduce(passing)]
-    return release.select(ids) if len(ids) and histories.split != VALIDATION else None
+    if histories.split == VALIDATION:
+        return None
+    filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
+    try:
+        return release.filter(split=VALIDATION, layout=[layout.name for layout in chosen.layouts], **filters)
+    except EmptySelectionError:
+        return None
 
 
 def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
