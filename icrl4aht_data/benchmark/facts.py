@@ -47,6 +47,10 @@ ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
 KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 """teammate kind -> family, for algorithms and heuristics."""
 
+SOURCES = ("ppo", "noise")
+"""How generated histories are made: by an ego that learns with PPO, or by a script whose actions are replaced by random
+ones, ever more rarely (noise distillation, Zisman et al. 2024). Releases may name others."""
+
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""
 
