@@ -239,10 +239,10 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     if has[labels].any():
         sources = " and ".join(sorted(set(dataset.column("source")[has[labels]].tolist())))
         choices.append(f"choose the {total - len(missing)} with {labels} actions (source {sources})")
-    counts = " and ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS)
+    others = " and ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS if name != labels)
     raise LabelsMissingError(
         f"labels = {labels}: {len(missing)} of {total} histories have no {labels} actions (first: history "
-        f"{dataset.ids[missing[0]]}); {counts}: {', or '.join(choices)}"
+        f"{dataset.ids[missing[0]]}), {others}: {', or '.join(choices)}"
     )
 
 
