@@ -218,10 +218,11 @@ def _sampler(
     order: ContextOrder,
     labels: Labels | None,
 ) -> Any:
-    shortest = int(dataset.column("T").min())
-    if options.context > shortest:
+    lengths = dataset.column("T")
+    if options.context > lengths.min():
         raise OptionError(
-            f"context = {options.context}: the shortest history of {dataset!r} has {shortest} steps; take fewer"
+            f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
+            + _longer_source(dataset, options.context)
         )
     shared: Any = {
         "batch_size": options.batch_size,
@@ -234,6 +235,13 @@ def _sampler(
         return dataset.ad(length=options.context, **shared)
     assert labels is not None
     return dataset.dpt(context=options.context, order=order, labels=labels, **shared)
+
+
+def _longer_source(dataset: Dataset, context: int) -> str:
+    """Returns the advice to choose a source whose histories all have so many steps, if there is one."""
+    lengths, sources = dataset.column("T"), dataset.column("source")
+    longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
+    return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""
 
 
 class LayoutNumbers:

@@ -41,6 +41,7 @@ def two_source_release(
     layouts: tuple[str, ...] = ("demo_wide", "coord_simple"),
     *,
     tasks: int = 2,
+    ppo_episodes: int = EPISODES,
     oracle: bool = True,
     seed: int = 0,
     **options: Any,
@@ -58,7 +59,8 @@ def two_source_release(
         names = itertools.product(range(2), range(2)) if source == "ppo" else ((0, number) for number in range(3))
         histories = []
         for learner, stream in names:
-            arrays = random_history(get_layout(task.layout_name), EPISODES, LENGTH, rng)
+            episodes = ppo_episodes if source == "ppo" else EPISODES
+            arrays = random_history(get_layout(task.layout_name), episodes, LENGTH, rng)
             arrays["oracle_actions"] = _oracle_actions(arrays["actions"], rng)
             if source == "noise":
                 arrays["expert_actions"] = arrays["oracle_actions"]
@@ -88,7 +90,7 @@ def _tasks(layouts: tuple[str, ...], tasks: int) -> Iterator[tuple[Task, str]]:
 
 def _oracle_actions(actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Actions of which the chance to be those that were taken rises from 0 to 1 over the episodes."""
-    chance = np.repeat(np.linspace(1.0, 0.0, EPISODES), LENGTH)
+    chance = np.repeat(np.linspace(1.0, 0.0, len(actions) // LENGTH), LENGTH)
     return np.where(rng.random(len(actions)) < chance, rng.integers(0, 6, len(actions)), actions)
 
 

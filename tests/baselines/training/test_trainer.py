@@ -41,6 +41,7 @@ from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, Option
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start
+from tests.helpers.two_sources import two_source_release
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -347,6 +348,10 @@ class TestHeldOut:
                 OptionError, match=r"context = 121: the shortest history of .* has 120 steps; take fewer"
             ):
                 prepare(name, MODEL, long, HistoryOptions(("demo_wide",), str(lite[0])))
+        two_source_release(tmp_path / "both", layouts=("demo_wide",), ppo_episodes=7)
+        mixed = HistoryOptions(("demo_wide",), str(tmp_path / "both"))
+        with pytest.raises(OptionError, match=r"has 120 steps; take fewer, or choose --source ppo, whose"):
+            prepare("ad", MODEL, long, mixed)
         two = HistoryOptions(("demo_wide", "coord_simple"), str(lite[0]), channels="own")
         with pytest.raises(OptionError, match=r"channels = own: .* coord_simple, demo_wide .*: leave out --channels"):
             prepare("ad", MODEL, OPTIONS, two)

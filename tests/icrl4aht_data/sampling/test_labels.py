@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from tests.helpers.random_releases import random_release
 from tests.helpers.two_sources import two_source_release
 from tests.servers.common import http_server
 
-OPTIONS = {"batch_size": 16, "context": 9, "seed": 4}
+OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
 
 
 @pytest.fixture
