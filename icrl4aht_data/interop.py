@@ -141,8 +141,8 @@ def hf_episodes(dataset: Selection) -> datasets.Dataset:
 def _episodes(dataset: Selection) -> Iterator[dict[str, Any]]:
     for history in dataset:
         entry = history.entry
-        names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
-        arrays = {name: history.read(name) for name in (*names, "rewards", "dones", "state")}
+        present = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
+        arrays = {name: history.read(name) for name in (*present, "rewards", "dones", "state")}
         ends = np.flatnonzero(arrays.pop("dones")) + 1
         for episode, (start, stop) in enumerate(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)):
             part = {name: array[start:stop] for name, array in arrays.items()}
