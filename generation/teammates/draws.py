@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
-from icrl4aht_data.benchmark.facts import TESTED_ON
+from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
@@ -31,6 +32,9 @@ LEAST_HEADROOM = 5.0
 
 DRAWS_PER_SEED = {0: 32, 1: 8}
 """base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""
+
+
+_VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
 
 
 class Draw(NamedTuple):
@@ -124,6 +128,20 @@ def drawn_teammates(
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     return [(sample_teammate(draw.family, draw.theta_id, "train", base_seed), draw) for draw in turns[:count]]
+
+
+def validation_tasks(track: str) -> list[Task]:
+    """Tasks of the split `validation`, for choosing models: up to four teammates of each training layout, of seed 1.
+
+    Layouts on which every draw of that seed acts like a test instance have none.
+    """
+    tasks = []
+    for layout in TRACKS[track]["validation"]:
+        families = hosted_families(layout, _VALIDATION_SEED)
+        count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
+        chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)
+        tasks += [make_task(track, "validation", layout, teammate, seed=0) for teammate, _ in chosen]
+    return tasks
 
 
 def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
