@@ -293,7 +293,8 @@ class HistorySplit(NamedTuple):
 def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the tasks, and of every other task a share of its histories; at least one each.
 
-    The choice depends on names and the seed alone: adding histories does not move the others between parts.
+    The histories of tasks with one only are trained on. The choice depends on names and the seed alone: adding
+    histories does not move the others between parts.
 
     Args:
         dataset: the histories to divide.
@@ -303,7 +304,7 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
             then, and no task of `dataset` is held out.
 
     Raises:
-        OptionError: if the share is not between 0 and 1, or a task has one history only.
+        OptionError: if the share is not between 0 and 1, or every task has one history only.
     """
     if not 0 < share < 1:
         raise OptionError(f"share = {share}: expected a number between 0 and 1")
@@ -313,11 +314,13 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     streams, held = _stream_names(dataset), np.zeros(len(dataset), bool)
     for code in tasks[len(held_tasks) :]:
         rows = sorted(np.flatnonzero(codes == code), key=lambda row: _rank(seed, names[code], *streams[row]))
-        if len(rows) < 2:
-            raise OptionError(
-                f"task {names[code]} has one history: expected two or more, one to train on and one to hold out"
-            )
-        held[rows[: _count(share, len(rows))]] = True
+        if len(rows) > 1:
+            held[rows[: _count(share, len(rows))]] = True
+    if not held.any():
+        raise OptionError(
+            f"every task of {dataset!r} has one history: expected a task with two or more, one to train on and one to "
+            f"hold out"
+        )
     in_held_task = np.isin(codes, held_tasks)
     return HistorySplit(
         train=dataset.select(~held & ~in_held_task),

@@ -49,9 +49,8 @@ def two_source_release(
     """Write a release with `tasks` tasks of each of `PARTS` on each layout; returns the written arrays by history id.
 
     A task of source ppo has two learners with two histories each, of `ppo_episodes` episodes, a task of source noise
-    three histories. States and
-    rewards are those of random play by the rules: nobody learns. `oracle=False` leaves out the oracle actions; other
-    options are those of `write_release`.
+    three histories. States and rewards are those of random play by the rules: nobody learns. `oracle=False` leaves out
+    the oracle actions; other options are those of `write_release`.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}

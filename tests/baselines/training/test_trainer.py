@@ -280,6 +280,14 @@ class TestHeldOut:
         own = job(split="validation")
         assert own["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
 
+    def test_tasks_with_one_history_are_trained_on(self, two_sources):
+        dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
+        split = hold_out(dataset[3:8], validation=dataset[:1])  # one history of the first task, four of the second
+        assert split.train.ids.tolist()[0] == dataset.ids[3]
+        assert (len(split.train), len(split.histories)) == (4, 1)
+        with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
+            hold_out(dataset[3:5])
+
     def test_streams_of_two_learners_are_told_apart(self, two_sources):
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
         first = [entry.history_id for entry in hold_out(dataset, 0.5).histories.entries]
