@@ -106,8 +106,8 @@ def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
     for sources in models:
         config = _trained(sources)["config"]
         channels = config["histories"].get("channels", "own")  # models of earlier versions have a layout's own
-        sources = sorted({cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell})
-        data = {"sources of histories": ", ".join(sources), "labels": config["histories"].get("labels")}
+        made_by = sorted({cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell})
+        data = {"sources of histories": ", ".join(made_by), "labels": config["histories"].get("labels")}
         settings = {**config["model"], **config["train"], "channels": channels}
         settings |= {name: value for name, value in data.items() if value}
         tested_on.setdefault(_bullets(settings), []).extend(sources)

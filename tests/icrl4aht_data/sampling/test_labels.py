@@ -88,12 +88,13 @@ def test_in_loaders_of_other_libraries(sampler):
 def test_hugging_face_has_both_labels(two_sources, lite):
     root, written = two_sources
     dataset = load_icrl4aht(root).select([3, 4])
-    rows = list(hf_episodes(dataset))
+    rows: Any = list(hf_episodes(dataset))
     for name in ("expert_actions", "oracle_actions"):
         found = np.concatenate([row[name] for row in rows if row["history_id"] == 3])
         np.testing.assert_array_equal(found, written[3][name])
     assert hf_index(dataset)["has_oracle_actions"] == [True, True]
-    assert next(iter(hf_episodes(load_icrl4aht(lite[0])[:1])))["oracle_actions"] is None
+    first: Any = next(iter(hf_episodes(load_icrl4aht(lite[0])[:1])))
+    assert first["oracle_actions"] is None
 
 
 def test_arrays_by_name(two_sources):
