@@ -12,9 +12,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, OptionError
+from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, OptionError, RemoteError
 from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, read_provenance
@@ -108,6 +109,24 @@ def test_verification_says_what_it_believes(mixed, lite_mixed):
         "nearest test teammates, of 2 tasks",
         "noise schedules, of 1 tasks",
     ]
+
+
+def test_a_remote_is_read_chunk_by_chunk(lite_mixed, tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
+    monkeypatch.setattr(MemoryFileSystem, "store", {})
+    memory = MemoryFileSystem()
+    memory.put(str(lite_mixed), "/mixed", recursive=True)
+    local, remote = load_icrl4aht(lite_mixed), load_icrl4aht("memory://mixed", source="ppo")
+    assert [history.entry for history in remote] == list(local.entries[2:])
+    np.testing.assert_array_equal(remote[3].read("oracle_actions", 7, 60), local[5].read("oracle_actions", 7, 60))
+    assert not list((remote.root / "data").rglob("*.h5")), "no shard was downloaded"
+    data = bytearray(memory.cat(f"/mixed/{SHARD}"))
+    shard = Shards(local.origin, local.index).open(SHARD)
+    row = next(row for row, history, field in shard.chunks() if (history, field.name) == (2, "oracle_actions"))
+    data[shard.table["offset"][row]] ^= 1
+    memory.pipe(f"/mixed/{SHARD}", bytes(data))
+    with pytest.raises(RemoteError, match=r"bytes \d+\.\.\d+: expected crc32"):
+        load_icrl4aht("memory://mixed")[2].read("oracle_actions")
 
 
 def test_a_bit_flip_in_the_oracle_actions_is_found(mixed, tmp_path):
