@@ -1,10 +1,10 @@
 """Hamming distances of policies: the share of common states on which two of them act differently (paper, App. "Teammate
 Policy Diversity Analysis").
 
-The common states of a heuristic family on a layout are those of 20 episodes of 100 steps with its five test instances:
-each plays four episodes, two with a random ego and two with the scripted ego `oracle`. A teammate's distance to a test
-instance is measured on the states of that instance's family. On asymm_both and cramped_up, which have no test tasks,
-the instances are those of the layout that their models are tested on, acting on the training layout.
+The common states of a heuristic family on a layout are those of 20 episodes of 100 steps with each of its five test
+instances, ten with a random ego and ten with the scripted ego `oracle`. A teammate's distance to a test instance is
+measured on the states of that instance's family. On asymm_both and cramped_up, which have no test tasks, the instances
+are those of the layout that their models are tested on, acting on the training layout.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
-_EPISODES = 2
+_EPISODES = 10
 """Episodes of each test instance with each of the two egos."""
 
 _SEED = 5
