@@ -84,7 +84,7 @@ def teammate_facts(
 
 def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
     """What measurements depend on."""
-    known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": EPISODES}
+    known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": REFERENCE_EPISODES}
     return software_versions() | {"version": version("icrl4aht-data")} | known
 
 
