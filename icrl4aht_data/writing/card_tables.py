@@ -185,7 +185,12 @@ def behaviours_in_words(mates: Sequence[CardTeammate]) -> str:
             own.setdefault(mate.split, set()).add((mate.layout, mate.family, mate.nearest.behaviour))
             counts[mate.split] = counts.get(mate.split, 0) + 1
     texts = [
-        sentence("behaviours", split=split, teammates=counts[split], behaviours=len(own[split]))
+        sentence(
+            "behaviours",
+            split=split,
+            teammates=count_in_words(counts[split], "numbered teammate"),
+            behaviours=count_in_words(len(own[split]), "different behaviour"),
+        )
         for split in SPLITS
         if split in own
     ]

@@ -119,7 +119,7 @@ def test_filter_by_what_the_labels_earn(measured):
 
 def test_a_history_names_what_its_labels_earn(measured):
     dataset = load_icrl4aht(measured)
-    assert "labels 9.5)" in repr(dataset[0])
+    assert "labels 9.5, source ppo)" in repr(dataset[0])
     assert "labels -30.0, source search)" in repr(dataset[4])
     assert "labels" not in repr(dataset[6])
 
