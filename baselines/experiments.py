@@ -30,7 +30,7 @@ from baselines.report.summary import REPORT_BEGINS, write_report
 from baselines.training.histories import TrainingTask, filter_histories, prepare
 from baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from baselines.training.trainer import train
-from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -42,11 +42,6 @@ from icrl4aht_data.utils.new_file import check_new_files
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""
-
-TESTED_ON = {layout: layout for layout in TRACKS["teammate"]["train"]} | dict(
-    zip(TRACKS["layout"]["train"], TRACKS["layout"]["test"], strict=True)
-)
-"""Training layout -> the layout that its models are tested on (paper, Sec. 5.1 and 5.2)."""
 
 
 @dataclass(frozen=True)

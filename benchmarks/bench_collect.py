@@ -31,9 +31,10 @@ from generation.collection.task import make_learner, run_task
 from generation.collection.task_folder import last_timing
 from generation.learners.config import Widths
 from generation.profiles import Profile, load_profile
+from generation.profiles.work import Work
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
-from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.provenance import Provenance
@@ -57,16 +58,16 @@ class _EnoughError(Exception):
 
 def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
     """Timing of a collection of the profile's last heuristic task after a number of updates."""
-    task = _task(profile)
+    work = _work(profile)
 
     def report(update: int, metrics: dict[str, float]) -> None:
         if update + 1 == updates:
             raise _EnoughError
 
     with tempfile.TemporaryDirectory() as folder:
-        artefact = Path(folder) / task.task_id
+        artefact = Path(folder) / work.name
         with suppress(_EnoughError):
-            run_task(task, profile, artefact, report, save_seconds=save_seconds)
+            run_task(work, profile, artefact, report, save_seconds=save_seconds)
         return last_timing(artefact) or {}
 
 
@@ -102,7 +103,7 @@ def collection_memory(updates: int) -> dict[str, Any]:
 def learn_only(updates: int) -> float:
     """Peak MiB of a process that only learns."""
     profile = _wide()
-    learner = make_learner(_task(profile), profile)
+    learner = make_learner(_work(profile).task, profile)
     state, update = jax.jit(learner.init)(jax.random.key(0)), jax.jit(learner.update, donate_argnums=0)
     for _ in range(updates):
         state, *_ = jax.block_until_ready(update(state))
@@ -115,9 +116,9 @@ def learn_and_record(updates: int) -> float:
     return peak_memory()
 
 
-def _task(profile: Profile) -> Task:
-    """A task with a teammate that needs no training."""
-    return replace(profile, presets=("default",)).heuristic_tasks()[-1]
+def _work(profile: Profile) -> Work:
+    """The first learner of a task with a teammate that needs no training."""
+    return replace(profile, presets=("default",)).works()[-1]
 
 
 def _wide() -> Profile:

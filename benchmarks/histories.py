@@ -34,5 +34,6 @@ def _rotated(source: Dataset, histories: int) -> Iterator[NewHistory]:
         arrays = {
             field.name: np.roll(history.read(field.name), episodes * (kept if field.axis == "T" else 1), axis=0)
             for field in held_fields("lite")
+            if history.entry.has(field)
         }
         yield NewHistory(number, arrays)

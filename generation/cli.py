@@ -140,7 +140,7 @@ def generate(
     nothing is packed, and the exit code is 1. Hyper-parameters of the egos replace those of the profile.
     """
     from generation.releases.build import build_releases
-    from generation.releases.package import bundle_release
+    from generation.releases.package import bundle_release, recorded_sources
 
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
@@ -152,7 +152,8 @@ def generate(
         allocate_gpu_memory_on_demand()
     profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
     tasks = read_tasks(task_file) if task_file else None
-    built = build_releases(profile, out, kind, console, options, suite, seed, tasks)
+    sources = recorded_sources(task_file.parent.parent) if task_file else {}
+    built = build_releases(profile, out, kind, console, options, suite, seed, tasks, sources)
     releases = dict(zip(kind, built, strict=True))
     for release in releases.values():
         console.print(f"release: {release}")
@@ -235,7 +236,7 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 
     name = get_layout(layout).name
     profile = _profile_with_threads(profile_name, None).with_ego(ego)
-    measured = learner_speed(task_learner(replace(profile, layouts=(name,)), profile.ego))
+    measured = learner_speed(task_learner(profile, profile.ego_on(name), name))
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
@@ -43,17 +44,16 @@ class ProgressBoard:
 
     Args:
         console: where to show it.
-        tasks: number of tasks.
-        updates: number of updates of each task.
+        updates: name of each task's artefact -> number of its updates.
         options: of `LineProgress`.
     """
 
-    def __init__(self, console: Console, tasks: int, updates: int, **options: Any) -> None:
+    def __init__(self, console: Console, updates: Mapping[str, int], **options: Any) -> None:
         self._bars = progress_bars(console, **options)
-        self._tasks, self._updates = tasks, updates
-        self._done = 0
+        self._updates = dict(updates)
+        self._done, self._done_updates = 0, 0
         self._running: dict[str, tuple[TaskID, int, float]] = {}
-        self._all = self._bars.add_task("all tasks", total=tasks * updates, note="", unit="updates")
+        self._all = self._bars.add_task("all tasks", total=sum(self._updates.values()), note="", unit="updates")
         self._shows_single = console.is_terminal
         self._show()
 
@@ -71,7 +71,7 @@ class ProgressBoard:
         if task_id in self._running:
             bar = self._running[task_id][0]
         else:
-            bar = self._bars.add_task(task_id, total=self._updates, note="", visible=self._shows_single)
+            bar = self._bars.add_task(task_id, total=self._updates[task_id], note="", visible=self._shows_single)
         self._running[task_id] = bar, updates, steps_per_second
         self._bars.update(bar, completed=updates, note=f"{steps_per_second:,.0f} steps/s")
         self._show()
@@ -82,6 +82,7 @@ class ProgressBoard:
         if bar is not None:
             self._bars.remove_task(bar[0])
         self._done += 1
+        self._done_updates += self._updates[task_id]
         self._show()
 
     def print_lines(self) -> None:
@@ -90,6 +91,6 @@ class ProgressBoard:
 
     def _show(self) -> None:
         speed = sum(speed for _, _, speed in self._running.values())
-        completed = self._done * self._updates + sum(updates for _, updates, _ in self._running.values())
-        note = f"{self._done}/{self._tasks} tasks" + (f", {speed:,.0f} steps/s" if speed else "")
+        completed = self._done_updates + sum(updates for _, updates, _ in self._running.values())
+        note = f"{self._done}/{len(self._updates)} tasks" + (f", {speed:,.0f} steps/s" if speed else "")
         self._bars.update(self._all, completed=completed, note=note)

@@ -53,8 +53,8 @@ def load_icrl4aht(
         root: a release folder, or an address: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://..., or any
             other that fsspec opens; the bundled mini release by default. Opening a remote release downloads its index,
             everything else is downloaded when it is read.
-        split: "train", "validation", "test" or "heldout". This and each of the following filters is one value, a sequence of values,
-            or None for any.
+        split: "train", "validation", "test" or "heldout". This and each of the following filters is one value, a
+            sequence of values, or None for any.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
         track: what the test tasks vary: "teammate" or "layout".
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).

@@ -1,4 +1,4 @@
-"""failed.jsonl: the tasks of a rebuild that failed, and why."""
+"""failed.jsonl: the units of work of a rebuild that failed, and why; `task_id` is the name of the artefact."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ class FailureLog:
     def add(self, outcome: TaskOutcome) -> None:
         """Add a task's line, or replace the one of an earlier attempt."""
         line = {
-            "task_id": outcome.task.task_id,
+            "task_id": outcome.work.name,
             "attempts": outcome.attempts,
             "error": outcome.error,
             "traceback": outcome.trace,
         }
         self._change(lambda lines: [*(old for old in lines if old["task_id"] != line["task_id"]), line])
 
-    def forget(self, task_ids: Iterable[str]) -> None:
+    def forget(self, names: Iterable[str]) -> None:
         """Remove the lines of tasks that are finished."""
-        finished = set(task_ids)
+        finished = set(names)
         self._change(lambda lines: [line for line in lines if line["task_id"] not in finished])
 
     def _change(self, change: Callable[[list[dict]], list[dict]]) -> None:

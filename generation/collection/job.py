@@ -1,15 +1,17 @@
-"""The job that every executor runs for a task, and its outcome."""
+"""The job that every executor runs for a unit of work, and its outcome."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple, Protocol
 
+from generation.collection.noise import is_noise_finished, run_noise
 from generation.collection.task import UpdateCallback, run_task
+from generation.collection.task_folder import is_task_finished
 from generation.learners.resume import BusyError
 from generation.profiles import Profile
-from icrl4aht_data.benchmark.tasks import Task
+from generation.profiles.work import Work
 from icrl4aht_data.errors import Icrl4ahtError
 
 
@@ -17,19 +19,45 @@ class CollectionError(Icrl4ahtError):
     """Some tasks have no finished artefact."""
 
 
+class Run(Protocol):
+    """Makes an artefact, see `task.run_task`."""
+
+    def __call__(
+        self, work: Work, profile: Profile, folder: Path, on_update: UpdateCallback, *, suite: Path | None, wait: bool
+    ) -> bool: ...
+
+
+class IsFinished(Protocol):
+    """Returns whether a folder has the artefact, see `task_folder.is_task_finished`."""
+
+    def __call__(self, folder: Path, work: Work, profile: Profile) -> bool: ...
+
+
+class Collector(NamedTuple):
+    """What makes the histories of one source."""
+
+    run: Run
+    is_finished: IsFinished
+
+
+def collector(source: str) -> Collector:
+    """Returns what makes the histories of a source."""
+    return {"ppo": Collector(run_task, is_task_finished), "noise": Collector(run_noise, is_noise_finished)}[source]
+
+
 @dataclass(frozen=True)
 class TaskOutcome:
-    """Result of a task.
+    """Result of a unit of work.
 
     Attributes:
-        task: the task.
+        work: the unit.
         status: "done", now or before; "busy", another collector works on it; "failed".
         attempts: how often it was tried.
         error: type and message of the last error.
         trace: its traceback.
     """
 
-    task: Task
+    work: Work
     status: Literal["done", "busy", "failed"]
     attempts: int = 1
     error: str = ""
@@ -38,7 +66,7 @@ class TaskOutcome:
 
 @dataclass(frozen=True)
 class CollectionJob:
-    """Collects single tasks; it is called in this process or in a worker's.
+    """Collects single units of work; it is called in this process or in a worker's.
 
     Attributes:
         profile: the profile of all tasks.
@@ -52,13 +80,18 @@ class CollectionJob:
     suite: Path | None
     wait: bool
 
-    def folder(self, task: Task) -> Path:
-        """Folder of a task's artefact."""
-        return self.artefacts / task.task_id
+    def folder(self, work: Work) -> Path:
+        """Folder of the artefact."""
+        return self.artefacts / work.name
 
-    def __call__(self, task: Task, on_update: UpdateCallback = lambda update, metrics: None) -> Literal["done", "busy"]:
+    def is_finished(self, work: Work) -> bool:
+        """Whether the artefact is complete and unchanged."""
+        return collector(work.source).is_finished(self.folder(work), work, self.profile)
+
+    def __call__(self, work: Work, on_update: UpdateCallback = lambda update, metrics: None) -> Literal["done", "busy"]:
         try:
-            run_task(task, self.profile, self.folder(task), on_update, suite=self.suite, wait=self.wait)
+            run = collector(work.source).run
+            run(work, self.profile, self.folder(work), on_update, suite=self.suite, wait=self.wait)
         except BusyError:
             return "busy"
         return "done"

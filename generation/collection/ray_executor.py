@@ -17,8 +17,8 @@ from generation.collection.job import CollectionJob, TaskOutcome
 from generation.collection.options import CollectOptions, request_determinism
 from generation.collection.task_folder import last_timing
 from generation.learners.resume import limit_xla_threads
+from generation.profiles.work import Work
 from generation.progress import ProgressBoard
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 
 _POLL_SECONDS = 1.0
@@ -27,7 +27,7 @@ _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the d
 
 
 def run_on_ray(
-    job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs tasks as workers are free. The artefacts' folder must be shared by all machines.
 
@@ -45,7 +45,7 @@ def run_on_ray(
             max_retries=options.retries,
             retry_exceptions=True,
         )(_work)
-        pending = {remote.remote(job, task): task for task in tasks}
+        pending = {remote.remote(job, work): work for work in tasks}
         try:
             while pending:
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
@@ -57,27 +57,27 @@ def run_on_ray(
                 ray.cancel(reference, force=True)
 
 
-def _show_progress(job: CollectionJob, tasks: Iterable[Task], board: ProgressBoard) -> None:
-    for task in tasks:  # workers report through their artefacts' timing files
-        timing = last_timing(job.folder(task))
+def _show_progress(job: CollectionJob, tasks: Iterable[Work], board: ProgressBoard) -> None:
+    for work in tasks:  # workers report through their artefacts' timing files
+        timing = last_timing(job.folder(work))
         if timing:
-            board.show_running(task.task_id, int(timing["update"]) + 1, timing["steps_per_second"])
+            board.show_running(work.name, int(timing["update"]) + 1, timing["steps_per_second"])
 
 
-def _work(job: CollectionJob, task: Task) -> str:
+def _work(job: CollectionJob, work: Work) -> str:
     request_determinism()
     if job.profile.xla_threads:
         limit_xla_threads(job.profile.xla_threads)
-    return job(task)
+    return job(work)
 
 
-def _outcome(ray: Any, reference: Any, task: Task, options: CollectOptions) -> TaskOutcome:
+def _outcome(ray: Any, reference: Any, work: Work, options: CollectOptions) -> TaskOutcome:
     try:
-        return TaskOutcome(task, ray.get(reference))
+        return TaskOutcome(work, ray.get(reference))
     except ray.exceptions.RayError as error:  # raised by the task, or the worker died
         cause = getattr(error, "cause", error)
         trace = Text.from_ansi(str(error)).plain
-        return TaskOutcome(task, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
+        return TaskOutcome(work, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
 
 
 def _check_reachable(address: str | None) -> None:

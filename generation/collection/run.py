@@ -15,55 +15,55 @@ from generation.collection.failures import FAILED, FailureLog
 from generation.collection.job import CollectionError, CollectionJob, TaskOutcome
 from generation.collection.options import CollectOptions
 from generation.collection.ray_executor import run_on_ray
-from generation.collection.task_folder import is_task_finished, last_timing
+from generation.collection.task_folder import last_timing
 from generation.profiles import Profile
+from generation.profiles.work import Work
 from generation.progress import ProgressBoard
-from icrl4aht_data.benchmark.tasks import Task
 
 
 class Executor(Protocol):
     """Runs tasks in any order; closing the generator cancels those that are not done."""
 
     def __call__(
-        self, job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+        self, job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
     ) -> Generator[TaskOutcome]: ...
 
 
 def run_in_process(
-    job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs one task after the other."""
-    for task in tasks:
-        yield _attempt(job, task, board, options.retries + 1)
+    for work in tasks:
+        yield _attempt(job, work, board, options.retries + 1)
 
 
-def _attempt(job: CollectionJob, task: Task, board: ProgressBoard, attempts: int) -> TaskOutcome:
+def _attempt(job: CollectionJob, work: Work, board: ProgressBoard, attempts: int) -> TaskOutcome:
     def on_update(update: int, metrics: dict[str, float]) -> None:
-        board.show_running(task.task_id, update + 1, metrics["steps_per_second"])
+        board.show_running(work.name, update + 1, metrics["steps_per_second"])
 
-    outcome = TaskOutcome(task, "failed")
+    outcome = TaskOutcome(work, "failed")
     for attempt in range(1, attempts + 1):
         try:
-            return TaskOutcome(task, job(task, on_update), attempt)
+            return TaskOutcome(work, job(work, on_update), attempt)
         except Exception as error:  # whatever it is, the other tasks continue
-            outcome = TaskOutcome(task, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
+            outcome = TaskOutcome(work, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
     return outcome
 
 
 def collect_tasks(
-    tasks: Sequence[Task],
+    tasks: Sequence[Work],
     profile: Profile,
     out: Path,
     console: Console,
     options: CollectOptions,
     suite: Path | None = None,
 ) -> None:
-    """Make every task's artefact under out/artefacts.
+    """Make every artefact under out/artefacts.
 
     Tasks that another collector works on are left to it, and waited for at the end.
 
     Args:
-        tasks: the tasks.
+        tasks: the units of work.
         profile: their profile.
         out: folder of the rebuild.
         console: where progress is printed.
@@ -75,33 +75,33 @@ def collect_tasks(
     """
     job = CollectionJob(profile, out / "artefacts", suite, wait=False)
     todo = []
-    for task in tasks:
-        if is_task_finished(job.folder(task), task, profile):
-            console.print(f"{_label(task, tasks)}: finished before")
+    for work in tasks:
+        if job.is_finished(work):
+            console.print(f"{_label(work, tasks)}: finished before")
         else:
-            todo.append(task)
-    missing = {task.task_id for task in todo}
+            todo.append(work)
+    missing = {work.name for work in todo}
     failures, last_error = FailureLog(out / FAILED), ""
     with (
-        ProgressBoard(console, len(todo), profile.ego.updates) as board,
+        ProgressBoard(console, {work.name: profile.updates(work) for work in todo}) as board,
         closing(_run_all(job, todo, board, options)) as outcomes,
     ):
         for outcome in outcomes:
-            label = _label(outcome.task, tasks)
+            label = _label(outcome.work, tasks)
             if outcome.status == "busy":
                 console.print(f"{label}: another collector works on it")
                 continue
-            board.show_ended(outcome.task.task_id)
-            console.print(f"{label}: {_describe(outcome, job.folder(outcome.task))}")
+            board.show_ended(outcome.work.name)
+            console.print(f"{label}: {_describe(outcome, job.folder(outcome.work))}")
             if outcome.status == "done":
-                missing.remove(outcome.task.task_id)
-                failures.forget([outcome.task.task_id])
+                missing.remove(outcome.work.name)
+                failures.forget([outcome.work.name])
                 continue
             failures.add(outcome)
             last_error = outcome.error
             if options.fail_fast:
                 raise CollectionError(f"{failures.path}: the first failure: {outcome.error}")
-    failures.forget({task.task_id for task in tasks} - missing)
+    failures.forget({work.name for work in tasks} - missing)
     if missing:
         reasons = f"{failures.path} has the reasons"
         if not failures.is_written:
@@ -113,16 +113,16 @@ def collect_tasks(
 
 
 def _run_all(
-    job: CollectionJob, tasks: Sequence[Task], board: ProgressBoard, options: CollectOptions
+    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs every task, then again, waiting, those that another collector worked on."""
     execute = _executor(options)
     for wait in (False, True):
-        busy: list[Task] = []
+        busy: list[Work] = []
         with closing(execute(replace(job, wait=wait), tasks, board, options)) as outcomes:
             for outcome in outcomes:
                 if outcome.status == "busy":
-                    busy.append(outcome.task)
+                    busy.append(outcome.work)
                 yield outcome
         tasks = busy
 
@@ -134,8 +134,11 @@ def _executor(options: CollectOptions) -> Executor:
     return run_on_ray
 
 
-def _label(task: Task, tasks: Sequence[Task]) -> str:
-    return f"task {tasks.index(task) + 1}/{len(tasks)} {task.layout.name} with {task.teammate_kind}"
+def _label(work: Work, tasks: Sequence[Work]) -> str:
+    learner = f", learner {work.learner}" if work.learner else ""
+    source = "" if work.source == "ppo" else f", {work.source}"
+    task = work.task
+    return f"task {tasks.index(work) + 1}/{len(tasks)} {task.layout.name} with {task.teammate_kind}{source}{learner}"
 
 
 def _describe(outcome: TaskOutcome, folder: Path) -> str:

@@ -32,6 +32,7 @@ from generation.learners.ego import Learner, compiled_update
 from generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock
 from generation.policy import Noise
 from generation.profiles import Profile
+from generation.profiles.work import Work
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError
@@ -51,11 +52,11 @@ UpdateCallback = Callable[[int, dict[str, float]], None]
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
     """The untrained ego of a task. `suite` is the folder of learned teammates."""
     teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
-    return Learner(Environment(task.layout), teammate, profile.ego)
+    return Learner(Environment(task.layout), teammate, profile.ego_on(task.layout.name))
 
 
 def run_task(
-    task: Task,
+    work: Work,
     profile: Profile,
     folder: Path,
     on_update: UpdateCallback = lambda update, metrics: None,
@@ -67,7 +68,7 @@ def run_task(
     """Train the ego of a task and record its histories into `folder`, resuming from the last saved update.
 
     Args:
-        task: the task.
+        work: the task, and which of its learners.
         profile: the ego's hyper-parameters.
         folder: the artefact.
         on_update: called after each update.
@@ -83,30 +84,31 @@ def run_task(
         DiskFullError: if the disk has no room.
     """
     with run_lock(folder, wait=wait):
-        if is_task_finished(folder, task, profile):
+        if is_task_finished(folder, work, profile):
             return False
         partial = partial_folder(folder)
-        if not is_task_finished(partial, task, profile):  # else it was killed just before it was renamed
-            _learn(task, profile, partial, on_update, suite, save_seconds)
+        if not is_task_finished(partial, work, profile):  # else it was killed just before it was renamed
+            _learn(work, profile, partial, on_update, suite, save_seconds)
         publish_artefact(partial, folder)
         return True
 
 
 def _learn(
-    task: Task, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
+    work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
 ) -> None:
-    learner, saved = make_learner(task, profile, suite), StateFile(partial / LEARNER, resumable_settings(task, profile))
-    state, first = _resume(learner, task, saved)
-    needed = needed_bytes(task, profile.ego, state)
-    with _readable_disk_errors(partial, needed):
+    task, saved = work.task, StateFile(partial / LEARNER, resumable_settings(work, profile))
+    learner = make_learner(task, profile, suite)
+    state, first = _resume(learner, work, saved)
+    needed = needed_bytes(task, learner.config, state)
+    with readable_disk_errors(partial, needed):
         if not first:
             check_room(partial, needed)
-        writer = ArtefactWriter(partial, task, profile.ego, first)
+        writer = ArtefactWriter(partial, task, learner.config, first)
         try:
             _update(learner, state, first, writer, saved, on_update, save_seconds)
         finally:
             writer.close()
-        finish_artefact(partial, task, profile)
+        finish_artefact(partial, work, profile)
 
 
 def _update(
@@ -142,7 +144,7 @@ def _update(
 
 
 @contextmanager
-def _readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
+def readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
     """Turn the errors of a full disk into one that names the folder and what it needs.
 
     An artefact that has no saved state to resume from is removed then.
@@ -161,9 +163,15 @@ def _readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
         raise shown from error
 
 
-def _resume(learner: Learner, task: Task, saved: StateFile) -> tuple[Any, int]:
+def learner_key(work: Work) -> Any:
+    """The typed key of a learner: the task's seed decides the first one's, the others' are independent of it."""
+    key = jax.random.key(work.task.seed)
+    return jax.random.fold_in(key, work.learner) if work.learner else key
+
+
+def _resume(learner: Learner, work: Work, saved: StateFile) -> tuple[Any, int]:
     """The learner's state and the number of updates it has had: as saved under the same settings, or new."""
-    init, key = jax.jit(learner.init), jax.random.key(task.seed)
+    init, key = jax.jit(learner.init), learner_key(work)
     try:
         updates = saved.progress
     except OtherSettingsError:  # a changed profile or version: an unfinished artefact is no loss

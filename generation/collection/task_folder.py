@@ -1,6 +1,6 @@
 """A task's artefact on disk: its files, when it counts as finished, and how it is filled.
 
-<task_id>/            finished: its hashes match
+<task_id>/            finished: its hashes match; -l1 behind the id for a second learner, and so on
   metadata.json       task, settings, versions, SHA-256 of the files below
   state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
   metrics.jsonl       one line per update
@@ -32,10 +32,11 @@ from generation.learners.config import PPOConfig
 from generation.learners.network import ActorCritic
 from generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
 from generation.profiles import Profile
+from generation.profiles.work import Work
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError, IndexFormatError
 from icrl4aht_data.utils.cached_arrays import new_mapped_array
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
@@ -61,29 +62,49 @@ def _hashed_files(config: PPOConfig) -> list[str]:
     return sorted({f"{name}.npy" for name in HistoryArrays._fields} | {METRICS} | policies)
 
 
-def artefact_settings(task: Task, profile: Profile) -> dict[str, Any]:
+def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
     """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
+    ego = profile.ego_on(work.task.layout.name)
+    return common_settings(work) | {
+        "ego_hash": json_hash(asdict(ego)),
+        "checkpoint_updates": list(checkpoint_updates(ego)),
+    }
+
+
+def common_settings(work: Work) -> dict[str, Any]:
+    """Returns the settings that artefacts of every source depend on."""
     return {
-        "task": asdict(task),
-        "ego_hash": profile.ego_hash,
-        "checkpoint_updates": list(checkpoint_updates(profile.ego)),
+        "task": asdict(work.task),
+        "source": work.source,
+        "learner": work.learner,
         "code_version": version("icrl4aht-data"),
     }
 
 
-def resumable_settings(task: Task, profile: Profile) -> dict[str, Any]:
+def resumable_settings(work: Work, profile: Profile) -> dict[str, Any]:
     """Returns the settings that must not change for a resumed task to give the bits of an uninterrupted one."""
-    return artefact_settings(task, profile) | software_versions()
+    return artefact_settings(work, profile) | software_versions()
 
 
-def is_task_finished(folder: Path, task: Task, profile: Profile) -> bool:
-    """Returns whether a folder has this task's artefact under these settings, with all its files unchanged."""
+def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
+    """Returns whether a folder has this learner's artefact under these settings, with all its files unchanged."""
+    return is_artefact_finished(
+        folder, artefact_settings(work, profile), _hashed_files(profile.ego_on(work.task.layout.name))
+    )
+
+
+def is_artefact_finished(folder: Path, settings: dict[str, Any], files: list[str]) -> bool:
+    """Returns whether a folder has an artefact of these settings and files, all of them unchanged.
+
+    Args:
+        folder: the folder.
+        settings: what the artefact depends on.
+        files: its hashed files, sorted.
+    """
     try:
         metadata = parse_json(read_text(folder / METADATA))
-        wanted = artefact_settings(task, profile)
-        same = {name: metadata[name] for name in wanted} == wanted
-        complete = sorted(metadata["files"]) == _hashed_files(profile.ego)
-        return same and complete and hashes_hold(folder, metadata["files"])
+        same = {name: metadata[name] for name in settings} == settings
+        return same and sorted(metadata["files"]) == files and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
@@ -123,15 +144,26 @@ def disk_full(partial: Path, needed: int) -> DiskFullError:
     )
 
 
-def finish_artefact(partial: Path, task: Task, profile: Profile) -> None:
-    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it."""
-    metadata = artefact_settings(task, profile) | {
-        "profile": profile.name,
-        "ego": asdict(profile.ego),
+def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
+    """Write the metadata of a learner's artefact, see `write_metadata`."""
+    ego = profile.ego_on(work.task.layout.name)
+    settings = artefact_settings(work, profile) | {"profile": profile.name, "ego": asdict(ego)}
+    write_metadata(partial, settings, _hashed_files(ego))
+
+
+def write_metadata(partial: Path, settings: dict[str, Any], files: list[str]) -> None:
+    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it.
+
+    Args:
+        partial: the artefact.
+        settings: what it depends on, and what else is known of its origin.
+        files: its hashed files, sorted.
+    """
+    metadata = settings | {
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),
         "xla_threads": xla_threads(),
-        "files": {name: file_hash(partial / name) for name in _hashed_files(profile.ego)},
+        "files": {name: file_hash(partial / name) for name in files},
     }
     with atomic_write(partial / METADATA) as unnamed:
         write_json(unnamed, metadata)

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
+from generation.paths import Paths, Scene
 from generation.policy import Policy
-from generation.teammates.heuristics.paths import Paths, Scene
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, FACING_OF, GOAL, PILE, PLATE, PLATES, POT, WALL, Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack

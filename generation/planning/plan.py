@@ -139,7 +139,13 @@ def estimate_cost(
         devices: number of devices that share the tasks.
         advance: called before each of the measurements with its name, the number of those done, and their number.
     """
-    ego, tasks = profile.ego, len(profile.task_layouts)
+    ego = profile.ego
+    layouts = [
+        layout
+        for layout in profile.layouts
+        for _ in range(profile.tasks_on(layout, "ppo") * profile.learners * ("ppo" in profile.sources))
+    ]
+    tasks = len(layouts)
     advance("measuring how fast egos learn", 0, _MEASUREMENTS)
     learning = calibrate(ego, partial(task_learner, profile))
     task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
@@ -161,7 +167,7 @@ def estimate_cost(
         environment_steps=tasks * ego.updates * ego.steps_per_update,
         recorded_transitions=tasks * ego.environments * ego.episodes * KEPT_STEPS,
         kept_transitions=kept,
-        artefact_bytes=artefact_bytes(profile.task_layouts, ego),
+        artefact_bytes=artefact_bytes(layouts, ego),
         **{f"{kind}_bytes": round(kept * size) for kind, size in sizes.items()},
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
         teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
@@ -174,13 +180,14 @@ def estimate_cost(
     )
 
 
-def task_learner(profile: Profile, ego: PPOConfig) -> Learner:
-    """The ego of a task on the profile's first layout, with a teammate of the kind that most tasks have."""
-    layout = get_layout(profile.layouts[0])
-    if profile.algorithms:
+def task_learner(profile: Profile, ego: PPOConfig, layout_name: str | None = None) -> Learner:
+    """The ego of a task on the profile's first layout or the given one, with a teammate of the profile's kind."""
+    layout = get_layout(layout_name or profile.layouts[0])
+    heuristics = [work.task.teammate for work in profile.works() if work.source == "ppo"]
+    if profile.algorithms or not heuristics:
         teammate = build_untrained(layout, profile.teammates.ppo.widths)
     else:
-        teammate = build_teammate(layout, profile.heuristic_tasks()[0].teammate)
+        teammate = build_teammate(layout, heuristics[0])
     return Learner(Environment(layout), teammate, ego)
 
 

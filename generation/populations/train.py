@@ -61,6 +61,9 @@ POPULATION_SAVE_SECONDS = 60.0
 """Interval of saves: the work that a kill can cost."""
 
 _SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
+RESPONSES = "responses"
+"""Folder of a population's final best responses, if its algorithm trains any."""
+
 POPULATION = "population.json"
 """The record of a finished population."""
 
@@ -217,7 +220,7 @@ class _PopulationTraining:
         """Number of updates done over all stages, and the state after them; None at the start."""
         done = self.saved.progress
         if done is None:  # remove the checkpoints of a run that was killed before its first save
-            for folder in (*self.folder.glob("m[0-9]*"), self.folder / "responses"):
+            for folder in (*self.folder.glob("m[0-9]*"), self.folder / RESPONSES):
                 shutil.rmtree(folder, ignore_errors=True)
             return 0, None
         stage = (done - 1) // self.run.config.updates
@@ -310,7 +313,7 @@ class _PopulationTraining:
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
             if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
-                path = self.folder / "responses" / f"m{k}"
+                path = self.folder / RESPONSES / f"m{k}"
                 save_policy(path, population.network, response, card | {"role": "best response", "seats": [0]})
 
     def _finish(self) -> None:
@@ -402,7 +405,7 @@ def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = Fals
     last = [point for point in suite_checkpoints(suite, layout.name, algorithm) if point.path.endswith(final)]
     loaded = [load_policy(suite / point.path) for point in last]
     members = stacked([params for _, params, _ in loaded])
-    folder = suite / layout.name / algorithm / "responses"
+    folder = suite / layout.name / algorithm / RESPONSES
     egos = members
     if folder.is_dir():
         egos = stacked([load_policy(folder / f"m{point.card['member']}")[1] for point in last])

@@ -3,131 +3,20 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from generation.learners.config import PPOConfig, Widths
-from generation.teammates.registry import heuristic_teammate
-from icrl4aht_data.benchmark.facts import ALGORITHMS, PAPER_TEAMMATE_STEPS, PAPER_TEAMMATES, track_of
-from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.commands.dataclass_options import replace_given
+from generation.profiles.noise_config import NoiseConfig
+from generation.profiles.profile import Profile, SampledConfig, TeammateConfig
+from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, SOURCES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 FOLDER = Path(__file__).parent
-
-_LEAST_EPISODES = 5
-"""Episodes of a stream: its start and its end are means over five."""
-
-
-@dataclass(frozen=True)
-class TeammateConfig:
-    """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1).
-
-    Attributes:
-        members: policies of each algorithm's population.
-        train: teammates of each algorithm for the training tasks.
-        heldout: further ones, for the in-distribution check.
-        ppo: hyper-parameters of every policy.
-    """
-
-    members: int = option_field(10, "Policies of each population.", at_least=1)
-    train: int = option_field(PAPER_TEAMMATES, "Teammates of each algorithm for training tasks.", at_least=1)
-    heldout: int = option_field(5, "Held-out teammates of each algorithm.", at_least=0)
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000
-        )
-    )
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-@dataclass(frozen=True)
-class Profile:
-    """The size of a rebuild.
-
-    Attributes:
-        name: of the profile's file.
-        ego: hyper-parameters of the egos.
-        teammates: the learned teammates.
-        data_version: version of the release, SemVer.
-        keep: streams of each task that the release keeps, best first.
-        layouts: names of the layouts.
-        presets: teammates by the heuristic H4 `utility_greedy`, on every layout.
-        algorithms: layout -> algorithms of its learned teammates.
-        policies: whether the release has the policies that label its histories.
-        xla_threads: threads of XLA on a CPU, so that every machine computes the same bits; None for all cores.
-
-    Raises:
-        OptionError: if there is no task, or the ego's sizes do not fit.
-    """
-
-    name: str
-    ego: PPOConfig
-    teammates: TeammateConfig
-    data_version: str
-    keep: int
-    layouts: tuple[str, ...]
-    presets: tuple[str, ...] = ()
-    algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    policies: bool = False
-    xla_threads: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.xla_threads is not None and self.xla_threads < 1:
-            raise OptionError(f"xla_threads = {self.xla_threads}: expected at least 1")
-        if not self.task_layouts:
-            raise OptionError("expected at least one of tasks.layouts, and one of tasks.presets or tasks.algorithms")
-        if not 0 < self.keep <= self.ego.environments:
-            raise OptionError(f"release.keep = {self.keep}: expected 1..{self.ego.environments}")
-        if self.ego.episodes < _LEAST_EPISODES:
-            raise OptionError(
-                f"ego.total_steps gives {self.ego.episodes} episodes a stream, expected at least {_LEAST_EPISODES}"
-            )
-
-    def with_ego(self, given: Mapping[str, Any]) -> Profile:
-        """Returns the profile with some of the ego's hyper-parameters replaced, at any depth.
-
-        Raises:
-            OptionError: if they do not fit.
-        """
-        try:
-            return replace(self, ego=replace_given(self.ego, given))
-        except ValueError as error:
-            raise OptionError(f"profile {self.name} with the given options: {error}") from error
-
-    def heuristic_tasks(self) -> list[Task]:
-        """One training task per layout and preset, each with a seed of its own."""
-        pairs = [(layout, number, preset) for layout in self.layouts for number, preset in enumerate(self.presets)]
-        return [
-            make_task(track_of(layout), "train", layout, heuristic_teammate("utility_greedy", preset, number), seed)
-            for seed, (layout, number, preset) in enumerate(pairs)
-        ]
-
-    @property
-    def task_layouts(self) -> tuple[str, ...]:
-        """The layout of each training task, if every population has enough good teammates."""
-        learned = [
-            layout for layout, names in self.algorithms.items() for _ in range(len(names) * self.teammates.train)
-        ]
-        return self.layouts * len(self.presets) + tuple(learned)
-
-    @property
-    def ego_hash(self) -> str:
-        """Hash of the ego's hyper-parameters, which with the task decide an artefact."""
-        return json_hash(asdict(self.ego))
-
-    @property
-    def hash(self) -> str:
-        """Hash of the profile."""
-        return json_hash(asdict(self))
 
 
 def profile_names() -> list[str]:
@@ -147,7 +36,7 @@ def load_profile(name: str) -> Profile:
         raise unknown("profile", name, profile_names())
     try:
         profile = _profile(path.stem, tomllib.loads(path.read_text(encoding="utf-8")))
-        profile.heuristic_tasks()  # raises for unknown presets
+        profile.works()  # raises for unknown presets, and for more sampled teammates than there are
     except tomllib.TOMLDecodeError as error:
         raise OptionError(f"{path}: not TOML: {error}") from error
     except KeyError as error:
@@ -158,23 +47,89 @@ def load_profile(name: str) -> Profile:
 
 
 def _profile(name: str, content: dict[str, Any]) -> Profile:
-    _check_keys(content, "", {"xla_threads", "ego", "teammates", "release", "tasks"})
-    _check_keys(content["release"], "release.", {"keep", "data_version", "policies"})
-    _check_keys(content["tasks"], "tasks.", {"layouts", "presets", "algorithms"})
-    tasks = content["tasks"]
+    _check_keys(content, "", {"xla_threads", "ego", "teammates", "noise", "release", "tasks"})
+    release, tasks = content["release"], content["tasks"]
+    _check_keys(release, "release.", {"keep", "data_version", "policies", "oracle_actions", "least_improvement"})
+    _check_keys(tasks, "tasks.", {"layouts", "sources", "learners", "presets", "sampled", "algorithms"})
     layouts = _layouts("tasks.layouts", tasks["layouts"])
+    sources = _names("tasks.sources", tasks.get("sources", ["ppo"]))
+    for source in sources:
+        if source not in SOURCES:
+            raise OptionError(f"tasks.sources: {unknown('source', source, SOURCES)}")
+    if not sources:
+        raise OptionError(f"tasks.sources = []: expected at least one of {', '.join(SOURCES)}")
+    ego = dict(content["ego"]) if "ppo" in sources else dict(content.get("ego", {}))
+    of_layouts = _tables("ego.layouts", ego.pop("layouts", {}), layouts)
+    egos = _options(PPOConfig(), "ego", ego)
     return Profile(
         name=name,
-        ego=_options(PPOConfig(), "ego", content["ego"]),
+        ego=egos,
+        ego_layouts={each: _options(egos, f"ego.layouts.{each}", values) for each, values in of_layouts.items()},
         teammates=_teammates(content.get("teammates", {})),
-        data_version=check_version(_typed("release.data_version", content["release"]["data_version"], str)),
-        keep=_typed("release.keep", content["release"]["keep"], int),
+        noise=_options(NoiseConfig(), "noise", content.get("noise", {})),
+        data_version=check_version(_typed("release.data_version", release["data_version"], str)),
+        keep=_typed("release.keep", release["keep"], int) if "ppo" in sources else 0,
         layouts=layouts,
+        sources=sources,
+        learners=_typed("tasks.learners", tasks.get("learners", 1), int),
         presets=_names("tasks.presets", tasks.get("presets", [])),
+        sampled=_sampled(tasks["sampled"], layouts) if "sampled" in tasks else None,
         algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
-        policies=_switch("release.policies", content["release"].get("policies", False)),
+        policies=_switch("release.policies", release.get("policies", False)),
+        oracle_actions=_switch("release.oracle_actions", release.get("oracle_actions", False)),
+        least_improvement=_number("release.least_improvement", release.get("least_improvement")),
         xla_threads=_typed("xla_threads", content["xla_threads"], int) if "xla_threads" in content else None,
     )
+
+
+def _sampled(values: dict[str, Any], layouts: tuple[str, ...]) -> SampledConfig:
+    """[tasks.sampled], where every value holds for all layouts or is a table of them."""
+    _check_keys(values, "tasks.sampled.", {"families", "per_layout", "ppo", "validation"})
+
+    def names(key: str, value: Any) -> tuple[str, ...]:
+        families = _names(key, value)
+        for family in families:
+            if family not in HEURISTIC_KINDS:
+                raise OptionError(f"{key}: {unknown('family', family, HEURISTIC_KINDS)}")
+        return families
+
+    def count(key: str, value: Any) -> int:
+        if _typed(key, value, int) < 0:
+            raise OptionError(f"{key} = {value}: expected at least 0")
+        return value
+
+    families = _by_layout("tasks.sampled.families", values["families"], layouts, names, ())
+    per_layout = _by_layout("tasks.sampled.per_layout", values["per_layout"], layouts, count, 0)
+    ppo = _by_layout("tasks.sampled.ppo", values.get("ppo", per_layout), layouts, count, 0)
+    validation = _by_layout("tasks.sampled.validation", values.get("validation", 0), layouts, count, 0)
+    for name in layouts:
+        if (per_layout[name] or validation[name]) and not families[name]:
+            raise OptionError(f"tasks.sampled.families: none for {name}, which has teammates in tasks.sampled")
+        if ppo[name] > per_layout[name]:
+            raise OptionError(
+                f"tasks.sampled.ppo = {ppo[name]} on {name}: expected at most per_layout = {per_layout[name]}"
+            )
+    return SampledConfig(families, per_layout, ppo, validation)
+
+
+def _by_layout(
+    key: str, value: Any, layouts: tuple[str, ...], check: Callable[[str, Any], Any], absent: Any
+) -> dict[str, Any]:
+    """Layout -> value, which is one for all layouts, or a table of them."""
+    if not isinstance(value, dict):
+        return dict.fromkeys(layouts, check(key, value))
+    found = _tables(key, value, layouts)
+    return {name: check(f"{key}.{name}", found[name]) if name in found else absent for name in layouts}
+
+
+def _tables(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, Any]:
+    """A table of some of the profile's layouts, by short name."""
+    typed = _typed(key, value, dict)
+    found = dict(zip(_layouts(key, list(typed)), typed.values(), strict=True))
+    for name in found:
+        if name not in layouts:
+            raise OptionError(f"{key}.{name}: expected one of tasks.layouts, {', '.join(layouts)}")
+    return found
 
 
 def _teammates(values: dict[str, Any]) -> TeammateConfig:
@@ -212,18 +167,12 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
 
 def _algorithms(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Layout -> algorithms, in the order of the layouts; a list applies to all of them."""
-    if isinstance(value, dict):
-        names_of = dict(zip(_layouts(key, list(value)), value, strict=True))
-        found = {name: _names(f"{key}.{typed}", value[typed]) for name, typed in names_of.items()}
-    else:
-        found = dict.fromkeys(layouts, _names(key, value))
-    for name, algorithms in found.items():
-        if name not in layouts:
-            raise OptionError(f"{key}.{name}: expected one of tasks.layouts, {', '.join(layouts)}")
+    found = _by_layout(key, value, layouts, _names, ())
+    for algorithms in found.values():
         for algorithm in algorithms:
             if algorithm not in ALGORITHMS:
                 raise OptionError(f"{key}: {unknown('algorithm', algorithm, ALGORITHMS)}")
-    return {name: found[name] for name in layouts if found.get(name)}
+    return {name: found[name] for name in layouts if found[name]}
 
 
 def _layouts(key: str, value: Any) -> tuple[str, ...]:
@@ -235,6 +184,12 @@ def _typed(key: str, value: Any, kind: type) -> Any:
     if isinstance(value, bool) or not isinstance(value, kind):
         raise OptionError(f"{key} = {value!r}: expected {kind.__name__}")
     return value
+
+
+def _number(key: str, value: Any) -> float | None:
+    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return value
+    raise OptionError(f"{key} = {value!r}: expected a number")
 
 
 def _switch(key: str, value: Any) -> bool:

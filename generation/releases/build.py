@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -12,8 +12,10 @@ from generation.collection.job import CollectionError
 from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
 from generation.populations.build import build_suite
+from generation.populations.headroom import learned_headroom
 from generation.populations.select import THRESHOLD, make_tasks
 from generation.profiles import Profile
+from generation.profiles.work import Work
 from generation.progress import progress_bars
 from generation.releases.package import check_release_folder, package_release
 from icrl4aht_data.benchmark.tasks import Task
@@ -35,6 +37,7 @@ def build_releases(
     suite: Path | None = None,
     seed: int = 0,
     tasks: Sequence[Task] | None = None,
+    sources: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
 
@@ -48,6 +51,7 @@ def build_releases(
             TEAMMATES of a release.
         seed: seed of the suite.
         tasks: tasks to collect instead of the profile's, which trains no teammates.
+        sources: task id -> source of these tasks, where it is not the profile's first one.
 
     Returns:
         The release folders.
@@ -59,39 +63,44 @@ def build_releases(
     for kind in kinds:
         check_release_folder(out / kind, profile)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
-    tasks = train_teammates(profile, suite, seed, console) if tasks is None else list(tasks)
-    collect_tasks(tasks, profile, out, console, options or CollectOptions(), suite)
+    works = train_teammates(profile, suite, seed, console) if tasks is None else profile.works_of(tasks, sources or {})
+    collect_tasks(works, profile, out, console, options or CollectOptions(), suite)
+    number = len({work.task.task_id for work in works})
     releases = []
     with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
         for kind in kinds:
             with progress_bars(console) as bars:
                 steps = [f"choosing labellers for {kind}", f"packing {kind}"]
-                rows = [bars.add_task(step, total=len(tasks), note="", unit="tasks") for step in steps]
+                rows = [bars.add_task(step, total=number, note="", unit="tasks") for step in steps]
 
                 def advance(step: int, bars=bars, rows=rows) -> None:
                     bars.advance(rows[step])
 
-                releases.append(package_release(out / "artefacts", out / kind, tasks, profile, suite, kind, advance))
+                releases.append(package_release(out / "artefacts", out / kind, works, profile, suite, kind, advance))
         for release in releases:
             print_statistics(read_info(release), console)
     return releases
 
 
-def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) -> list[Task]:
-    """The training tasks of a profile: those with presets, then those with learned teammates, which are trained first.
+def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) -> list[Work]:
+    """The units of work of a profile, for which its learned teammates are trained first.
 
     Raises:
         CollectionError: if there is no task, because no teammate is good enough.
     """
-    tasks = profile.heuristic_tasks()
     if not profile.algorithms:
-        return tasks
+        return profile.works()
     selections = build_suite(profile, suite, profile.algorithms, seed, console)
-    tasks += make_tasks(suite, selections, "train")
-    if not tasks:
+    learned = make_tasks(suite, selections, "train")
+    headroom = learned_headroom(learned, suite)
+    for task in learned:
+        if not headroom[task.task_id].matters:
+            console.print(f"{task.task_id}: left out, the ego does not matter: {headroom[task.task_id].describe()}")
+    works = profile.works([task for task in learned if headroom[task.task_id].matters])
+    if not works:
         names = dict.fromkeys(chain(*profile.algorithms.values()))
         raise CollectionError(
             f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
-    return tasks
+    return works

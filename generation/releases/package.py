@@ -18,6 +18,7 @@ from generation.learners.checkpoint import load_policy
 from generation.populations.select import THRESHOLD
 from generation.populations.train import population_threads
 from generation.profiles import Profile
+from generation.profiles.work import Work
 from generation.releases.labeller import choose_labeller
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
@@ -34,7 +35,7 @@ from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 def package_release(
     artefacts: Path,
     target: Path,
-    tasks: Sequence[Task],
+    works: Sequence[Work],
     profile: Profile,
     suite: Path,
     kind: Kind,
@@ -47,7 +48,7 @@ def package_release(
     Args:
         artefacts: folder of the tasks' finished artefacts.
         target: the release folder; a release of this profile there is replaced atomically.
-        tasks: the tasks, in the release's order.
+        works: the units of work, by task in the release's order.
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
@@ -58,7 +59,7 @@ def package_release(
     """
     check_release_folder(target, profile)
     recorded, new = _recorded_provenance(suite), []
-    for task in tasks:
+    for task in {work.task.task_id: work.task for work in works}.values():
         new.append(_new_task(artefacts / task.task_id, task, profile, suite, recorded))
         advance(0)
     return write_release(
@@ -89,6 +90,12 @@ def bundle_release(release: Path) -> Path:
     with atomic_folder(MINI, overwrite=True, sources=[release]) as copy:
         shutil.copytree(release, copy, dirs_exist_ok=True)
     return MINI
+
+
+def recorded_sources(release: Path) -> dict[str, str]:
+    """task id -> source, as a release says; empty for a folder that is none."""
+    path = release / PROVENANCE
+    return {task_id: made.source for task_id, made in read_provenance(path).items()} if path.is_file() else {}
 
 
 def _recorded_provenance(suite: Path) -> dict[str, Provenance]:

@@ -23,12 +23,17 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
+TESTED_ON = {layout: layout for layout in _TEAMMATE_LAYOUTS} | dict(
+    zip(_LAYOUT_LAYOUTS, TRACKS["layout"]["test"], strict=True)
+)
+"""Training layout -> the layout that its models are tested on (paper, Sec. 5.1 and 5.2)."""
+
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
 """Every layout of the benchmark, in the paper's order; the position in this tuple enters seeds."""
 
 SPLITS = ("train", "validation", "test", "heldout")
-"""Splits of the tasks. `validation` combines training layouts with heuristic teammates that are neither in `train` nor in
-`test`, for choosing models; `heldout` with learned teammates that are not in `train` (paper, App. F)."""
+"""Splits of the tasks. `validation` combines training layouts with heuristic teammates that are neither in `train`
+nor in `test`, for choosing models; `heldout` with learned teammates that are not in `train` (paper, App. F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
 """Families of teammates: "rl" (learned policies) and the heuristics "H1".."H4" (paper, App. B)."""
@@ -46,6 +51,10 @@ ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
 
 KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 """teammate kind -> family, for algorithms and heuristics."""
+
+SOURCES = ("ppo", "noise")
+"""How generated histories are made: by an ego that learns with PPO, or by a script whose actions are replaced by random
+ones, ever more rarely (noise distillation, Zisman et al. 2024). Releases may name others."""
 
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""

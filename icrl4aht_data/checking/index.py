@@ -52,7 +52,7 @@ def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
 def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
     by_id = {task.task_id: task for task in tasks}
     has_tasks = bool(tasks) or index.info.kind in KINDS
-    streams: set[tuple[str, int]] = set()
+    streams: set[tuple[str, int, int]] = set()
     first: dict[str, Entry] = {}
     for entry in index.entries:
         task, other = by_id.get(entry.task_id), first.setdefault(entry.task_id, entry)
@@ -71,10 +71,12 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
             report.add(TASKS, f"history {entry.history_id}: its task {entry.task_id!r} is missing")
         elif task is not None and not _describes(task, entry):
             report.add(TASKS, f"history {entry.history_id}: index and task {entry.task_id!r} disagree")
-        if (entry.task_id, entry.env_idx) in streams:
-            report.add(HISTORIES, f"history {entry.history_id}: stream {entry.env_idx} of its task appears twice")
-        streams.add((entry.task_id, entry.env_idx))
-    for task_id in by_id.keys() - {task_id for task_id, _ in streams}:
+        stream = entry.task_id, entry.learner, entry.env_idx
+        if stream in streams:
+            of = f"learner {entry.learner} of " if entry.learner else ""
+            report.add(HISTORIES, f"history {entry.history_id}: stream {entry.env_idx} of {of}its task appears twice")
+        streams.add(stream)
+    for task_id in by_id.keys() - first.keys():
         report.add(TASKS, f"task {task_id!r} has no history")
 
 
@@ -108,6 +110,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
     root, info, shards = index.root, index.info, index.values("shard")
     kept_steps = info.environment.kept_steps
     described = describe(info.kind, info.data_version, kept_steps, list(index.entries), info.format_version)
+    described = replace(described, left_out=info.left_out)
     if info.shards.keys() != set(shards):
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")
     elif report.ok and provenance is not None:

@@ -35,7 +35,7 @@ def check_provenance(
     seeds = {task.task_id: task.seed for task in tasks}
     for task_id in provenance.keys() - members.keys():
         report.add(PROVENANCE, f"task {task_id!r}: has no history")
-    labellers = {of_task.expert.policy_sha256 for of_task in provenance.values() if of_task.expert is not None}
+    labellers = {of_task.expert.policy_sha256 for of_task in provenance.values() if of_task.expert} - {None}
     for name in listed:
         if name.startswith(f"{EXPERTS}/") and name.split("/")[1] not in labellers:
             report.add(name, f"{PROVENANCE} names no such policy")

@@ -24,7 +24,7 @@ from icrl4aht_data.utils.remembered import remembered_hash
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")
 """The entry fields that can be filtered by."""
 
-_VERSION = 2  # of the cached columns
+_VERSION = 3  # of the cached columns
 _UNCACHED = 2**20  # bytes: a smaller index is decoded as quickly as its columns are opened
 _BLOCK = 2**19  # bytes decoded at a time
 

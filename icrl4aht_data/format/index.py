@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import FAMILIES, SPLITS, TRACKS
+from icrl4aht_data.benchmark.facts import FAMILIES, SOURCES, SPLITS, TRACKS
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError, unknown
 from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.format.info import ReleaseInfo, read_info
@@ -20,7 +20,7 @@ from icrl4aht_data.utils.paths import resolve_inside
 ALIASES = {"algorithm": "teammate_kind"}
 """Other names of filters: the kind of a learned teammate is the algorithm that trained it."""
 
-_KNOWN_VALUES = {"split": SPLITS, "track": tuple(TRACKS), "teammate_family": FAMILIES}
+_KNOWN_VALUES = {"split": SPLITS, "track": tuple(TRACKS), "teammate_family": FAMILIES, "source": SOURCES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,10 @@ class Index:
             matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], codes)
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
-            raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {self.summary()}")
+            sources = ", ".join(self.values("source")) or "none"
+            raise EmptySelectionError(
+                f"{self.root}: no history has {what}. This release has {self.summary()}; sources: {sources}"
+            )
         if matching.all():
             return np.arange(len(self.entries))
         ids = np.concatenate([self.entries.rows(c) for c in np.flatnonzero(matching).tolist()])
@@ -91,7 +94,7 @@ class Index:
         canonical = get_layout(str(value)).name if name == "layout" else value
         code = self.entries.code(name, canonical) if isinstance(canonical, str) else None
         if code is None and name != "layout" and canonical not in _KNOWN_VALUES.get(name, ()):
-            raise unknown(given, value, _KNOWN_VALUES.get(name) or self.values(name))
+            raise unknown(given, value, (*_KNOWN_VALUES.get(name, ()), *self.values(name)))
         return -1 if code is None else code
 
     def summary(self) -> str:

@@ -17,11 +17,12 @@ from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.errors import (
     FormatTooNewError,
     FormatTooOldError,
+    Icrl4ahtError,
     IndexFormatError,
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind
+from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
@@ -37,6 +38,8 @@ _VERSION_LENGTH = 100  # characters
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
+_Number = Annotated[int, Meta(ge=0, lt=2**31)]
+_Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,34 @@ class LayoutStatistics:
 
 
 @dataclass(frozen=True)
+class LeftOutTask:
+    """A task that was attempted, or considered, and has no histories in the release.
+
+    Args:
+        task_id: the task's id.
+        layout: the layout's short name.
+        teammate: the teammate in words, such as "H3/t12" or "fcp/m1".
+        source: how its histories were to be made, see `Entry.source`.
+        learners: number of independent learners; 0 where none was trained.
+        streams: number of their recorded streams.
+        return_start: mean return of the streams' first episodes, see `schema.curve_ends`; None where nothing was
+            recorded.
+        return_end: mean return of their last episodes.
+        reason: why it was left out, as a sentence for people.
+    """
+
+    task_id: str
+    layout: str
+    teammate: str
+    source: str
+    learners: _Number
+    streams: _Number
+    return_start: _Return | None
+    return_end: _Return | None
+    reason: str
+
+
+@dataclass(frozen=True)
 class ReleaseInfo:
     """The content of meta/info.json.
 
@@ -122,6 +153,7 @@ class ReleaseInfo:
         layouts: layout name -> summary, in order of first appearance in the index.
         shards: shard, a path in the release -> its size in bytes.
         statistics: layout name -> the paper's statistics; empty in releases written before there were any.
+        left_out: tasks without histories in the release, such as those whose learner did not learn.
     """
 
     format_version: int
@@ -134,6 +166,7 @@ class ReleaseInfo:
     layouts: dict[str, LayoutSummary]
     shards: dict[str, _Bytes] = field(default_factory=dict)
     statistics: dict[str, LayoutStatistics] = field(default_factory=dict)
+    left_out: list[LeftOutTask] = field(default_factory=list)
 
     @property
     def has_chunk_hashes(self) -> bool:
@@ -141,9 +174,9 @@ class ReleaseInfo:
         return "hash" in (CHUNK_DTYPES[self.format_version].names or ())
 
     def to_json(self) -> dict[str, Any]:
-        """The object to write, without `shards` and `statistics` where they are empty."""
+        """The object to write, without `shards`, `statistics` and `left_out` where they are empty."""
         content = json.loads(msgspec.json.encode(self))
-        return {name: value for name, value in content.items() if value != {}}
+        return {name: value for name, value in content.items() if value not in ({}, [])}
 
     @classmethod
     def from_json(cls, content: Any) -> ReleaseInfo:
@@ -160,7 +193,11 @@ class ReleaseInfo:
             raise IndexFormatError(str(error)) from error
         try:
             check_version(info.data_version)  # it names tags and folders
-        except OptionError as error:
+            for task in info.left_out:
+                get_layout(task.layout)
+                for text in (task.task_id, task.teammate, task.source, task.reason):
+                    check_name(text)
+        except Icrl4ahtError as error:
             raise IndexFormatError(str(error)) from error
         if len(content["environment"]) != 2:
             raise IndexFormatError("environment: expected max_steps and kept_steps only")
@@ -187,7 +224,7 @@ def read_info(root: Path) -> ReleaseInfo:
             return ReleaseInfo.from_json(content)
     except IndexFormatError as error:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
-    found = f"{path}: format version {version}, this package reads {' and '.join(map(str, READABLE_VERSIONS))}"
+    found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
         raise FormatTooNewError(f"{found}: `pip install -U icrl4aht-data`")
     raise FormatTooOldError(f"{found}: rebuild or fetch the release again")

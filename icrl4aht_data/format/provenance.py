@@ -10,11 +10,15 @@ import msgspec
 from msgspec import Meta
 
 from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.schema import check_name
 from icrl4aht_data.utils.files import parse_json, read_text
 
 _Streams = Annotated[int, Meta(ge=0, lt=2**31)]
 _Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Positive = Annotated[int, Meta(ge=1, le=2**63 - 1)]
 _Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
+_Share = Annotated[float, Meta(ge=0, le=1)]
+_Exponent = Annotated[float, Meta(gt=0, lt=1e15)]
 
 
 @dataclass(frozen=True)
@@ -47,19 +51,19 @@ class StreamFilter:
 
 @dataclass(frozen=True)
 class ExpertLabels:
-    """Origin of the expert actions.
+    """Origin of the expert actions: one policy for all histories of a task, whichever learner made them.
 
     Args:
-        policy_sha256: SHA-256 of the policy's weights.
+        policy_sha256: SHA-256 of the policy's weights; None for a script.
         action: how the policy chose actions.
-        step: environment steps that the policy was trained for.
+        step: environment steps that the policy was trained for; None for a script.
         return_greedy: its mean return over `episodes` episodes with the task's teammate, acting greedily.
         return_sampled: its mean return with sampled actions.
         episodes: number of episodes of each measurement.
         last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
     """
 
-    policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None
     action: str
     step: _Count | None = None
     return_greedy: _Return | None = None
@@ -92,6 +96,39 @@ class TeammateSuite:
     xla_threads: Annotated[int, Meta(ge=1)] | None = None
 
 
+@dataclass(frozen=True)
+class ReferenceEgos:
+    """Mean returns with the task's teammate of egos that do not learn, in episodes of `facts.KEPT_STEPS` steps.
+
+    Args:
+        stay: the ego that never moves.
+        random: the ego of random actions.
+        oracle: the scripted ego, which sees the full state.
+        episodes: number of episodes of each measurement.
+    """
+
+    stay: _Return
+    random: _Return
+    oracle: _Return
+    episodes: _Positive
+
+
+@dataclass(frozen=True)
+class NearestTest:
+    """The test teammate on the same layout that acts most like the task's teammate.
+
+    Args:
+        teammate: family and number of the test teammate, such as "H3/t1".
+        distance: share of the steps in which the two choose other actions in the same states.
+        behaviour: number of the behaviour among the draws of one layout and family, which act alike if they share it;
+            None where it was not determined.
+    """
+
+    teammate: str
+    distance: _Share
+    behaviour: _Count | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
     """Origin of one task's histories. Everything that was not recorded is None.
@@ -106,8 +143,13 @@ class Provenance:
         platform: JAX backend, such as "cpu".
         xla_threads: threads of one operation on a CPU, which decide the bits; None on other platforms.
         seed: the learner's seed.
+        source: how the histories were made, see `Entry.source`.
+        learners: number of independent learners, each with `ego["environments"]` streams; None for a script.
+        noise: settings of a noise history's schedules: numbers, and ranges [least, most] that each history draws from.
+        references: returns of egos that do not learn.
+        nearest_test: the test teammate that acts most like this one.
         teammate: how the teammate played: its `slot` and the source of its `noise`.
-        streams_recorded: environment streams of the learner.
+        streams_recorded: environment streams of all learners.
         streams_kept: how many of them became histories.
         filter: their returns before and after keeping the best.
         expert: where expert actions come from.
@@ -124,6 +166,11 @@ class Provenance:
     platform: str | None = None
     xla_threads: Annotated[int, Meta(ge=1)] | None = None
     seed: int | None = None
+    source: str | None = None
+    learners: _Positive | None = None
+    noise: dict[str, Any] | None = None
+    references: ReferenceEgos | None = None
+    nearest_test: NearestTest | None = None
     teammate: dict[str, Any] | None = None
     streams_recorded: _Streams | None = None
     streams_kept: _Streams | None = None
@@ -144,8 +191,10 @@ class Provenance:
     def to_json(self) -> dict[str, Any]:
         """The object to write, without what was not recorded."""
         content = _recorded(asdict(self))
-        for name in {"expert", "suite"} & content.keys():
+        for name in {"expert", "nearest_test", "suite"} & content.keys():
             content[name] = _recorded(content[name])
+        if self.expert is not None:  # null says that the labels come from a script
+            content["expert"] = {"policy_sha256": self.expert.policy_sha256} | content["expert"]
         other = content.pop("other")
         return content | other
 
@@ -164,6 +213,9 @@ class Provenance:
             msgspec.convert(found.ego, _EgoScale | None)
             if found.teammate is not None:
                 msgspec.convert(found.teammate, _TeammateSetting)
+            _check_noise(msgspec.convert(found.noise, _NoiseSetting | None))
+            for name in filter(None, (found.source, found.nearest_test and found.nearest_test.teammate)):
+                check_name(name)
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
         return replace(found, other={name: value for name, value in content.items() if name not in known})
@@ -179,6 +231,29 @@ class _EgoScale:
 
     total_steps: int
     environments: int
+
+
+class _NoiseSetting(msgspec.Struct):
+    """The settings of noise schedules that are known; others are kept as they are."""
+
+    histories: _Positive | None = None
+    episodes: _Positive | None = None
+    start: tuple[_Share, _Share] | None = None
+    end: tuple[_Share, _Share] | None = None
+    begin: tuple[_Share, _Share] | None = None
+    finish: tuple[_Share, _Share] | None = None
+    power: tuple[_Exponent, _Exponent] | None = None
+
+
+def _check_noise(noise: _NoiseSetting | None) -> None:
+    """Check that every range is one.
+
+    Raises:
+        IndexFormatError: names the range.
+    """
+    for name, value in () if noise is None else msgspec.structs.asdict(noise).items():
+        if isinstance(value, tuple) and value[0] > value[1]:
+            raise IndexFormatError(f"noise.{name}: expected a range [least, most], found {list(value)}")
 
 
 class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):

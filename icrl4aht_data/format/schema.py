@@ -28,12 +28,13 @@ from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Version of the file format that is written."""
 
-READABLE_VERSIONS = (2, FORMAT_VERSION)
-"""Versions that are read; for others see `FormatTooOldError` and `FormatTooNewError`. Version 2 has no hashes of chunks
-and no `source`, `expert_return`, `expert_return_sampled` and `expert_step` in the index."""
+READABLE_VERSIONS = (2, 3, FORMAT_VERSION)
+"""Versions that are read; for others see `FormatTooOldError` and `FormatTooNewError`. Version 3 has no oracle actions,
+and no `learner` and `has_oracle_actions` in the index. Version 2 also has no hashes of chunks and no `source`,
+`expert_return`, `expert_return_sampled` and `expert_step` in the index."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
@@ -64,7 +65,7 @@ chunks follow in rows with `rows` = 0, so that the table covers every byte of a 
 history, then by `FIELDS`, then by chunk. In the file a history's chunks are ordered by time, so that a window of steps
 is one range of bytes, see `shard_writer.file_order`."""
 
-CHUNK_DTYPES: dict[int, np.dtype] = {2: np.dtype(_POSITION), 3: CHUNK_DTYPE}
+CHUNK_DTYPES: dict[int, np.dtype] = {2: np.dtype(_POSITION), 3: CHUNK_DTYPE, 4: CHUNK_DTYPE}
 """Format version -> dtype of its chunk tables."""
 
 
@@ -114,13 +115,14 @@ FIELDS: dict[str, Field] = {
         Field("dones", "bool", "bool", "T", "scalar", 2000),
         Field("teammate_actions", "int32", "int8", "T", "scalar", 2000, optional=(OBSERVATIONS,)),
         Field("expert_actions", "int32", "int8", "T", "scalar", 2000, optional=ALL_KINDS),
+        Field("oracle_actions", "int32", "int8", "T", "scalar", 2000, optional=ALL_KINDS),
         Field("episode_end_state", "uint8", "uint8", "E", "state", 1000, absent=(OBSERVATIONS,)),
         Field("obs", "uint8", "uint8", "T", "obs", 200, absent=("lite",)),
     )
 }
 """Every field, in file order. `episode_end_state` is the state after each episode's last kept step."""
 
-ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions")
+ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions", "oracle_actions")
 
 
 def held_fields(kind: Kind) -> tuple[Field, ...]:
@@ -155,12 +157,12 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     Args:
         history_id: position of the line in the index.
         task_id: task whose learner made the history, see `benchmark.tasks`.
-        env_idx: environment stream within the learner's parallel rollout.
+        env_idx: environment stream within the learner's parallel rollout, or number of a noise history.
         T: number of steps.
         obs_shape: (5, 5, C) of one observation.
         action_dim: number of actions.
         track: "teammate" or "layout".
-        split: "train", "validation", "test" or "heldout".
+        split: a name in `facts.SPLITS`.
         layout: the layout's short name.
         teammate_family: "rl" or "H1".."H4".
         teammate_kind: the algorithm's or the heuristic's name.
@@ -175,12 +177,14 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return_start: mean return of the first episodes.
         return_end: mean return of the last episodes.
         return_mean: mean return of all episodes.
-        source: how the history was made, such as "ppo".
+        source: how the history was made: a name in `facts.SOURCES`, or another one.
         expert_return: mean return of 200 episodes of 100 steps of the policy that the expert actions come from, acting
             greedily with the task's teammate; None where it was not measured. All histories of a task agree in this
             and the next two fields.
         expert_return_sampled: the mean return with sampled actions.
-        expert_step: environment steps that the policy was trained for; None where it is unknown.
+        expert_step: environment steps that the policy was trained for; None where it is unknown, or for a script.
+        learner: which of the task's independent learners made the history, from 0.
+        has_oracle_actions: whether the history has `oracle_actions`.
     """
 
     history_id: _Int
@@ -209,6 +213,8 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     expert_return: _Number | None = None
     expert_return_sampled: _Number | None = None
     expert_step: _Row | None = None
+    learner: _Row = 0
+    has_oracle_actions: bool = False
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """The fields that this history's shard stores."""

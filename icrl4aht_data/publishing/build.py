@@ -17,7 +17,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, ReleaseError, unknown
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
-from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, MANIFEST, TEAMMATES
+from icrl4aht_data.format.schema import INFO, MANIFEST, TEAMMATES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
@@ -66,8 +66,8 @@ def build_release(
         advance: progress of verifying and of copying.
 
     Raises:
-        OptionError: if `target` may not be written, see `release_folder.check_target`, if `source` is of an older
-            format version, or if a library is not installed.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, if `source` is of a
+            format version without chunk hashes, or if a library is not installed.
         ReleaseError: if `source` is not valid; names the first problems.
     """
     source = (MINI if source is None else source).resolve()
@@ -76,9 +76,10 @@ def build_release(
     if missing:
         raise OptionError(f"building a release needs {', '.join(missing)}: pip install 'icrl4aht-data[plot,hf]'")
     check_valid(source, advance)
-    if (version := read_info(source).format_version) != FORMAT_VERSION:
+    if not (info := read_info(source)).has_chunk_hashes:
         raise OptionError(
-            f"{source}: format version {version}, releases are published in {FORMAT_VERSION}: convert it first"
+            f"{source}: format version {info.format_version} has no chunk hashes, published releases have them: "
+            f"convert it first"
         )
     kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
     with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:

@@ -293,7 +293,8 @@ class _PublishedHistory:
 
     def field_names(self) -> list[str]:
         """Return the names of the arrays that the release takes."""
-        return [f.name for f in held_fields(self.kind) if self.kind not in f.optional or self.line[f"has_{f.name}"]]
+        fields = held_fields(self.kind)
+        return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
     def check_arrays(self) -> None:
         """Check that the group has the arrays that the release takes, and observations.

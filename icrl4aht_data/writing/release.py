@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import check_version, describe, shard_sizes
+from icrl4aht_data.format.info import LeftOutTask, check_version, describe, shard_sizes
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
@@ -53,19 +53,21 @@ class NewHistory:
     """One history to write.
 
     Args:
-        env_idx: environment stream within the learner's parallel rollout.
+        env_idx: environment stream within the learner's parallel rollout, or number of a noise history.
         arrays: field name -> array, for the fields `schema.held_fields` of the release's kind; a full release renders
             `obs` from the states. Accessing a mapping may read the array, so that few are in memory at a time.
+        learner: which of the task's independent learners made it, from 0.
     """
 
     env_idx: int
     arrays: Mapping[str, np.ndarray]
+    learner: int = 0
 
     @classmethod
     def from_history(cls, history: History) -> NewHistory:
         """Return a history of any release with states, as a lite release stores it."""
         names = [field.name for field in history.entry.stored_fields("lite")]
-        return cls(history.entry.env_idx, {name: history.read(name) for name in names})
+        return cls(history.entry.env_idx, {name: history.read(name) for name in names}, history.entry.learner)
 
 
 @dataclass(frozen=True)
@@ -74,11 +76,10 @@ class NewTask:
 
     Args:
         task: the task; a `NamedTask` only in a release of observations.
-        provenance: how its histories were made.
-        streams: the number of histories that `load` returns.
+        provenance: how its histories were made; `source`, "ppo" where it says none, is that of their index entries.
+        streams: the number of histories that `load` returns, of all learners.
         load: returns the histories; called once, when their shard is written.
         files: path in the release -> file to copy there; see `checkpoint_files`.
-        source: how the histories were made, see `Entry.source`.
     """
 
     task: Task
@@ -86,7 +87,6 @@ class NewTask:
     streams: int
     load: Callable[[], Iterable[NewHistory]]
     files: Mapping[str, Path] = field(default_factory=dict)
-    source: str = "ppo"
 
 
 def write_release(
@@ -98,6 +98,7 @@ def write_release(
     card: str | None = None,
     source_card: str | None = None,
     kept_steps: int = KEPT_STEPS,
+    left_out: Sequence[LeftOutTask] = (),
     shard_histories: int = 1024,
     shard_bytes: int = SHARD_BYTES,
     overwrite: bool = False,
@@ -115,6 +116,7 @@ def write_release(
         card: README.md of the release; by default `dataset_card.render_card` describes the release.
         source_card: cards of the releases that this one is made of, to keep with its own.
         kept_steps: steps of every episode.
+        left_out: tasks without histories, to be listed in meta/info.json.
         shard_histories: maximum number of histories in a shard.
         shard_bytes: intended size of a shard, estimated from the first history of each layout.
         overwrite: replace a release at `target`, if nothing else is in its folder.
@@ -147,7 +149,7 @@ def write_release(
         for name, source in chain.from_iterable(one.files.items() for one in new):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, root / name)
-        content = _write_meta(root, kind, new, writer.entries, data_version, kept_steps)
+        content = _write_meta(root, kind, new, writer.entries, data_version, kept_steps, left_out)
         if source_card is not None:
             (root / SOURCE_CARD).write_text(source_card, encoding="utf-8")
             content = replace(content, files=frozenset({SOURCE_CARD}))
@@ -157,7 +159,13 @@ def write_release(
 
 
 def _write_meta(
-    root: Path, kind: Kind, new: list[NewTask], entries: list[Entry], data_version: str, kept_steps: int
+    root: Path,
+    kind: Kind,
+    new: list[NewTask],
+    entries: list[Entry],
+    data_version: str,
+    kept_steps: int,
+    left_out: Sequence[LeftOutTask],
 ) -> CardContent:
     """Write index, tasks, provenance and info; returns them for the card."""
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
@@ -168,7 +176,8 @@ def _write_meta(
     write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
     sizes = shard_sizes(root, entries)
     statistics = layout_statistics(entries, tasks, provenance, kept_steps, sizes)
-    info = replace(describe(kind, data_version, kept_steps, entries), shards=sizes, statistics=statistics)
+    info = describe(kind, data_version, kept_steps, entries)
+    info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
     write_json(root / INFO, info.to_json())
     return CardContent(info, entries, tasks, provenance)
 
@@ -241,6 +250,11 @@ class _ShardWriter:
             raise OptionError(
                 f"task {task.task_id}: env_idx: expected a stream's number from 0, found {history.env_idx}"
             )
+        if not 0 <= history.learner < (new.provenance.learners or 2**63):
+            raise OptionError(
+                f"task {task.task_id}: learner: expected 0 to {(new.provenance.learners or 2**63) - 1}, found "
+                f"{history.learner}"
+            )
         needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():
             raise OptionError(f"task {task.task_id}: a history has no arrays {sorted(needed - arrays.keys())}")
@@ -273,7 +287,9 @@ class _ShardWriter:
             return_start=float(start[0]),
             return_end=float(end[0]),
             return_mean=float(returns.mean()),
-            source=new.source,
+            source=new.provenance.source or "ppo",
+            learner=history.learner,
+            has_oracle_actions="oracle_actions" in arrays,
             **new.provenance.entry_fields(),
         )
 
@@ -283,7 +299,8 @@ class _ShardWriter:
         placed: list[Entry] = []
         for number, entry in enumerate(entries):
             stacked = self.kind == "lite"
-            shape = (entry.T, entry.episodes, entry.has_expert_actions) if stacked else (number,)
+            labels = entry.has_expert_actions, entry.has_oracle_actions
+            shape = (entry.T, entry.episodes, labels) if stacked else (number,)
             row = rows[shape]
             rows[shape] += 1
             group, history_id = f"/{list(rows).index(shape)}", len(self.entries) + number

@@ -130,7 +130,7 @@ def file_order(field: Field, start: int) -> tuple[int, ...]:
     """
     if field.axis == "E":
         return (1,)
-    order = ("actions", "rewards", "dones", "state", "teammate_actions", "expert_actions", "obs")
+    order = ("actions", "rewards", "dones", "state", "teammate_actions", "expert_actions", "oracle_actions", "obs")
     leads = field.name == "state" and start % _BLOCK == 0
     return (0, start // _BLOCK, -1 if leads else order.index(field.name), start)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -66,13 +67,15 @@ def stored_task(
     def load() -> Iterator[NewHistory]:
         for history in dataset:
             names = [field.name for field in held_fields(kind) if history.entry.has(field)]
-            yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read))
+            yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read), history.entry.learner)
             done()
 
     if task.teammate.get("kind") == "rl":
         dataset.origin.below(f"{TEAMMATES}/{task.teammate['theta']['sha256']}")  # fetched and checked
     files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
-    if provenance.expert is not None:
-        sha256 = provenance.expert.policy_sha256
+    if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
-    return NewTask(task, provenance, len(dataset), load, files, dataset.entries[0].source)
+    source = dataset.entries[0].source
+    if source != (provenance.source or "ppo"):  # version 3 has the source in the index only
+        provenance = replace(provenance, source=source)
+    return NewTask(task, provenance, len(dataset), load, files)

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from generation.cli import cli
+from generation.collection.task_folder import artefact_settings
 from generation.learners.config import PPOConfig, Widths
-from generation.profiles import FOLDER, load_profile, profile_names
+from generation.profiles import FOLDER, Profile, load_profile, profile_names
 from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_id, write_tasks
@@ -62,19 +63,18 @@ def test_shipped_profiles_load(name):
     profile = load_profile(name)
     assert profile.name == name
     assert profile.ego.updates > 0
-    assert 0 < profile.keep <= profile.ego.environments
+    assert "ppo" not in profile.sources or 0 < profile.keep <= profile.ego.environments * profile.learners
     for layout in profile.layouts:
-        learned = len(profile.algorithms.get(layout, ())) * profile.teammates.train
-        assert profile.task_layouts.count(layout) == len(profile.presets) + learned > 0
-    tasks = profile.heuristic_tasks()
-    assert len(tasks) == len(profile.layouts) * len(profile.presets)
-    for task in tasks:
-        assert task.layout.name in TRACKS[task.track]["train"]
-        assert task.split == "train"
+        assert sum(profile.tasks_on(layout, source) for source in profile.sources) > 0
+    works = profile.works()
+    assert len({work.name for work in works}) == len(works)
+    for work in works:
+        assert work.task.layout.name in TRACKS[work.task.track]["train"]
+        assert work.task.split == "train" or (work.task.split, work.source) == ("validation", "noise")
 
 
 def test_every_task_has_a_seed_and_an_id_of_its_own(changed):
-    tasks = load_profile(changed("keep = 8", "keep = 8")).heuristic_tasks()
+    tasks = [work.task for work in load_profile(changed("keep = 8", "keep = 8")).works()]
     assert len(tasks) == 4
     assert len({task.seed for task in tasks}) == len(tasks)
     assert len({task.task_id for task in tasks}) == len(tasks)
@@ -90,7 +90,7 @@ def test_paper_profile_has_the_papers_numbers():
     assert (ego.entropy, ego.value, ego.shaping_horizon) == (0.01, 0.5, 60_000_000)
     assert ego.widths == Widths((128, 128, 8), (16, 32, 32), 128, 128, 128)
     assert profile.keep == 128
-    assert (profile.presets, len(profile.task_layouts)) == ((), 8 * 80)
+    assert [profile.tasks_on(layout, "ppo") for layout in profile.layouts] == [80] * 8
     assert profile.algorithms == dict.fromkeys(profile.layouts, ALGORITHMS)
     assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
 
@@ -107,12 +107,19 @@ def test_histories_of_full_length(name):
     assert load_profile(name).ego.episodes == 146
 
 
-def test_ego_hash_is_of_the_ego_alone(changed):
+def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
+    def settings(profile: Profile, learner: int = 0) -> dict:
+        return artefact_settings(profile.works()[-1]._replace(learner=learner), profile)
+
     plain = load_profile(changed("keep = 8", "keep = 8"))
-    assert plain.ego_hash == load_profile(changed("keep = 8", "keep = 7")).ego_hash
-    assert plain.ego_hash == load_profile(changed('"coord_simple", ', "")).ego_hash
-    assert plain.ego_hash != load_profile(changed("rollout = 40", "rollout = 80")).ego_hash
-    assert plain.ego_hash != load_profile(changed("dense = 8", "dense = 9")).ego_hash
+    assert settings(plain) == settings(load_profile(changed("keep = 8", "keep = 7")))
+    assert settings(plain) != settings(load_profile(changed("rollout = 40", "rollout = 80")))
+    assert settings(plain) != settings(load_profile(changed("dense = 8", "dense = 9")))
+    assert settings(plain) != settings(plain, learner=1)
+    other = load_profile(changed("[release]", "[ego.layouts.coord_simple]\nentropy = 0.02\n[release]"))
+    assert (other.ego_on("coord_simple").entropy, other.ego_on("cramped_up").entropy) == (0.02, 0.01)
+    assert settings(other) == settings(plain)
+    assert artefact_settings(other.works()[0], other) != artefact_settings(plain.works()[0], plain)
 
 
 def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(changed):
@@ -120,7 +127,6 @@ def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(change
     assert profile.with_ego({}) == profile
     other = profile.with_ego({"learning_rate": 1e-3, "gru": 4})
     assert (other.ego.learning_rate, other.ego.widths.gru, other.ego.rollout) == (1e-3, 4, profile.ego.rollout)
-    assert other.ego_hash != profile.ego_hash
     assert other.hash != profile.hash
     for given, message in (
         ({"minibatches": 3}, "not a multiple of minibatches = 3"),
@@ -146,7 +152,7 @@ def test_a_profile_by_its_path(changed):
     assert profile.layouts == ("coord_simple", "cramped_up")
     assert profile.ego.widths == Widths((4,), (4,), 8, 8, 8)
     assert (profile.ego.updates, profile.ego.episodes, profile.ego.epochs) == (100, 10, 4)
-    tasks = profile.heuristic_tasks()
+    tasks = [work.task for work in profile.works()]
     made = [(task.layout.name, task.track, task.teammate["theta"]["inertia"], task.seed) for task in tasks]
     assert made == [
         ("coord_simple", "teammate", 0.3, 0),
@@ -160,8 +166,8 @@ def test_learned_teammates_on_some_layouts(changed):
     learned = 'algorithms = { cramped_room_up = ["fcp", "comedi"], coord_simple = [] }\npresets ='
     profile = load_profile(changed("presets =", learned))
     assert profile.algorithms == {"cramped_up": ("fcp", "comedi")}
-    assert profile.task_layouts.count("coord_simple") == 2
-    assert profile.task_layouts.count("cramped_up") == 2 + 2 * profile.teammates.train
+    assert profile.tasks_on("coord_simple", "ppo") == 2
+    assert profile.tasks_on("cramped_up", "ppo") == 2 + 2 * profile.teammates.train
 
 
 @pytest.mark.parametrize(
@@ -178,7 +184,7 @@ def test_learned_teammates_on_some_layouts(changed):
         (
             'presets = ["default", "high_inertia"]',
             "",
-            r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
+            r"expected at least one of tasks\.layouts, and one of tasks\.presets, tasks\.sampled or tasks\.algorithms",
         ),
         (
             'presets = ["default", "high_inertia"]',
@@ -223,7 +229,7 @@ def test_learned_teammates_on_some_layouts(changed):
         (
             '["coord_simple", "cramped_room_up"]',
             "[]",
-            r"expected at least one of tasks\.layouts, and one of tasks\.presets or tasks\.algorithms",
+            r"expected at least one of tasks\.layouts, and one of tasks\.presets, tasks\.sampled or tasks\.algorithms",
         ),
         ("total_steps = 32000", "total_steps = 13500", r"ego\.total_steps gives 4 episodes .*expected at least 5"),
         ("keep = 8", "keep 8", r"not TOML: "),
@@ -264,7 +270,7 @@ def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
 
 
 def test_task_files_round_trip(tmp_path):
-    tasks = load_profile("smoke").heuristic_tasks()
+    tasks = [work.task for work in load_profile("smoke").works()]
     path = tmp_path / "tasks.jsonl"
     write_tasks(path, tasks)
     assert read_tasks(path) == tasks
@@ -274,7 +280,7 @@ def test_task_files_round_trip(tmp_path):
 
 
 def _lines() -> list[str]:
-    return [json.dumps(asdict(task)) for task in load_profile("smoke").heuristic_tasks()]
+    return [json.dumps(asdict(task)) for task in (work.task for work in load_profile("smoke").works())]
 
 
 def _with(line: str, **fields) -> str:

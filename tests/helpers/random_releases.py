@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,6 +79,8 @@ def random_release(
     episodes: int = 6,
     length: int = 20,
     labels: bool = True,
+    oracle: bool = False,
+    learners: int = 1,
     seed: int = 0,
     shard_histories: int = 1024,
     experts: Sequence[ExpertLabels | None] = (),
@@ -86,22 +89,26 @@ def random_release(
 ) -> dict[int, dict[str, np.ndarray]]:
     """Write a release of random actions; returns the written arrays by history id.
 
-    `experts` and `sources` say where the labels and the histories of each task come from.
+    `experts` and `sources` say where the labels and the histories of each task come from; `oracle` adds oracle actions,
+    equal to the labels where the source is "noise". Every learner has `streams` histories.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
     tasks = []
     for number, task in enumerate(make_tasks(list(layouts), teammates)):
         histories = []
-        for stream in range(streams):
+        source, expert = sources[number] if sources else None, experts[number] if experts else None
+        for learner, stream in itertools.product(range(learners), range(streams)):
             arrays = random_history(get_layout(task.layout_name), episodes, length, rng)
+            if oracle:
+                same = source == "noise"
+                arrays["oracle_actions"] = arrays["expert_actions"] if same else rng.integers(0, 6, episodes * length)
             if not labels:
                 del arrays["expert_actions"]
             written[len(written)] = arrays
-            histories.append(NewHistory(stream, arrays))
-        made = Provenance(seed=task.seed, expert=experts[number] if experts else None)
-        source = sources[number] if sources else "ppo"
-        tasks.append(NewTask(task, made, streams, lambda histories=histories: histories, source=source))
+            histories.append(NewHistory(stream, arrays, learner))
+        made = Provenance(seed=task.seed, source=source, expert=expert, learners=None if learners == 1 else learners)
+        tasks.append(NewTask(task, made, len(histories), lambda histories=histories: histories))
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)
     return written

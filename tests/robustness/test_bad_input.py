@@ -79,11 +79,11 @@ def test_no_release_here(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "error", "what_to_do"),
-    [(4, FormatTooNewError, "pip install -U"), (1, FormatTooOldError, "fetch the release again")],
+    [(5, FormatTooNewError, "pip install -U"), (1, FormatTooOldError, "fetch the release again")],
 )
 def test_other_format_versions(damaged, version, error, what_to_do):
     (damaged / "meta" / "info.json").write_text(json.dumps({"format_version": version, "renamed": 1}))
-    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 2 and 3.*{what_to_do}"):
+    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 2, 3, 4.*{what_to_do}"):
         load(damaged)
 
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
+from generation.paths import Rule, Scene, is_ingredient
 from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, extra_split
-from generation.teammates.heuristics.paths import Rule, Scene, is_ingredient
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 
 RUNNER, PLATER, FLEX = range(3)

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
+from generation.paths import Paths, Scene
 from generation.policy import Noise, Policy
-from generation.teammates.heuristics.paths import Paths, Scene
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
+from generation.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
 from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, extra_split
-from generation.teammates.heuristics.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import GOAL, INDICATOR, PLATE, PLATES, POT, Layout
 from icrl4aht_data.overcooked.state import POT_STEPS

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from generation.paths import Paths, Rule, Scene
 from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
-from generation.teammates.heuristics.paths import Paths, Rule, Scene
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 from icrl4aht_data.overcooked.layouts import GOAL, PILE, PLATES, POT
 

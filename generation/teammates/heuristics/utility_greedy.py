@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from generation.paths import UNREACHABLE, Scene
 from generation.teammates.heuristics.heuristic import Heuristic, Sampling, next_key
-from generation.teammates.heuristics.paths import UNREACHABLE, Scene
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.state import ingredient_count
 

@@ -19,7 +19,7 @@ from baselines.agents.host import Percept, from_host
 from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import PROTOCOLS
-from baselines.experiments import EXPERIMENTS, TESTED_ON, ExperimentPlan, run_experiment
+from baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
 from baselines.methods.options import ModelOptions
 from baselines.report.model_card import model_card
 from baselines.report.results import note_results, read_run
@@ -28,6 +28,7 @@ from baselines.training.options import HistoryOptions, TrainOptions
 from generation.learners.encoder import CompactView
 from generation.policy import Policy
 from generation.teammates.instances import published_task
+from icrl4aht_data.benchmark.facts import TESTED_ON
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe

@@ -15,8 +15,8 @@ from generation.collection import task_folder as artefacts
 from generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, partial_folder
 from generation.learners.resume import StateFile
 from generation.profiles import Profile, load_profile
+from generation.profiles.work import Work
 from generation.releases.check import compare_rebuilds
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import TINY, artefact, start
 
@@ -31,17 +31,17 @@ def report(update, metrics):
     time.sleep(0.1)
 
 profile = load_profile(sys.argv[1])
-run_task(*profile.heuristic_tasks(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
+run_task(*profile.works(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
 """
 
 
 @pytest.fixture
 def task(built):
     profile = load_profile(str(built / "tiny.toml"))
-    return profile.heuristic_tasks()[0], profile
+    return profile.works()[0], profile
 
 
-def run_task(task: tuple[Task, Profile], *arguments, **options) -> bool:
+def run_task(task: tuple[Work, Profile], *arguments, **options) -> bool:
     return collect.run_task(task[0], task[1], *arguments, **options)
 
 

@@ -24,11 +24,11 @@ from generation.collection.task import run_task
 from generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
 from generation.learners.resume import RunLog, StateFile
 from generation.profiles import Profile, load_profile
-from icrl4aht_data.benchmark.tasks import Task
+from generation.profiles.work import Work
 from tests.helpers.tiny import artefact, start
 from tests.robustness.limits import can_mount, file_size_limit
 
-Given = tuple[Task, Profile]
+Given = tuple[Work, Profile]
 
 
 class Usage(NamedTuple):
@@ -42,7 +42,7 @@ class Usage(NamedTuple):
 @pytest.fixture
 def task(built):
     profile = load_profile(str(built / "tiny.toml"))
-    return profile.heuristic_tasks()[0], profile
+    return profile.works()[0], profile
 
 
 def never(update, metrics):
@@ -59,9 +59,9 @@ def test_free_space_is_checked_before_the_work(task: Given, tmp_path, monkeypatc
 
 
 def test_arrays_are_allocated_not_sparse(task: Given, tmp_path):
-    writer = ArtefactWriter(tmp_path, task[0], task[1].ego, 0)
+    writer = ArtefactWriter(tmp_path, task[0].task, task[1].ego, 0)
     writer.close()
-    for name, (shape, dtype) in array_shapes(task[0].layout, task[1].ego).items():
+    for name, (shape, dtype) in array_shapes(task[0].task.layout, task[1].ego).items():
         path = tmp_path / f"{name}.npy"
         assert path.stat().st_blocks * 512 >= path.stat().st_size
         found = np.load(path)
@@ -112,12 +112,12 @@ def test_failures_wait_for_room(task, tmp_path, monkeypatch):
 def test_the_other_tasks_are_finished(built, pair, tmp_path, monkeypatch):
     """The first of two tasks meets a full disk; the second is finished, and the list of failures says so."""
     profile = load_profile(str(built / "pair.toml"))
-    tasks = profile.heuristic_tasks()
-    second = tmp_path / "artefacts" / tasks[1].task_id
+    tasks = profile.works()
+    second = tmp_path / "artefacts" / tasks[1].name
     shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
     output = StringIO()
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 5_000))
-    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {tasks[0].task_id}; "):
+    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {tasks[0].name}; "):
         collect_tasks(tasks, profile, tmp_path, Console(file=output, width=500), CollectOptions())
     assert second.is_dir()
     (line,) = (tmp_path / "failed.jsonl").read_text().splitlines()
@@ -142,7 +142,7 @@ folder = Path(sys.argv[2])
 for size in map(int, sys.argv[3].split(",")):
     with small_disk(folder, size) as enlarge:
         try:
-            collect_tasks(profile.heuristic_tasks(), profile, folder, Console(), CollectOptions())
+            collect_tasks(profile.works(), profile, folder, Console(), CollectOptions())
             print("size", size, "enough")
         except CollectionError as error:
             artefacts = folder / "artefacts"

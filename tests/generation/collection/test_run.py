@@ -33,7 +33,7 @@ from tests.helpers.tiny import artefact, start
 @pytest.fixture
 def tasks(built):
     profile = load_profile(str(built / "pair.toml"))
-    return profile.heuristic_tasks(), profile
+    return profile.works(), profile
 
 
 def failures(out: Path) -> list[dict]:
@@ -52,8 +52,8 @@ def failing(monkeypatch, *errors: Exception | None) -> list[int]:
     """Replace the runner by one whose n-th call raises the n-th error; returns the seeds it was called with."""
     calls: list[int] = []
 
-    def run_task(task, profile, folder, report, *, suite, wait):
-        calls.append(task.seed)
+    def run_task(work, profile, folder, report, *, suite, wait):
+        calls.append(work.task.seed)
         error = errors[len(calls) - 1] if len(calls) <= len(errors) else None
         if error is not None:
             raise error
@@ -69,7 +69,7 @@ def test_a_task_that_raises_is_reported_and_the_others_are_done(tasks, tmp_path,
         collect(tasks, tmp_path)
     assert calls == [0, 1]
     (line,) = failures(tmp_path)
-    assert (line["task_id"], line["attempts"]) == (tasks[0][0].task_id, 1)
+    assert (line["task_id"], line["attempts"]) == (tasks[0][0].name, 1)
     assert line["error"] == "ZeroDivisionError: no steps"
     assert "Traceback" in line["traceback"]
     assert "finished" in collect(tasks, tmp_path)
@@ -110,14 +110,14 @@ def test_a_task_that_another_collector_is_at_comes_last(tasks, tmp_path, monkeyp
 
 def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     """The other one finishes its task; it is not done again."""
-    task, profile = tasks[0][0], tasks[1]
-    folder = tmp_path / "artefacts" / task.task_id
+    work, profile = tasks[0][0], tasks[1]
+    folder = tmp_path / "artefacts" / work.name
     folder.parent.mkdir()
     with run_lock(folder):
-        assert job.CollectionJob(profile, folder.parent, None, wait=False)(task) == "busy"
-        shutil.copytree(pair / "artefacts" / task.task_id, folder)
+        assert job.CollectionJob(profile, folder.parent, None, wait=False)(work) == "busy"
+        shutil.copytree(pair / "artefacts" / work.name, folder)
     before = (folder / "metadata.json").stat().st_mtime_ns
-    assert job.CollectionJob(profile, folder.parent, None, wait=True)(task) == "done"
+    assert job.CollectionJob(profile, folder.parent, None, wait=True)(work) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
@@ -203,7 +203,7 @@ def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
 def test_the_board_counts_tasks_speed_and_time_left():
     output = StringIO()
     console = Console(file=output, force_terminal=True, width=160)
-    with ProgressBoard(console, tasks=2, updates=10) as board:
+    with ProgressBoard(console, {"one": 10, "two": 10}) as board:
         board.show_running("one", 5, 1_000.0)
         board.show_running("two", 2, 500.0)
         board.show_ended("one")

@@ -101,7 +101,7 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
     shutil.copytree(folder, tmp_path / "copy")
     shutil.copy(tmp_path / "copy/checkpoints/c1/policy.json", tmp_path / "copy/checkpoints/c0/policy.json")
     profile = load_profile(str(built / "tiny.toml"))
-    assert not artefacts.is_task_finished(tmp_path / "copy", profile.heuristic_tasks()[0], profile)
+    assert not artefacts.is_task_finished(tmp_path / "copy", profile.works()[0], profile)
 
 
 def test_few_updates_have_as_many_checkpoints():
@@ -126,7 +126,7 @@ def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
     names = [path.name for path in folder.glob("*.npy")] + ["metrics.jsonl", "policy.safetensors", "policy.json"]
     metadata["files"] = {name: file_hash(folder / name) for name in names}
     (folder / METADATA).write_text(json.dumps(metadata))
-    assert not artefacts.is_task_finished(folder, profile.heuristic_tasks()[0], profile)
+    assert not artefacts.is_task_finished(folder, profile.works()[0], profile)
 
 
 def test_a_finished_task_is_not_done_again(built, monkeypatch):
@@ -143,23 +143,23 @@ def test_a_finished_task_is_not_done_again(built, monkeypatch):
 
 def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
-    (task,) = profile.heuristic_tasks()
+    (work,) = profile.works()
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
-    assert artefacts.is_task_finished(folder, task, profile)
+    assert artefacts.is_task_finished(folder, work, profile)
     (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
-    assert not artefacts.is_task_finished(folder, task, load_profile(str(built / "other.toml")))
+    assert not artefacts.is_task_finished(folder, work, load_profile(str(built / "other.toml")))
     actions = bytearray((folder / "actions.npy").read_bytes())
     actions[-1] ^= 1
     (folder / "actions.npy").write_bytes(actions)
-    assert not artefacts.is_task_finished(folder, task, profile)
+    assert not artefacts.is_task_finished(folder, work, profile)
     (folder / METADATA).unlink()
-    assert not artefacts.is_task_finished(folder, task, profile)
+    assert not artefacts.is_task_finished(folder, work, profile)
 
 
 def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
     profile = load_profile(str(built / "tiny.toml"))
-    (task,) = profile.heuristic_tasks()
+    (work,) = profile.works()
     folder = built / "b" / task.task_id
 
     def stop(update, metrics):
@@ -167,9 +167,9 @@ def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect.run_task(task, profile, folder, stop)
+        collect.run_task(work, profile, folder, stop)
     assert not folder.exists()
-    collect.run_task(task, profile, folder)
+    collect.run_task(work, profile, folder)
     for name in ("state", "actions", "teammate_actions", "rewards", "episode_end_state"):
         assert (folder / f"{name}.npy").read_bytes() == (artefact(built / "a") / f"{name}.npy").read_bytes(), name
     weights = "checkpoints/c4/policy.safetensors"
@@ -205,16 +205,16 @@ def test_nothing_but_lines_where_output_is_no_terminal(built):
 
 def test_two_collectors_never_do_one_task_together(built):
     profile = load_profile(str(built / "tiny.toml"))
-    (task,) = profile.heuristic_tasks()
+    (work,) = profile.works()
     folder = built / "c" / task.task_id
 
     def meanwhile(update, metrics):
         with pytest.raises(OptionError, match="another process works in this folder"):
-            collect.run_task(task, profile, folder)
+            collect.run_task(work, profile, folder)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect.run_task(task, profile, folder, meanwhile)
+        collect.run_task(work, profile, folder, meanwhile)
 
 
 def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):

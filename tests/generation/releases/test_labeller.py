@@ -19,6 +19,7 @@ from generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
 from generation.env import Environment
 from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
 from generation.profiles import load_profile
+from generation.profiles.work import Work
 from generation.releases import labeller
 from generation.releases.labeller import choose_checkpoint, choose_labeller
 from generation.releases.package import package_release
@@ -71,7 +72,7 @@ def task(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "artefacts" / artefact(built / "a").name
     shutil.copytree(artefact(built / "a"), folder)
-    return profile.heuristic_tasks()[0], profile, folder
+    return profile.works()[0].task, profile, folder
 
 
 def with_returns(folder: Path, greedy: list[float]) -> None:
@@ -97,8 +98,8 @@ def test_packing_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
         assert (np.array(found[way]) % 5 == 0).all()  # rewards are multiples of 5
     assert len(np.unique(found["sampled"])) > 1
     monkeypatch.setattr(labeller, "_measure", never)
-    package_release(folder.parent, tmp_path / "full", [chosen], profile, tmp_path, "full")
-    assert is_task_finished(folder, chosen, profile)
+    package_release(folder.parent, tmp_path / "full", [Work(chosen)], profile, tmp_path, "full")
+    assert is_task_finished(folder, Work(chosen), profile)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +182,7 @@ def test_index_provenance_and_card_state_the_labeller(built):
 def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
     chosen, profile, folder = task
     with_returns(folder, [0, 60, 20, 5, 0])
-    root = package_release(folder.parent, tmp_path / "lite", [chosen], profile, tmp_path, "lite")
+    root = package_release(folder.parent, tmp_path / "lite", [Work(chosen)], profile, tmp_path, "lite")
     dataset = load_icrl4aht(root)
     network, params, card = load_policy(folder / "checkpoints/c1")
     states = [history.state[:] for history in dataset]
@@ -203,7 +204,7 @@ def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_pat
     np.save(folder / "rewards.npy", rewards)
     ends = rewards.reshape(8, 5, 100).sum(axis=-1).mean()
     with_returns(folder, [ends * share] * 5)
-    root = package_release(folder.parent, tmp_path / "lite", [chosen], profile, tmp_path, "lite")
+    root = package_release(folder.parent, tmp_path / "lite", [Work(chosen)], profile, tmp_path, "lite")
     card = (root / "README.md").read_text()
     assert ("| **demo_wide** | **train** |" in card) == weak
     assert ("The labels of 1 task earn less than half" in card) == weak
@@ -218,7 +219,7 @@ def with_policies(task, tmp_path) -> Path:
     """A release with the policies of the labellers."""
     chosen, profile, folder = task
     return package_release(
-        folder.parent, tmp_path / "with", [chosen], replace(profile, policies=True), tmp_path, "lite"
+        folder.parent, tmp_path / "with", [Work(chosen)], replace(profile, policies=True), tmp_path, "lite"
     )
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from generation.env import Environment
+from generation.paths import Paths, Scene
 from generation.policy import Noise
 from generation.teammates.heuristics import territory
 from generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
 from generation.teammates.heuristics.heuristic import draw
-from generation.teammates.heuristics.paths import Paths, Scene
 from generation.teammates.instances import published_thetas
 from generation.teammates.registry import (
     HEURISTIC_FAMILIES,

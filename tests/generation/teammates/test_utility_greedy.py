@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from generation.paths import UNREACHABLE, Paths
 from generation.policy import Noise
 from generation.teammates.heuristics import utility_greedy
 from generation.teammates.heuristics.heuristic import next_key
-from generation.teammates.heuristics.paths import UNREACHABLE, Paths
 from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY, GreedyMemory
 from generation.teammates.registry import build_teammate, heuristic_teammate
 from icrl4aht_data.overcooked import rules

@@ -96,7 +96,7 @@ def test_returns_of_experts_are_those_of_the_provenance(tmp_path, name, value):
     (task,) = make_tasks(["demo_simple"])
     arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
     labels = ExpertLabels("ab" * 32, "greedy", step=7, return_greedy=0.0, return_sampled=16.9, episodes=200)
-    new = NewTask(task, Provenance(expert=labels), 1, lambda: [NewHistory(0, arrays)], source="dqn")
+    new = NewTask(task, Provenance(source="dqn", expert=labels), 1, lambda: [NewHistory(0, arrays)])
     root = write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
     to_release(load_icrl4aht(root), tmp_path / "converted", "full")
     for folder in (root, tmp_path / "converted"):

@@ -252,8 +252,8 @@ def hash_batches(dataset: Dataset) -> bytes:
 
 def hash_arrays(dataset: Dataset) -> bytes:
     """Return a hash of every stored array and of the observations."""
-    names = [stored.name for stored in held_fields(dataset.info.kind)]
-    return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names)] for h in dataset))
+    names = {h: [one.name for one in held_fields(dataset.info.kind) if h.entry.has(one)] for h in dataset}
+    return _hash(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
 
 
 def _hash(arrays: Iterable[np.ndarray]) -> bytes:

@@ -1,8 +1,8 @@
-"""Features of a state for heuristic teammates: shortest paths of the layout, masks over cells, and moves made of them.
+"""Features of a state for scripted agents: shortest paths of the layout, masks over cells, and moves made of them.
 
-`cells` denotes the cells of the layout, row by row. Teammates see the complete state. The partner never blocks a path;
-ties resolve in the order right, down, left, up (first steps) and above, below, left, right (access cells), scanning
-targets row by row. Source: paper, App. B.2.
+`cells` denotes the cells of the layout, row by row. Scripted agents see the complete state. The partner never blocks a
+path; ties resolve in the order right, down, left, up (first steps) and above, below, left, right (access cells),
+scanning targets row by row. Source: paper, App. B.2.
 """
 
 from __future__ import annotations

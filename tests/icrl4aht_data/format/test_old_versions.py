@@ -1,4 +1,4 @@
-"""Releases of format version 2: read, verified, combined with others, converted to the current version."""
+"""Releases of format versions 2 and 3: read, verified, combined with others, converted to the current version."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.dataset_card import SOURCE_CARD
 from tests.helpers.batches import CACHES, assert_equal, digest
-from tests.helpers.old_releases import NEW_FIELDS, as_version_2
+from tests.helpers.old_releases import NEW_FIELDS, as_version
 from tests.helpers.random_releases import SHARD, random_release
 
 
@@ -29,7 +29,13 @@ def old(lite, tmp_path_factory) -> Path:
     """`lite` in format version 2, with a source card. Read only."""
     root = shutil.copytree(lite[0], tmp_path_factory.mktemp("old") / "release")
     (root / SOURCE_CARD).write_text("# sources\n")
-    return as_version_2(root)
+    return as_version(root, 2)
+
+
+@pytest.fixture(scope="module")
+def version_3(lite, tmp_path_factory) -> Path:
+    """`lite` in format version 3. Read only."""
+    return as_version(shutil.copytree(lite[0], tmp_path_factory.mktemp("old") / "version_3"), 3)
 
 
 @pytest.mark.parametrize("cache", CACHES)
@@ -38,10 +44,10 @@ def test_it_is_read(lite, old, cache):
     for options in ({}, {"source": "ppo"}):
         assert len(load_icrl4aht(old).index.query(**options)) == 12
     for line in (old / HISTORIES).read_text().splitlines():
-        assert not set(NEW_FIELDS) & json.loads(line).keys()
+        assert not set(NEW_FIELDS[2]) & json.loads(line).keys()
     assert list(load_icrl4aht(old).entries) == list(load_icrl4aht(lite[0]).entries)
     entry = load_icrl4aht(old).entries[3]
-    assert [getattr(entry, name) for name in NEW_FIELDS] == ["ppo", None, None, None]
+    assert [getattr(entry, name) for name in NEW_FIELDS[2]] == ["ppo", None, None, None, 0, False]
     one, two = (load_icrl4aht(root, layout="demo_wide", cache=cache) for root in (old, lite[0]))
     assert_equal(one.ad(batch_size=4, length=30, seed=1)[2], two.ad(batch_size=4, length=30, seed=1)[2])
 
@@ -58,10 +64,21 @@ def test_that_it_has_no_hashes_is_said(lite, old):
     assert "without chunk hashes" not in repr(load_icrl4aht(lite[0])) and not verify_release(lite[0]).notes
 
 
-@pytest.mark.parametrize("kind", ["lite", "full"])
-def test_convert_brings_it_to_the_current_version(request, tmp_path, kind):
+def test_version_3_is_read_and_verified(lite, version_3):
+    assert read_info(version_3).format_version == 3
+    line = json.loads((version_3 / HISTORIES).read_text().splitlines()[0])
+    assert "source" in line and not set(NEW_FIELDS[3]) & line.keys()
+    assert list(load_icrl4aht(version_3).entries) == list(load_icrl4aht(lite[0]).entries)
+    assert_equal(*(load_icrl4aht(root, layout="demo_wide").dpt(4, 30, seed=1)[2] for root in (version_3, lite[0])))
+    report = verify_release(version_3, level="deep")
+    assert report.ok and not report.notes, report
+    assert "without chunk hashes" not in repr(load_icrl4aht(version_3))
+
+
+@pytest.mark.parametrize(("kind", "version"), [("lite", 2), ("lite", 3), ("full", 2)])
+def test_convert_brings_it_to_the_current_version(request, tmp_path, kind, version):
     root = request.getfixturevalue(kind)[0]
-    as_version_2(shutil.copytree(root, tmp_path / "old"))
+    as_version(shutil.copytree(root, tmp_path / "old"), version)
     (tmp_path / "old" / SOURCE_CARD).write_text("# sources\n")
     write_manifest(tmp_path / "old")
     result = CliRunner().invoke(cli, ["convert", str(tmp_path / "old"), "--out", str(tmp_path / "new")])
@@ -89,15 +106,15 @@ def test_it_is_combined_with_a_current_one(old, tmp_path):
 
 
 def test_it_is_not_published(old, tmp_path):
-    with pytest.raises(OptionError, match="format version 2, releases are published in 3: convert it first"):
+    with pytest.raises(OptionError, match=r"format version 2 has no chunk hashes.* convert it first"):
         build_release(old, tmp_path / "built")
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", [2, 4])
 def test_chunk_tables_have_the_version_of_the_release(lite, old, tmp_path, version):
     """So that nobody can pass off tables without hashes as those of a release that has them."""
-    root = shutil.copytree(lite[0] if version == 3 else old, tmp_path / "release")
-    shutil.copyfile(chunk_table_path(old if version == 3 else lite[0], SHARD), chunk_table_path(root, SHARD))
+    root = shutil.copytree(lite[0] if version == 4 else old, tmp_path / "release")
+    shutil.copyfile(chunk_table_path(old if version == 4 else lite[0], SHARD), chunk_table_path(root, SHARD))
     write_manifest(root)
     with pytest.raises(ChunkTableError, match=f"the chunk table is not of format version {version}; fetch meta/ again"):
         load_icrl4aht(root)[0].actions[:]
@@ -108,12 +125,12 @@ def test_versions_of_shards_are_compared(lite, old, tmp_path):
     root = shutil.copytree(lite[0], tmp_path / "release")
     shutil.copyfile(old / SHARD, root / SHARD)
     problems = [finding.problem for finding in verify_release(root).findings]
-    assert any("attributes: expected {'format_version': 3" in problem for problem in problems), problems
+    assert any("attributes: expected {'format_version': 4" in problem for problem in problems), problems
 
 
 def test_the_info_may_not_say_another_version(old, tmp_path):
     root = shutil.copytree(old, tmp_path / "release")
-    (root / INFO).write_text((root / INFO).read_text().replace('"format_version": 2', '"format_version": 3'))
+    (root / INFO).write_text((root / INFO).read_text().replace('"format_version": 2', '"format_version": 4'))
     write_manifest(root)
-    with pytest.raises(ChunkTableError, match="not of format version 3"):
+    with pytest.raises(ChunkTableError, match="not of format version 4"):
         load_icrl4aht(root)[0].actions[:]

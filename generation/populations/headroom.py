@@ -1,0 +1,104 @@
+"""Which learned teammates an ego matters with: a reference ego, or the partner that a teammate was trained with, earns
+another return than the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from generation.env import Environment
+from generation.learners.rollout import init_rollout, policy_player, roll_out
+from generation.policy import Policy
+from generation.populations.train import RESPONSES
+from generation.teammates.draws import LEAST_HEADROOM
+from generation.teammates.learned import build_learned
+from generation.teammates.references import EPISODES, reference_returns
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.checkpoints import checkpoint_folder
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+
+_SEED = 12
+
+
+class LearnedHeadroom(NamedTuple):
+    """Mean returns of 20 episodes of 100 steps with a learned teammate.
+
+    Attributes:
+        stay, random, oracle: of the reference egos.
+        self_play: of the policy that it was trained with, which draws its actions: its last best response, or itself.
+    """
+
+    stay: float
+    random: float
+    oracle: float
+    self_play: float
+
+    @property
+    def matters(self) -> bool:
+        """Whether some ego earns at least 5 more than another."""
+        return max(self) - min(self) >= LEAST_HEADROOM
+
+    def describe(self) -> str:
+        """Returns the returns as a text."""
+        return ", ".join(f"{name.replace('_', '-')} {value:.1f}" for name, value in self._asdict().items())
+
+
+def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, LearnedHeadroom]:
+    """Measure how much an ego matters with learned teammates.
+
+    Args:
+        tasks: tasks with learned teammates.
+        suite: folder of their checkpoints.
+
+    Returns:
+        task id -> returns.
+    """
+    found = {}
+    for layout in dict.fromkeys(task.layout for task in tasks):
+        own = [task for task in tasks if task.layout == layout]
+        folders = [checkpoint_folder(suite, task.teammate) for task in own]
+        mates = [build_learned(layout, folder) for folder in folders]
+        partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
+        returns = reference_returns(layout, mates)
+        self_play = [_paired_return(layout, ego, mate) for ego, mate in zip(partners, mates, strict=True)]
+        for k, task in enumerate(own):
+            found[task.task_id] = LearnedHeadroom(
+                *(float(returns[name][k]) for name in ("stay", "random", "oracle")), self_play[k]
+            )
+    return found
+
+
+def _partner(folder: Path) -> Path:
+    """Folder of the policy that a checkpoint, m<k>/c<n>, was trained with."""
+    response = folder.parent.parent / RESPONSES / folder.parent.name
+    return response if response.is_dir() else folder
+
+
+def _paired_return(layout: Layout, ego: Policy, mate: Policy) -> float:
+    play = _compiled(layout, ego._replace(params=()), mate._replace(params=()))
+    return float(np.asarray(play(ego.params, mate.params)).mean())
+
+
+@lru_cache(maxsize=8)
+def _compiled(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
+    """A function of both policies' parameters that returns the returns, float32 (EPISODES,)."""
+    env = Environment(layout, KEPT_STEPS)
+
+    @jax.jit
+    def play(ego_params: Any, mate_params: Any) -> jax.Array:
+        players = [
+            policy_player(env, ego, ego_params, EGO, EPISODES),
+            policy_player(env, mate, mate_params, TEAMMATE, EPISODES),
+        ]
+        episodes, actions = jax.random.split(jax.random.key(_SEED))
+        carry = init_rollout(env, players, jax.random.split(episodes, EPISODES))
+        return roll_out(env, players, carry, KEPT_STEPS, actions)[1].reward.sum(axis=0)
+
+    return play

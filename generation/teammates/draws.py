@@ -1,0 +1,208 @@
+"""Heuristic teammates drawn from the published training ranges: which ones training and validation tasks may have.
+
+`draws.jsonl` has one line per draw, measured by `python -m generation draws`, so that tasks are known without any
+simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws act alike,
+and on some layouts all draws of a family act like a test instance. Those are not admissible: no task has them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+from icrl4aht_data.benchmark.facts import TESTED_ON
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
+
+DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
+"""Table of all draws."""
+
+SAME_BEHAVIOUR = 0.02
+"""Hamming distance below which two teammates count as one behaviour."""
+
+LEAST_HEADROOM = 5.0
+"""Difference of the reference egos' returns from which the ego matters."""
+
+DRAWS_PER_SEED = {0: 32, 1: 8}
+"""base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""
+
+
+class Draw(NamedTuple):
+    """One draw on one layout: `sample_teammate(family, theta_id, "train", base_seed)`.
+
+    Attributes:
+        layout: short name of a training layout.
+        family: kind of the heuristic, such as "utility_greedy".
+        base_seed: 0 for training, 1 for validation.
+        theta_id: number of the draw, from 0.
+        nearest: test instance that acts most like it, such as "H3/t1".
+        distance: Hamming distance to that instance, 0..1; see `generation.teammates.distances`.
+        behaviour: number that the layout's draws of one family, of all seeds, share if they act alike.
+        stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
+        random: mean return of the ego `random`.
+        oracle: mean return of the ego `oracle`.
+    """
+
+    layout: str
+    family: str
+    base_seed: int
+    theta_id: int
+    nearest: str
+    distance: float
+    behaviour: int
+    stay: float
+    random: float
+    oracle: float
+
+    @property
+    def admissible(self) -> bool:
+        """Whether it acts unlike every test instance."""
+        return self.distance >= SAME_BEHAVIOUR
+
+    @property
+    def headroom(self) -> bool:
+        """Whether the ego matters."""
+        returns = (self.stay, self.random, self.oracle)
+        return max(returns) - min(returns) >= LEAST_HEADROOM
+
+
+def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
+    """Returns the draws of a family on a training layout, by theta_id.
+
+    Raises:
+        UnknownNameError: for an unknown layout, family or seed, and for a layout without training tasks.
+    """
+    name = get_layout(layout).name
+    if name not in TESTED_ON:
+        raise unknown("training layout", layout, TESTED_ON)
+    if family not in HEURISTIC_FAMILIES:
+        raise unknown("teammate family", family, HEURISTIC_FAMILIES)
+    if base_seed not in DRAWS_PER_SEED:
+        raise unknown("base_seed of draws", base_seed, map(str, DRAWS_PER_SEED))
+    return list(_bundled_draws().get((name, family, base_seed), ()))
+
+
+def drawn_teammates(
+    layout: str, families: Sequence[str], count: int, base_seed: int = 0
+) -> list[tuple[dict[str, Any], Draw]]:
+    """Chooses drawn teammates of a layout, without any simulation.
+
+    The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
+    layout, of any family, has headroom. Each family first gives one draw of every behaviour, then its other draws, both
+    by theta_id.
+
+    Args:
+        layout: a training layout.
+        families: kinds of heuristics, in the order of their turns.
+        count: number of teammates.
+        base_seed: 0 for training, 1 for validation.
+
+    Returns:
+        Teammate entries, as `sample_teammate` returns them, with their draws.
+
+    Raises:
+        OptionError: for an unknown family, a family without admissible draws on the layout, and a larger count than
+            the families have draws.
+        UnknownNameError: for an unknown layout or seed, and for a layout without training tasks.
+    """
+    name = get_layout(layout).name
+    for family in families:
+        if family not in HEURISTIC_FAMILIES:
+            raise OptionError(str(unknown("teammate family", family, HEURISTIC_FAMILIES)))
+    queues = [_queue(name, family, base_seed) for family in dict.fromkeys(families)]
+    available = sum(map(len, queues))
+    if count > available:
+        raise OptionError(
+            f"{name}: {count} drawn teammates requested of {', '.join(families) or 'no family'}, which have only "
+            f"{available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
+        )
+    turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
+    return [(sample_teammate(draw.family, draw.theta_id, "train", base_seed), draw) for draw in turns[:count]]
+
+
+def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
+    """Returns the families with draws that tasks of a training layout may have, in the order of the paper."""
+    return [family for family in HEURISTIC_FAMILIES if _usable(get_layout(layout).name, family, base_seed)]
+
+
+def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
+    """The draws of a family that may be chosen, in the order in which they are; at least one."""
+    draws = _usable(layout, family, base_seed)
+    if not draws:
+        raise OptionError(
+            f"{layout} cannot host drawn teammates of {family}: {_reason(layout, family, base_seed)}; "
+            f"name other families ({_hosted_text(layout, base_seed)})"
+        )
+    first = {draw.behaviour: draw for draw in reversed(draws)}
+    return sorted(draws, key=lambda draw: (first[draw.behaviour] != draw, draw.theta_id))
+
+
+def _usable(layout: str, family: str, base_seed: int) -> list[Draw]:
+    draws = [draw for draw in read_draws(layout, family, base_seed) if draw.admissible]
+    return [draw for draw in draws if draw.headroom] if _has_headroom(layout, base_seed) else draws
+
+
+def _has_headroom(layout: str, base_seed: int) -> bool:
+    """Whether any admissible draw of the layout has headroom."""
+    draws = (draw for family in HEURISTIC_FAMILIES for draw in read_draws(layout, family, base_seed))
+    return any(draw.admissible and draw.headroom for draw in draws)
+
+
+def _reason(layout: str, family: str, base_seed: int) -> str:
+    """Why no draw of a family may be used on a layout."""
+    draws = read_draws(layout, family, base_seed)
+    if not draws:
+        return "it has no draws there; `python -m generation draws` measures them"
+    if not any(draw.admissible for draw in draws):
+        farthest = max(draws, key=lambda draw: draw.distance)
+        return (
+            f"all {len(draws)} draws act like a test instance (Hamming distance at most {farthest.distance:.3f}, to "
+            f"{farthest.nearest}; expected at least {SAME_BEHAVIOUR})"
+        )
+    return f"the ego matters with none of its admissible draws (returns differ by less than {LEAST_HEADROOM:g})"
+
+
+def _hosted_text(layout: str, base_seed: int) -> str:
+    counts = {family: len(_usable(layout, family, base_seed)) for family in hosted_families(layout, base_seed)}
+    return "available: " + (", ".join(f"{count} of {family}" for family, count in counts.items()) or "none")
+
+
+@lru_cache(maxsize=1)
+def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
+    draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
+    for draw in read_draws_table(DRAWS_TABLE):
+        draws[draw.layout, draw.family, draw.base_seed].append(draw)
+    return {key: tuple(found) for key, found in draws.items()}
+
+
+def read_draws_table(path: Path) -> list[Draw]:
+    """The draws of a table, in its order.
+
+    Raises:
+        TaskFormatError: names the file and the line.
+    """
+    draws = []
+    for number, line in enumerate(read_lines(path), start=1):
+        try:
+            draws.append(Draw(**parse_json(line)))
+        except (TypeError, Icrl4ahtError) as error:
+            raise TaskFormatError(f"{path}, line {number}: expected the fields {', '.join(Draw._fields)}") from error
+    return draws
+
+
+def write_draws_table(path: Path, draws: Iterable[Draw]) -> None:
+    """Write draws, one JSON line each, by layout, family, seed and theta_id."""
+    layouts, families = list(TESTED_ON), list(HEURISTIC_FAMILIES)
+
+    def order(draw: Draw) -> tuple[int, ...]:
+        return layouts.index(draw.layout), families.index(draw.family), draw.base_seed, draw.theta_id
+
+    lines = (json.dumps(draw._asdict(), separators=(",", ":")) for draw in sorted(draws, key=order))
+    with atomic_write(path) as partial:
+        partial.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
