@@ -14,8 +14,9 @@ from rich.console import Console
 
 from generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
 from generation.learners.config import PPOConfig, Widths
+from generation.progress import progress_bars
 from generation.teammates.instances import published_tasks
-from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TESTED_ON, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
@@ -33,7 +34,7 @@ from icrl4aht_data.commands.options import (
     run,
     version_option,
 )
-from icrl4aht_data.errors import OptionError, TaskFormatError
+from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write
@@ -64,7 +65,7 @@ _threads_option = click.option(
 _SECTIONS = {
     "Rebuild": ("plan", "generate", "check"),
     "Learned teammates": ("teammates", "diversity"),
-    "Maintain": ("speed", "manifests"),
+    "Maintain": ("speed", "draws", "manifests"),
 }
 
 
@@ -247,24 +248,60 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of the published test tasks.
+    """Write the manifests of the test and validation tasks.
 
-    Makes teammate_test.jsonl and layout_test.jsonl from the published parameter sets. Files that have these tasks are
-    kept.
+    Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl from the drawn teammates that
+    `draws` measured. Files that have these tasks are kept.
     """
-    for track in TRACKS:
-        path, tasks = manifest_path(track, "test"), published_tasks(track)
+    from generation.teammates.draws import validation_tasks
+
+    made = {"test": published_tasks, "validation": validation_tasks}
+    for track, split in [(track, split) for split in made for track in TRACKS]:
+        path, tasks = manifest_path(track, split), made[split](track)
         path = out / path.name if out else path
         if check or path.is_file():
             different = read_tasks(path) != tasks
             if different and (check or not overwrite):
                 remedy = "run `python -m generation manifests --overwrite`" if check else "replace it by --overwrite"
-                raise TaskFormatError(f"{path}: differs from the parameter sets; {remedy}")
+                raise TaskFormatError(f"{path}: differs from the parameter sets or draws; {remedy}")
         if not check:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as partial:
                 write_tasks(partial, tasks)
         console.print(f"{path}: {len(tasks)} tasks")
+
+
+@cli.command(epilog=examples("python -m generation draws --layout demo_wide --out draws.jsonl"))
+@click.option(
+    "--layout", "layouts", type=LAYOUT, multiple=True, help="Training layout; repeat for more.", show_default="all"
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Write the table here.",
+    show_default="the package's file",
+)
+@click.option("--overwrite", is_flag=True, help="Measure again what the table has.")
+def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
+    """Measure the heuristic teammates that tasks may draw.
+
+    Draws parameters from the training ranges, 32 for training and 8 for validation of each family on each layout, and
+    writes for each draw which test instance acts most like it, and what the egos stay, random and oracle earn with it.
+    Layouts that the table has are kept, so that a stopped command resumes.
+    """
+    from generation.teammates.draws import DRAWS_TABLE
+    from generation.teammates.measuring import fill_table
+
+    names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
+    for name in names:
+        if name not in TESTED_ON:
+            raise unknown("training layout", name, TESTED_ON)
+    path = out or DRAWS_TABLE
+    with progress_bars(console) as bars:
+        bar = bars.add_task("draws", total=len(names), note="", unit="layouts")
+        fill_table(path, names, lambda done, name: bars.update(bar, completed=done, note=name), overwrite)
+    console.print(f"wrote {path}")
 
 
 def _layouts_option(default_text: str) -> Callable[[Any], Any]:

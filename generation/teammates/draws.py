@@ -2,7 +2,8 @@
 
 `draws.jsonl` has one line per draw, measured by `python -m generation draws`, so that tasks are known without any
 simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws act alike,
-and on some layouts all draws of a family act like a test instance. Those are not admissible: no task has them.
+and on some layouts all draws of a family act like one of its test instances. Those are not admissible: no task has
+them.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
-from icrl4aht_data.benchmark.facts import TESTED_ON
+from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
@@ -33,6 +35,9 @@ DRAWS_PER_SEED = {0: 32, 1: 8}
 """base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""
 
 
+_VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
+
+
 class Draw(NamedTuple):
     """One draw on one layout: `sample_teammate(family, theta_id, "train", base_seed)`.
 
@@ -41,12 +46,14 @@ class Draw(NamedTuple):
         family: kind of the heuristic, such as "utility_greedy".
         base_seed: 0 for training, 1 for validation.
         theta_id: number of the draw, from 0.
-        nearest: test instance that acts most like it, such as "H3/t1".
+        nearest: test instance of its family that acts most like it, such as "H3/t1".
         distance: Hamming distance to that instance, 0..1; see `generation.teammates.distances`.
         behaviour: number that the layout's draws of one family, of all seeds, share if they act alike.
         stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
         random: mean return of the ego `random`.
         oracle: mean return of the ego `oracle`.
+        other: test instance of the other families that acts most like it; for information, it excludes no draw.
+        other_distance: Hamming distance to that instance.
     """
 
     layout: str
@@ -59,10 +66,12 @@ class Draw(NamedTuple):
     stay: float
     random: float
     oracle: float
+    other: str = ""
+    other_distance: float = 1.0
 
     @property
     def admissible(self) -> bool:
-        """Whether it acts unlike every test instance."""
+        """Whether it acts unlike every test instance of its family."""
         return self.distance >= SAME_BEHAVIOUR
 
     @property
@@ -124,6 +133,20 @@ def drawn_teammates(
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     return [(sample_teammate(draw.family, draw.theta_id, "train", base_seed), draw) for draw in turns[:count]]
+
+
+def validation_tasks(track: str) -> list[Task]:
+    """Tasks of the split `validation`, for choosing models: up to four teammates of each training layout, of seed 1.
+
+    Layouts on which every draw of that seed acts like a test instance have none.
+    """
+    tasks = []
+    for layout in TRACKS[track]["validation"]:
+        families = hosted_families(layout, _VALIDATION_SEED)
+        count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
+        chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)
+        tasks += [make_task(track, "validation", layout, teammate, seed=0) for teammate, _ in chosen]
+    return tasks
 
 
 def hosted_families(layout: str, base_seed: int = 0) -> list[str]:

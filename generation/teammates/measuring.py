@@ -2,60 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from generation.teammates.distances import (
-    CommonStates,
-    act_along,
-    common_states,
-    distances_to_tests,
-    group_behaviours,
-)
-from generation.teammates.draws import DRAWS_PER_SEED, Draw
+import numpy as np
+
+from generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
+from generation.teammates.draws import DRAWS_PER_SEED, Draw, read_draws_table, write_draws_table
+from generation.teammates.instances import INSTANCES
 from generation.teammates.references import reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
-from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _DIGITS = 4
-"""Decimal places of stored numbers: all digits of shares of 2,000 states, and of means of 20 returns."""
+"""Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
+
+DRAW_NUMBERS = [
+    (family, base_seed, theta_id)
+    for family in HEURISTIC_FAMILIES
+    for base_seed, count in DRAWS_PER_SEED.items()
+    for theta_id in range(count)
+]
+"""Family, base_seed and theta_id of each draw of a layout."""
 
 
-def measure_layout(layout: Layout, per_seed: Mapping[int, int] = DRAWS_PER_SEED) -> Iterator[list[Draw]]:
-    """Measures the draws of a training layout.
+def fill_table(path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool) -> None:
+    """Measure the layouts whose draws a table does not have yet, and write it after each of them.
+
+    Args:
+        path: the table; a missing one is started.
+        layouts: short names of training layouts.
+        on_layout: called with the number of finished layouts and the name of the next one.
+        overwrite: also measure the layouts that the table has.
+    """
+    draws = read_draws_table(path) if path.is_file() else []
+    measured = Counter(draw.layout for draw in draws)
+    for number, name in enumerate(layouts):
+        on_layout(number, name)
+        if overwrite or measured[name] != len(DRAW_NUMBERS):
+            draws = [draw for draw in draws if draw.layout != name]
+            draws += measure_draws(get_layout(name))
+            write_draws_table(path, draws)
+    on_layout(len(layouts), "")
+
+
+def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW_NUMBERS) -> list[Draw]:
+    """Measures draws on a training layout. Behaviours are numbered within these draws.
 
     Args:
         layout: the layout.
-        per_seed: base_seed -> number of draws of each family.
-
-    Yields:
-        The draws of one family after the other.
+        numbers: family, base_seed and theta_id of each draw.
     """
+    policies = [
+        build_teammate(layout, sample_teammate(family, theta_id, "train", seed)) for family, seed, theta_id in numbers
+    ]
     common = common_states(layout)
-    for family in HEURISTIC_FAMILIES:
-        yield measure_family(layout, family, common, per_seed)
-
-
-def measure_family(
-    layout: Layout, family: str, common: CommonStates, per_seed: Mapping[int, int] = DRAWS_PER_SEED
-) -> list[Draw]:
-    """Measures the draws of one family on a training layout, see `measure_layout`."""
-    numbers = [(seed, theta_id) for seed, count in per_seed.items() for theta_id in range(count)]
-    policies = [build_teammate(layout, sample_teammate(family, theta_id, "train", seed)) for seed, theta_id in numbers]
     actions = act_along(layout, policies, common.records)
     distances = distances_to_tests(common, actions)
-    nearest = distances.argmin(axis=1)
-    behaviours = group_behaviours(actions)
+    families = np.array([family for family, _, _ in numbers])
+    own = families[:, None] == np.repeat(list(HEURISTIC_FAMILIES), INSTANCES)
+    nearest, others = (np.where(mask, distances, np.inf).argmin(axis=1) for mask in (own, ~own))
+    behaviours = np.zeros(len(numbers), int)
+    for family in np.unique(families):
+        behaviours[families == family] = group_behaviours(actions[families == family])
     returns = reference_returns(layout, policies)
+
+    def near(k: int, instance: int) -> tuple[str, float]:
+        return common.instances[instance], round(float(distances[k, instance]), _DIGITS)
+
     return [
         Draw(
             layout.name,
-            family,
-            seed,
-            theta_id,
-            common.instances[nearest[k]],
-            round(float(distances[k, nearest[k]]), _DIGITS),
-            behaviours[k],
+            *numbers[k],
+            *near(k, nearest[k]),
+            int(behaviours[k]),
             *(round(float(returns[ego][k]), _DIGITS) for ego in ("stay", "random", "oracle")),
+            *near(k, others[k]),
         )
-        for k, (seed, theta_id) in enumerate(numbers)
+        for k in range(len(numbers))
     ]

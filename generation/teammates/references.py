@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from generation.env import Environment, EnvState
+from generation.env import Environment
 from generation.experts.oracle import oracle
 from generation.learners.rollout import Player, init_rollout, policy_player, roll_out
 from generation.policy import Policy, stacked
@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
 EPISODES = 20
-"""Episodes over which a return is measured."""
+"""Episodes over which the return of a reference ego is measured."""
 
 _SEED = 11
 
@@ -27,42 +27,44 @@ _SEED = 11
 def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int = EPISODES) -> dict[str, np.ndarray]:
     """Measures the reference egos with teammates, in episodes of 100 steps.
 
-    All pairs play from the same starts. A teammate's returns do not depend on the other teammates. Teammates that share
-    their functions share one compilation.
+    All pairs play from the same starts, and a teammate's returns do not depend on the other teammates. There is one
+    compilation, in which policies with the same functions are one.
 
     Args:
         layout: the layout.
-        teammates: policies that play agent 1.
+        teammates: policies that play agent 1; at least one.
         episodes: number of episodes of each ego with each teammate.
 
     Returns:
         "stay", "random" and "oracle" -> mean return with each teammate, float64 (teammates,).
     """
     env, egos = Environment(layout, KEPT_STEPS), reference_egos(layout)
-    returns = np.zeros((len(egos), len(teammates)))
-    for numbers, family in stacked_families(teammates):
-        returns[:, numbers] = _mean_returns(env, tuple(egos.values()), family, len(numbers), episodes)
-    return dict(zip(egos, returns, strict=True))
-
-
-def _mean_returns(env: Environment, egos: Sequence[Policy], family: Policy, mates: int, episodes: int) -> np.ndarray:
-    """Mean returns (egos, teammates); environments are ordered by ego, teammate and episode."""
-    n = mates * episodes
-    keys = jax.random.split(jax.random.key(_SEED), episodes)
+    families = list(stacked_families(teammates))
+    each = len(teammates) * episodes
+    total = len(egos) * each  # environments are ordered by ego, teammate and episode
+    mate_of = np.arange(total) // episodes % len(teammates)
+    starts = jax.random.split(jax.random.key(_SEED), episodes)
 
     @jax.jit
     def play(params):
-        own = jax.tree.map(lambda leaf: jnp.concatenate([jnp.repeat(leaf, episodes, axis=0)] * len(egos)), params)
         players = [
-            player_in_some(env, ego, (), EGO, np.arange(k * n, (k + 1) * n), len(egos) * n)
-            for k, ego in enumerate(egos)
+            player_in_some(env, ego, (), EGO, np.arange(k * each, (k + 1) * each), total)
+            for k, ego in enumerate(egos.values())
         ]
-        players.append(policy_player(env, family, own, TEAMMATE, len(egos) * n, own_params=True))
-        carry = init_rollout(env, players, jnp.tile(keys, len(egos) * mates))
-        return roll_out(env, players, carry, env.max_steps, keys[0])[1].reward.sum(axis=0)
+        for (numbers, family), all_params in zip(families, params, strict=True):
+            envs = np.flatnonzero(np.isin(mate_of, numbers))
+            own = _rows(all_params, np.searchsorted(numbers, mate_of[envs]))
+            players.append(player_in_some(env, family, own, TEAMMATE, envs, total, own_params=True))
+        carry = init_rollout(env, players, jnp.tile(starts, total // episodes))
+        return roll_out(env, players, carry, env.max_steps, starts[0])[1].reward.sum(axis=0)
 
-    earned = np.asarray(play(family.params), np.float64)
-    return earned.reshape(len(egos), mates, episodes).mean(axis=-1)
+    earned = np.asarray(play([family.params for _, family in families]), np.float64)
+    means = earned.reshape(len(egos), len(teammates), episodes).mean(axis=-1)
+    return dict(zip(egos, means, strict=True))
+
+
+def _rows(tree: Any, rows: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
 def reference_egos(layout: Layout) -> dict[str, Policy]:
@@ -96,13 +98,10 @@ def player_in_some(
     """
     player = policy_player(env, policy, params, agent, len(envs), own_params=own_params)
 
-    def part(state: EnvState) -> EnvState:
-        return jax.tree.map(lambda leaf: leaf[envs], state)
-
     return Player(
         agent * total + envs,
-        lambda state: player.init(part(state)),
-        lambda memory, state, key: player.act(memory, part(state), key),
+        lambda state: player.init(_rows(state, envs)),
+        lambda memory, state, key: player.act(memory, _rows(state, envs), key),
     )
 
 
