@@ -15,6 +15,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run as run_command
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
+from icrl4aht_data.format.schema import FORMAT_VERSION
 from tests.helpers.paths import ROOT
 
 
@@ -40,7 +41,7 @@ def test_list(lite):
 
 def test_show_release_and_history(lite):
     release = json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)
-    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, 3)
+    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, FORMAT_VERSION)
     history = json.loads(CliRunner().invoke(cli, ["show", "--json", "--history", "7", str(lite[0])]).output)
     assert (history["history_id"], history["layout"], history["T"]) == (7, "demo_wide", 120)
     assert history["teammate"]["family"] == "utility_greedy"
