@@ -10,6 +10,7 @@ are those of the layout that their models are tested on, acting on the training 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -87,6 +88,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     ]
 
 
+@lru_cache(maxsize=2)
 def common_states(layout: Layout) -> CommonStates:
     """Returns the states of a training layout on which teammates are compared.
 
@@ -120,9 +122,12 @@ def common_states(layout: Layout) -> CommonStates:
         return roll_out(env, players, carry, env.max_steps, key)[1].record
 
     records = play([family.params for family in families], jax.random.key(_SEED))
-    actions = [act_along(layout, policies, records[:, k * each : (k + 1) * each]) for k, policies in enumerate(tests)]
+    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
+    actions = np.concatenate(
+        [act_along(layout, own, records)[:, :, k * each : (k + 1) * each] for k, own in enumerate(tests)]
+    )
     names = tuple(f"{short}/t{t}" for short in HEURISTIC_KINDS.values() for t in range(INSTANCES))
-    return CommonStates(records, names, np.concatenate(actions))
+    return CommonStates(records, names, actions)
 
 
 def act_along(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
@@ -180,8 +185,9 @@ def group_behaviours(actions: np.ndarray) -> list[int]:
     A policy has the behaviour of the first one before it that opened a behaviour and acts like it, that is, whose
     distance is below `SAME_BEHAVIOUR`; else it opens the next one.
     """
-    flat, first, found = actions.reshape(len(actions), -1), [], []
-    for own in flat:
+    first: list[np.ndarray] = []
+    found: list[int] = []
+    for own in actions:
         same = (k for k, other in enumerate(first) if (own != other).mean() < SAME_BEHAVIOUR)
         found.append(next(same, len(first)))
         if found[-1] == len(first):

@@ -10,8 +10,18 @@ import pytest
 from generation.learners.rollout import Rollout
 from generation.policy import Policy
 from generation.teammates import references
-from generation.teammates.distances import CommonStates, common_states, distances_to_tests, group_behaviours
+from generation.teammates.distances import (
+    CommonStates,
+    common_states,
+    distances_to_tests,
+    group_behaviours,
+    nearest_test,
+)
+from generation.teammates.draws import read_draws
+from generation.teammates.instances import published_thetas
+from generation.teammates.measuring import measure_draws
 from generation.teammates.references import reference_egos, reference_returns
+from generation.teammates.registry import build_teammate
 from icrl4aht_data.errors import UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
@@ -83,3 +93,27 @@ def test_returns_belong_to_their_teammates(monkeypatch):
     np.testing.assert_array_equal(found["random"] - found["random"][0], [0, 300, 0])  # the same draws with each
     assert 0 < found["random"][0] < 15
     np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2)["random"], found["random"][1:])
+
+
+# The shipped table, on one layout: slow, since all families and the scripted ego are compiled.
+
+SHIPPED = get_layout("demo_wide")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["assembly_line", "utility_greedy"])
+def test_a_test_instance_acts_like_itself(family):
+    """Also where its actions are random: the noise of a state is that of the episode, not of the teammate."""
+    thetas = published_thetas(SHIPPED.name, family)
+    found = nearest_test(SHIPPED, [build_teammate(SHIPPED, {"family": family, "theta": theta}) for theta in thetas])
+    assert [near.distance for near in found] == [0.0] * len(thetas)
+    assert found[0].name == {"assembly_line": "H3/t0", "utility_greedy": "H4/t0"}[family]
+
+
+@pytest.mark.slow
+def test_rows_of_the_table_are_measured_again():
+    """Draws of both seeds, apart from the number of their behaviour, which depends on the draws before."""
+    numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]
+    for found, (family, base_seed, theta_id) in zip(measure_draws(SHIPPED, numbers), numbers, strict=True):
+        expected = read_draws(SHIPPED.name, family, base_seed)[theta_id]
+        assert found._replace(behaviour=0) == expected._replace(behaviour=0)

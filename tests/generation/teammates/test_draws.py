@@ -24,7 +24,6 @@ from generation.teammates.draws import (
 from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, TRACKS
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
-from icrl4aht_data.overcooked.layouts import get_layout
 
 H1, H2, H3, H4 = HEURISTIC_FAMILIES
 
@@ -220,14 +219,3 @@ def test_layouts_without_training_tasks_are_refused(tmp_path):
     result = CliRunner().invoke(cli, ["draws", "--layout", "asymm_right", "--out", str(tmp_path / "draws.jsonl")])
     assert "unknown training layout 'asymm_right'" in str(result.exception)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_rows_of_the_table_are_measured_again():
-    """Three draws, with the smallest, the largest and another number, of the family with most behaviours."""
-    family, layout = H3, "demo_wide"
-    numbers = [(family, 0, 0), (family, 0, 31), (family, 1, 5)]
-    again = measuring.measure_draws(get_layout(layout), numbers)
-    for found, (_, seed, theta_id) in zip(again, numbers, strict=True):
-        expected = read_draws(layout, family, seed)[theta_id]
-        assert found._replace(behaviour=0) == expected._replace(behaviour=0)
