@@ -19,6 +19,7 @@ from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, to
 from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
+from tests.helpers.random_releases import random_release
 
 
 @pytest.fixture
