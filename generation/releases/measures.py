@@ -175,9 +175,11 @@ def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
 
 
 def _why_unhosted(draws: Sequence[Draw]) -> str:
+    if not draws:
+        return "no draws were measured"
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
-        farthest = max((draw.distance for draw in draws), default=0.0)
+        farthest = max(draw.distance for draw in draws)
         return f"all {len(draws)} draws act like a test teammate (distance {farthest:.3f} at most)"
     widest = max(float(np.ptp([draw.stay, draw.random, draw.oracle])) for draw in admissible)
     return (
