@@ -39,7 +39,7 @@ class TeammateFacts(NamedTuple):
 
     Attributes:
         references: returns of the reference egos with it.
-        nearest: the test teammate that acts most like it; None on layouts without training tasks.
+        nearest: the test teammate that acts most like it; None where it is unknown.
         matters: whether the ego matters: some ego, or the partner that it was trained with, earns another return.
     """
 
@@ -122,7 +122,11 @@ def _facts_of_draw(draw: Draw) -> TeammateFacts:
 def _measure(
     layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, LearnedHeadroom]
 ) -> dict[str, TeammateFacts]:
-    """Measure teammates of one layout. Only learned ones, which no table numbers, get numbers of behaviours here."""
+    """Measure teammates of one layout; how unlike the test they act, only of learned ones.
+
+    For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
+    distances would take longer than a small rebuild.
+    """
     learned = [task for task in tasks if task.teammate_family == "rl"]
     heuristics = [task for task in tasks if task.teammate_family != "rl"]
     missing = [task for task in learned if task.task_id not in headroom]
@@ -133,7 +137,7 @@ def _measure(
         egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
         for k, task in enumerate(heuristics):
             returns[task.task_id] = [float(egos[ego][k]) for ego in ("stay", "random", "oracle")]
-    nearest = _nearest(layout, learned, suite, numbered=True) | _nearest(layout, heuristics, suite, numbered=False)
+    nearest = _nearest(layout, learned, suite)
     return {
         task_id: TeammateFacts(
             ReferenceEgos(*(round(value, _DIGITS) for value in earned[:3]), REFERENCE_EPISODES),
@@ -144,13 +148,13 @@ def _measure(
     }
 
 
-def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path, *, numbered: bool) -> dict[str, NearestTest]:
+def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:
     """task id -> nearest test teammate; nothing on layouts without training tasks."""
     if not tasks or layout.name not in TESTED_ON:
         return {}
     near = nearest_test(layout, [_build(task, suite) for task in tasks])
     return {
-        task.task_id: NearestTest(found.teammate, round(found.distance, _DIGITS), found.behaviour if numbered else None)
+        task.task_id: NearestTest(found.teammate, round(found.distance, _DIGITS), found.behaviour)
         for task, found in zip(tasks, near, strict=True)
     }
 
@@ -171,9 +175,11 @@ def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
 
 
 def _why_unhosted(draws: Sequence[Draw]) -> str:
+    if not draws:
+        return "no draws were measured"
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
-        farthest = max((draw.distance for draw in draws), default=0.0)
+        farthest = max(draw.distance for draw in draws)
         return f"all {len(draws)} draws act like a test teammate (distance {farthest:.3f} at most)"
     widest = max(float(np.ptp([draw.stay, draw.random, draw.oracle])) for draw in admissible)
     return (

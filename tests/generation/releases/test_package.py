@@ -227,7 +227,4 @@ def test_a_preset_is_measured(tmp_path):
     facts = teammate_facts([task], tmp_path, tmp_path)[task.task_id]
     assert facts.matters
     assert facts.references.stay == 0 < facts.references.oracle
-    assert facts.nearest is not None
-    assert facts.nearest.teammate.startswith("H4/")
-    assert facts.nearest.distance < 0.02
-    assert facts.nearest.behaviour is None
+    assert facts.nearest is None
