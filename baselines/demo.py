@@ -28,7 +28,7 @@ from baselines.report.lead import (
 )
 from baselines.report.overlap import overlap_legend
 from baselines.report.page import write_page_with_episodes
-from baselines.report.results import EvaluationRun, note_results, read_run, validation_tasks
+from baselines.report.results import EvaluationRun, note_results, read_run, shipped_validation_tasks
 from baselines.training.histories import prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import RUN_CURVES
@@ -114,7 +114,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     _train_demo(out / "ad", settings)
     write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
 
-    tasks = _validation_tasks() if settings.tasks is None else settings.tasks
+    tasks = _demo_tasks() if settings.tasks is None else settings.tasks
     say(5, f"evaluating it and {', '.join(AGENTS)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
     compared = _evaluate_all(out, tasks, settings)
     write(lead_table(compared.families, compared.agent))
@@ -163,8 +163,8 @@ def _train_demo(folder: Path, settings: DemoSettings) -> None:
         train(job.method, job.data, job.options, folder, job.about, done=done)
 
 
-def _validation_tasks() -> tuple[Task, ...]:
-    return tuple(task for task in validation_tasks().values() if task.layout.name == DEMO_LAYOUT)
+def _demo_tasks() -> tuple[Task, ...]:
+    return tuple(task for task in shipped_validation_tasks().values() if task.layout.name == DEMO_LAYOUT)
 
 
 def _evaluate_all(out: Path, tasks: Sequence[Task], settings: DemoSettings) -> _Compared:

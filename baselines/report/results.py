@@ -237,7 +237,7 @@ def as_run(
         raise OptionError(f"{where}: results of different settings in one run")
     known = published_test_tasks() | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
-        known = validation_tasks() | known
+        known = shipped_validation_tasks() | known
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
     played: dict[Cell, list[Task]] = defaultdict(list)
     for result in results:
@@ -275,7 +275,7 @@ def published_test_tasks() -> dict[str, Task]:
 
 
 @cache
-def validation_tasks() -> dict[str, Task]:
+def shipped_validation_tasks() -> dict[str, Task]:
     """Returns the package's validation tasks by id."""
     return {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "validation"))}
 
