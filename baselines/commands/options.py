@@ -62,6 +62,7 @@ class HostPort(click.ParamType):
 
 EGO_NAME = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
+_EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
@@ -76,6 +77,12 @@ _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (
 acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
 experiment_acting_option = click.option(
     "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
+)
+evaluation_split_option = click.option(
+    "--split",
+    type=_EVALUATION_SPLIT,
+    help="Tasks of this split: test, or validation, by which models are chosen.",
+    show_default="test",
 )
 tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
 episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
@@ -117,7 +124,7 @@ def history_filters(command: Any) -> Any:
             "--source",
             metavar="NAME",
             multiple=True,
-            help="Train only on histories made by this learner, such as ppo; repeat for several.",
+            help="Train only on histories of this source, ppo or noise; repeat for several.",
         ),
     ]
 
@@ -152,9 +159,16 @@ model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
 def training_summary(histories: dict[str, Any]) -> str:
-    """Returns the layouts and channels of a training run, one line, from the settings of its histories."""
-    shape = " x ".join(map(str, histories["obs_shape"]))
-    return f"training on {', '.join(histories['layouts'])}; {histories['channels']} channels, observations of {shape}"
+    """Returns layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
+    shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
+    parts = [
+        f"training on {', '.join(histories['layouts'])}",
+        f"{histories['channels']} channels, observations of {shape}",
+        f"{sizes['train']} histories",
+        f"held out {sizes['histories']} with the same teammates"
+        + (f" and {sizes['teammates']} with others (split {split})" if split else ""),
+    ]
+    return "; ".join(parts + ([f"{histories['labels']} labels"] if histories["labels"] else []))
 
 
 def default_batch_size(size: str = "small") -> int:
@@ -261,7 +275,8 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         ),
         _experiment_size_option,
         history_filters,
-        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs")),
+        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs", "labels")),
+        evaluation_split_option,
         tasks_option,
         episodes_option,
         seeds_option,

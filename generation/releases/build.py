@@ -74,7 +74,7 @@ def build_releases(
     members = {work.task.task_id: work.task for work in works}
     releases = []
     with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
-        facts = teammate_facts(members.values(), suite, headroom)
+        facts = teammate_facts(members.values(), out / "artefacts", suite, headroom)
         for kind in kinds:
             with progress_bars(console) as bars:
                 steps = [f"choosing labellers for {kind}", f"packing {kind}"]

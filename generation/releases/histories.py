@@ -63,9 +63,9 @@ def select_histories(
 ) -> TaskHistories | LeftOutTask:
     """Choose the histories of a task that a release keeps.
 
-    A noise history is always kept. Of the streams of learners the best ones are kept that improve by
-    `profile.least_improvement`, or, on a layout without headroom, the best ones. On a layout with headroom a task with
-    which the ego does not matter is left out.
+    A noise history is always kept, and of the streams of learners the best ones. With `profile.least_improvement`, on
+    layouts with headroom, only those streams are kept that improve by this, and tasks are left out with whose teammate
+    the ego does not matter.
 
     Args:
         artefacts: folder of the finished artefacts.
@@ -77,13 +77,13 @@ def select_histories(
     task, source = works[0].task, works[0].source
     folders = [artefacts / work.name for work in works]
     returns = [stream_returns(np.load(folder / "rewards.npy", mmap_mode="r")) for folder in folders]
-    least = profile.least_improvement if headroom and source == "ppo" else None
+    least = profile.least_improvement if headroom else None
     if source == "ppo":
         streams = select_streams(returns, profile.keep, least)
     else:
         streams = [np.arange(len(own)) for own in returns]
     found = TaskHistories(task, source, folders, returns, streams, least)
-    if headroom and not facts.matters:
+    if least is not None and not facts.matters:
         egos = facts.references
         return found.left_out(
             f"the ego does not matter: returns of the reference egos differ by less than {LEAST_HEADROOM:g} (stay "

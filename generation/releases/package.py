@@ -75,7 +75,7 @@ def package_release(
     for work in works:
         tasks.setdefault(work.task.task_id, []).append(work)
     if facts is None:
-        facts = teammate_facts((members[0].task for members in tasks.values()), suite)
+        facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
     headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
     recorded, new, omitted, curves = _recorded_provenance(suite), [], list(left_out), SourceCurves()
     for task_id, members in tasks.items():

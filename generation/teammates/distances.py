@@ -1,15 +1,16 @@
 """Hamming distances of policies: the share of common states on which two of them act differently (paper, App. "Teammate
 Policy Diversity Analysis").
 
-The common states of a heuristic family on a layout are those of 20 episodes of 100 steps with its five test instances:
-each plays four episodes, two with a random ego and two with the scripted ego `oracle`. A teammate's distance to a test
-instance is measured on the states of that instance's family. On asymm_both and cramped_up, which have no test tasks,
-the instances are those of the layout that their models are tested on, acting on the training layout.
+The common states of a heuristic family on a layout are those of 20 episodes of 100 steps with each of its five test
+instances, ten with a random ego and ten with the scripted ego `oracle`. A teammate's distance to a test instance is
+measured on the states of that instance's family. On asymm_both and cramped_up, which have no test tasks, the instances
+are those of the layout that their models are tested on, acting on the training layout.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -26,28 +27,15 @@ from generation.teammates.references import player_in_some, reference_egos, stac
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, TESTED_ON
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
-_EPISODES = 2
+_EPISODES = 10
 """Episodes of each test instance with each of the two egos."""
 
 _SEED = 5
-
-
-class NearestTest(NamedTuple):
-    """The published test instance that acts most like a teammate.
-
-    Attributes:
-        name: the instance, such as "H3/t1".
-        distance: share of the common states on which the two act differently, 0..1.
-        behaviour: number that the teammate shares with those of its group that act like it, from 0.
-    """
-
-    name: str
-    distance: float
-    behaviour: int
 
 
 class CommonStates(NamedTuple):
@@ -87,6 +75,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     ]
 
 
+@lru_cache(maxsize=2)
 def common_states(layout: Layout) -> CommonStates:
     """Returns the states of a training layout on which teammates are compared.
 
@@ -120,9 +109,12 @@ def common_states(layout: Layout) -> CommonStates:
         return roll_out(env, players, carry, env.max_steps, key)[1].record
 
     records = play([family.params for family in families], jax.random.key(_SEED))
-    actions = [act_along(layout, policies, records[:, k * each : (k + 1) * each]) for k, policies in enumerate(tests)]
+    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
+    actions = np.concatenate(
+        [act_along(layout, own, records)[:, :, k * each : (k + 1) * each] for k, own in enumerate(tests)]
+    )
     names = tuple(f"{short}/t{t}" for short in HEURISTIC_KINDS.values() for t in range(INSTANCES))
-    return CommonStates(records, names, np.concatenate(actions))
+    return CommonStates(records, names, actions)
 
 
 def act_along(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
@@ -180,8 +172,9 @@ def group_behaviours(actions: np.ndarray) -> list[int]:
     A policy has the behaviour of the first one before it that opened a behaviour and acts like it, that is, whose
     distance is below `SAME_BEHAVIOUR`; else it opens the next one.
     """
-    flat, first, found = actions.reshape(len(actions), -1), [], []
-    for own in flat:
+    first: list[np.ndarray] = []
+    found: list[int] = []
+    for own in actions:
         same = (k for k, other in enumerate(first) if (own != other).mean() < SAME_BEHAVIOUR)
         found.append(next(same, len(first)))
         if found[-1] == len(first):

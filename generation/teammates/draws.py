@@ -2,7 +2,8 @@
 
 `draws.jsonl` has one line per draw, measured by `python -m generation draws`, so that tasks are known without any
 simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws act alike,
-and on some layouts all draws of a family act like a test instance. Those are not admissible: no task has them.
+and on some layouts all draws of a family act like one of its test instances. Those are not admissible: no task has
+them.
 """
 
 from __future__ import annotations
@@ -39,12 +40,14 @@ class Draw(NamedTuple):
         family: kind of the heuristic, such as "utility_greedy".
         base_seed: 0 for training, 1 for validation.
         theta_id: number of the draw, from 0.
-        nearest: test instance that acts most like it, such as "H3/t1".
+        nearest: test instance of its family that acts most like it, such as "H3/t1".
         distance: Hamming distance to that instance, 0..1; see `generation.teammates.distances`.
         behaviour: number that the layout's draws of one family, of all seeds, share if they act alike.
         stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
         random: mean return of the ego `random`.
         oracle: mean return of the ego `oracle`.
+        other: test instance of the other families that acts most like it; for information, it excludes no draw.
+        other_distance: Hamming distance to that instance.
     """
 
     layout: str
@@ -57,10 +60,12 @@ class Draw(NamedTuple):
     stay: float
     random: float
     oracle: float
+    other: str = ""
+    other_distance: float = 1.0
 
     @property
     def admissible(self) -> bool:
-        """Whether it acts unlike every test instance."""
+        """Whether it acts unlike every test instance of its family."""
         return self.distance >= SAME_BEHAVIOUR
 
     @property

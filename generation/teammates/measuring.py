@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
 from generation.teammates.draws import DRAWS_PER_SEED, Draw, read_draws_table, write_draws_table
+from generation.teammates.instances import INSTANCES
 from generation.teammates.references import reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _DIGITS = 4
-"""Decimal places of stored numbers: all digits of shares of 2,000 states, and of means of 20 returns."""
+"""Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
+
+DRAW_NUMBERS = [
+    (family, base_seed, theta_id)
+    for family in HEURISTIC_FAMILIES
+    for base_seed, count in DRAWS_PER_SEED.items()
+    for theta_id in range(count)
+]
+"""Family, base_seed and theta_id of each draw of a layout."""
 
 
 def fill_table(path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool) -> None:
@@ -27,50 +38,47 @@ def fill_table(path: Path, layouts: Sequence[str], on_layout: Callable[[int, str
     """
     draws = read_draws_table(path) if path.is_file() else []
     measured = Counter(draw.layout for draw in draws)
-    expected = len(HEURISTIC_FAMILIES) * sum(DRAWS_PER_SEED.values())
     for number, name in enumerate(layouts):
         on_layout(number, name)
-        if overwrite or measured[name] != expected:
+        if overwrite or measured[name] != len(DRAW_NUMBERS):
             draws = [draw for draw in draws if draw.layout != name]
             draws += measure_draws(get_layout(name))
             write_draws_table(path, draws)
     on_layout(len(layouts), "")
 
 
-def measure_draws(layout: Layout, per_seed: Mapping[int, int] = DRAWS_PER_SEED) -> list[Draw]:
-    """Measures the draws of every family on a training layout.
+def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW_NUMBERS) -> list[Draw]:
+    """Measures draws on a training layout. Behaviours are numbered within these draws.
 
     Args:
         layout: the layout.
-        per_seed: base_seed -> number of draws of each family.
+        numbers: family, base_seed and theta_id of each draw.
     """
-    numbers = [
-        (family, seed, theta_id)
-        for family in HEURISTIC_FAMILIES
-        for seed, count in per_seed.items()
-        for theta_id in range(count)
-    ]
     policies = [
         build_teammate(layout, sample_teammate(family, theta_id, "train", seed)) for family, seed, theta_id in numbers
     ]
     common = common_states(layout)
     actions = act_along(layout, policies, common.records)
     distances = distances_to_tests(common, actions)
-    nearest = distances.argmin(axis=1)
-    behaviours = [
-        behaviour
-        for family in HEURISTIC_FAMILIES
-        for behaviour in group_behaviours(actions[[own == family for own, _, _ in numbers]])
-    ]
+    families = np.array([family for family, _, _ in numbers])
+    own = families[:, None] == np.repeat(list(HEURISTIC_FAMILIES), INSTANCES)
+    nearest, others = (np.where(mask, distances, np.inf).argmin(axis=1) for mask in (own, ~own))
+    behaviours = np.zeros(len(numbers), int)
+    for family in np.unique(families):
+        behaviours[families == family] = group_behaviours(actions[families == family])
     returns = reference_returns(layout, policies)
     return [
         Draw(
             layout.name,
-            *numbers[k],
+            family,
+            base_seed,
+            theta_id,
             common.instances[nearest[k]],
             round(float(distances[k, nearest[k]]), _DIGITS),
-            behaviours[k],
+            int(behaviours[k]),
             *(round(float(returns[ego][k]), _DIGITS) for ego in ("stay", "random", "oracle")),
+            other=common.instances[others[k]],
+            other_distance=round(float(distances[k, others[k]]), _DIGITS),
         )
-        for k in range(len(numbers))
+        for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]

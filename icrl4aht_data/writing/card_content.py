@@ -66,7 +66,7 @@ class CardContent:
 
     @cached_property
     def headroom(self) -> dict[str, bool]:
-        """Return for each layout whether the ego matters beside any of its teammates; empty where it is unknown."""
+        """Return for each layout whether the ego matters with any of its teammates; empty where it is unknown."""
         layouts: dict[str, bool] = {}
         for task_id, members in self.histories.items():
             references = self.provenance.get(task_id, Provenance()).references

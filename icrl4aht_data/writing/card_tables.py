@@ -7,9 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LABEL_EPISODES, SOURCES, SPLITS
 from icrl4aht_data.benchmark.tasks import Task
@@ -26,9 +24,7 @@ LEAST_RISE = 5.0
 LONGEST_TABLE = 60
 """Rows from which tables of tasks and teammates are summarized by layout and family."""
 
-CURVES_HEADER = ("layout", "source", "split", "teammates", "tasks", "learners", "histories", "transitions")
-CURVES_NUMBERS = 4
-"""Columns of numbers at the end of `CURVES_HEADER`, before those of returns."""
+_NAMES = 4  # columns of the table of learning curves that are no numbers
 
 
 def curves_rows(release: CardContent) -> tuple[list[str], list[list[str]]]:
@@ -38,7 +34,20 @@ def curves_rows(release: CardContent) -> tuple[list[str], list[list[str]]]:
         release: the release.
     """
     filtered = any(of_task.filter for of_task in release.provenance.values())
-    header = [*CURVES_HEADER, "first", "last", *(["last, before the filter"] if filtered else []), "rise by 5"]
+    header = [
+        "layout",
+        "source",
+        "split",
+        "teammates",
+        "tasks",
+        "learners",
+        "histories",
+        "transitions",
+        "first",
+        "last",
+    ]
+    header += ["last, before the filter"] if filtered else []
+    header.append(f"rise by {LEAST_RISE:g}")
     rows = []
     for (layout, source, split), members in _ordered_groups(release):
         rows.append([layout, source, split, *_curve_cells(release, members, filtered)])
@@ -53,7 +62,7 @@ def curves_rows(release: CardContent) -> tuple[list[str], list[list[str]]]:
 def curves_table(release: CardContent) -> str:
     """Return the table of learning curves."""
     header, rows = curves_rows(release)
-    return markdown_table(header, rows, right=len(header) - 4)
+    return markdown_table(header, rows, right=len(header) - _NAMES)
 
 
 def _ordered_groups(release: CardContent) -> list[tuple[tuple[str, ...], list[Entry]]]:
@@ -185,7 +194,12 @@ def behaviours_in_words(mates: Sequence[CardTeammate]) -> str:
             own.setdefault(mate.split, set()).add((mate.layout, mate.family, mate.nearest.behaviour))
             counts[mate.split] = counts.get(mate.split, 0) + 1
     texts = [
-        sentence("behaviours", split=split, teammates=counts[split], behaviours=len(own[split]))
+        sentence(
+            "behaviours",
+            split=split,
+            teammates=count_in_words(counts[split], "teammate"),
+            behaviours=count_in_words(len(own[split]), "different behaviour"),
+        )
         for split in SPLITS
         if split in own
     ]
@@ -259,8 +273,9 @@ def _long_labels(release: CardContent, tasks: Sequence[Sequence[Entry]]) -> str:
     for members in tasks:
         first = members[0]
         row = [first.layout, first.source, first.split, names.get(first.task_id, first.teammate_kind)]
-        row += ["script" if first.expert_step is None and first.source == "noise" else _number(first.expert_step)]
-        row += [f"{first.expert_return:z.1f}", _return(first.expert_return_sampled), f"{mean_end(members):z.1f}"]
+        scripted = first.source == "noise" and first.expert_step is None
+        row += ["script" if scripted else _number(first.expert_step), f"{first.expert_return:z.1f}"]
+        row += ["" if scripted else _return(first.expert_return_sampled), f"{mean_end(members):z.1f}"]
         rows.append([f"**{cell}**" for cell in row] if have_weak_labels(members) else row)
     header = ["layout", "source", "split", "teammate", "step", "greedy", "sampled", "last"]
     return markdown_table(header, rows, right=4)
@@ -317,12 +332,14 @@ def left_out_table(left_out: Sequence[LeftOutTask]) -> str:
 def print_learning(release: CardContent, console: Console) -> None:
     """Print how much the histories of a release rise, by layout and source, and what is not in the release."""
     header, rows = curves_rows(release)
-    table = Table(*header[:4], box=box.MARKDOWN, title="learning")
-    for name in header[4:]:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(*(cell.replace("*", "") for cell in row))
-    console.print(table, width=max(console.width, 30 + 12 * len(header)), crop=False)
+    lines = [header, *([cell.replace("*", "") for cell in row] for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
+    console.print("Learning, by layout and source:")
+    for line in lines:
+        names = [cell.ljust(width) for cell, width in zip(line[:_NAMES], widths, strict=False)]
+        numbers = [cell.rjust(width) for cell, width in zip(line[_NAMES:], widths[_NAMES:], strict=True)]
+        console.print("  ".join([*names, *numbers]), markup=False, highlight=False, soft_wrap=True)
     for task in release.info.left_out:
         source = f" ({task.source})" if task.source else ""
-        console.print(f"left out: {task.layout} with {task.teammate}{source}: {task.reason}", markup=False)
+        text = f"left out: {task.layout} with {task.teammate}{source}: {task.reason}"
+        console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -255,10 +255,10 @@ class _ShardWriter:
             raise OptionError(
                 f"task {task.task_id}: env_idx: expected a stream's number from 0, found {history.env_idx}"
             )
-        if not 0 <= history.learner < (new.provenance.learners or 2**63):
+        if not 0 <= history.learner < (learners := new.provenance.learners or 1):
             raise OptionError(
-                f"task {task.task_id}: learner: expected 0 to {(new.provenance.learners or 2**63) - 1}, found "
-                f"{history.learner}"
+                f"task {task.task_id}: learner: expected 0 to {learners - 1}, since provenance has {learners} "
+                f"learners, found {history.learner}"
             )
         needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
+from generation.teammates.draws import validation_tasks
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -66,6 +67,13 @@ def test_bundled_manifests_are_the_published_tasks(track):
     assert read_tasks(manifest_path(track, "test")) == published_tasks(track)
 
 
+@pytest.mark.parametrize("track", TRACKS)
+def test_bundled_manifests_are_the_validation_tasks(track):
+    tasks = read_tasks(manifest_path(track, "validation"))
+    assert tasks == validation_tasks(track)
+    assert {task.layout.name for task in tasks} <= {*TRACKS[track]["validation"]}
+
+
 def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
@@ -73,7 +81,7 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     monkeypatch.setattr("generation.cli.manifest_path", lambda track, split: short)
     result = CliRunner().invoke(cli, ["manifests", "--check"])
     assert result.exit_code == 1
-    assert "differs from the parameter sets" in str(result.exception)
+    assert "differs from the parameter sets or draws" in str(result.exception)
 
 
 def test_manifests_are_replaced_on_demand(tmp_path):

@@ -1,0 +1,119 @@
+"""Distances to the test instances and groups of behaviours, by hand; returns of reference egos with small policies."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from generation.learners.rollout import Rollout
+from generation.policy import Policy
+from generation.teammates import references
+from generation.teammates.distances import (
+    CommonStates,
+    common_states,
+    distances_to_tests,
+    group_behaviours,
+    nearest_test,
+)
+from generation.teammates.draws import read_draws
+from generation.teammates.instances import published_thetas
+from generation.teammates.measuring import measure_draws
+from generation.teammates.references import reference_egos, reference_returns
+from generation.teammates.registry import build_teammate
+from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.overcooked.layouts import get_layout
+
+LAYOUT = get_layout("cramped_up")
+
+
+def test_a_distance_is_measured_on_the_states_of_the_instances_family():
+    """Two families of five instances; two steps of one episode each."""
+    tested = np.zeros((10, 2, 1), np.int8)
+    tested[3], tested[7] = 1, [[2], [4]]
+    actions = np.array([[[1, 2], [1, 3]], [[0, 0], [1, 4]]], np.int8)  # (teammates, T, episodes)
+    common = CommonStates(jnp.zeros((2, 2, 1), jnp.uint8), tuple(f"i{k}" for k in range(10)), tested)
+    distances = distances_to_tests(common, actions)
+    np.testing.assert_array_equal(distances[0], [1, 1, 1, 0, 1, 1, 1, 0.5, 1, 1])
+    np.testing.assert_array_equal(distances[1], [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5])
+
+
+def test_behaviours_are_numbered_in_order():
+    """Each acts like the first of a behaviour: 1 of 100 states is too little for one of its own, 2 are not."""
+    actions = np.zeros((5, 10, 10), np.int8)
+    actions[1, 0, :2] = 1
+    actions[2, 0, 0] = 1
+    actions[3, 0, :3] = 1
+    actions[4, 9] = 3
+    assert group_behaviours(actions) == [0, 1, 0, 1, 2]
+    assert group_behaviours(actions[[1, 0]]) == [0, 1]
+    assert group_behaviours(actions[:0]) == []
+
+
+def test_test_layouts_have_no_common_states():
+    with pytest.raises(UnknownNameError, match="unknown training layout 'asymm_right'"):
+        common_states(get_layout("asymm_right"))
+
+
+def count(params, key) -> jax.Array:
+    return jnp.int32(0)
+
+
+def walks(params, steps, view, key):
+    """Acts by its parameter."""
+    return params, steps + 1
+
+
+def walks_too(params, steps, view, key):
+    """Acts as `walks` does, as a function of its own."""
+    return params, steps + 1
+
+
+def test_returns_belong_to_their_teammates(monkeypatch):
+    """Rewards are replaced by 100 for the teammate's action 2 plus the ego's action: 4 of `stay`, 1 of the oracle."""
+
+    def counted(*arguments, **options) -> tuple[object, Rollout]:
+        carry, played = roll_out(*arguments, **options)
+        actions = played.actions.astype(jnp.float32)
+        return carry, played._replace(reward=actions[..., 0] + 100 * (actions[..., 1] == 2))
+
+    roll_out = references.roll_out
+    egos = reference_egos(LAYOUT)
+    egos["oracle"] = Policy((), count, lambda params, steps, view, key: (jnp.int32(1), steps), "state")
+    monkeypatch.setattr(references, "roll_out", counted)
+    monkeypatch.setattr(references, "reference_egos", lambda layout: egos)
+    monkeypatch.setattr(references, "KEPT_STEPS", 3)
+    actions = {0: walks, 2: walks_too, 5: walks}
+    mates = [Policy(jnp.int32(action), count, act, "state") for action, act in actions.items()]
+    found = reference_returns(LAYOUT, mates, episodes=2)
+    np.testing.assert_array_equal(found["stay"], [12, 312, 12])
+    np.testing.assert_array_equal(found["oracle"], [3, 303, 3])
+    assert found["random"].dtype == np.float64
+    np.testing.assert_array_equal(found["random"] - found["random"][0], [0, 300, 0])  # the same draws with each
+    assert 0 < found["random"][0] < 15
+    np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2)["random"], found["random"][1:])
+
+
+# The shipped table, on one layout: slow, since all families and the scripted ego are compiled.
+
+SHIPPED = get_layout("demo_wide")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["assembly_line", "utility_greedy"])
+def test_a_test_instance_acts_like_itself(family):
+    """Also where its actions are random: the noise of a state is that of the episode, not of the teammate."""
+    thetas = published_thetas(SHIPPED.name, family)
+    found = nearest_test(SHIPPED, [build_teammate(SHIPPED, {"family": family, "theta": theta}) for theta in thetas])
+    assert [near.distance for near in found] == [0.0] * len(thetas)
+    assert found[0].teammate == {"assembly_line": "H3/t0", "utility_greedy": "H4/t0"}[family]
+
+
+@pytest.mark.slow
+def test_rows_of_the_table_are_measured_again():
+    """Draws of both seeds, apart from the number of their behaviour, which depends on the draws before."""
+    numbers = [("assembly_line", 0, 0), ("assembly_line", 0, 31), ("assembly_line", 1, 5)]
+    for found, (family, base_seed, theta_id) in zip(measure_draws(SHIPPED, numbers), numbers, strict=True):
+        expected = read_draws(SHIPPED.name, family, base_seed)[theta_id]
+        assert found._replace(behaviour=0) == expected._replace(behaviour=0)

@@ -1,0 +1,221 @@
+"""Drawn teammates: the shipped table, which draws tasks may have and in which order, and the command that measures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from generation.cli import cli
+from generation.teammates import draws, measuring
+from generation.teammates.draws import (
+    DRAWS_PER_SEED,
+    DRAWS_TABLE,
+    Draw,
+    drawn_teammates,
+    hosted_families,
+    read_draws,
+    read_draws_table,
+    validation_tasks,
+    write_draws_table,
+)
+from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, TRACKS
+from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
+
+H1, H2, H3, H4 = HEURISTIC_FAMILIES
+
+
+def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distance=0.5, oracle=30.0) -> Draw:
+    """A draw on demo_wide with which stay earns 1 and random 2."""
+    return Draw(
+        "demo_wide", family, base_seed, theta_id, "H3/t0", distance, behaviour, 1.0, 2.0, oracle, "H1/t1", distance
+    )
+
+
+def with_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> None:
+    write_draws_table(tmp_path / "draws.jsonl", found)
+    monkeypatch.setattr(draws, "DRAWS_TABLE", tmp_path / "draws.jsonl")
+    monkeypatch.setattr(draws, "_bundled_draws", draws._bundled_draws.__wrapped__)
+
+
+def chosen(*arguments, **options) -> list[tuple[str, int]]:
+    return [(found.family, found.theta_id) for _, found in drawn_teammates("demo_wide", *arguments, **options)]
+
+
+# The shipped table.
+
+
+def test_the_table_has_every_draw_once():
+    expected = [
+        (layout, family, seed, theta_id)
+        for layout in TESTED_ON
+        for family in HEURISTIC_FAMILIES
+        for seed, count in DRAWS_PER_SEED.items()
+        for theta_id in range(count)
+    ]
+    assert [found[:4] for found in read_draws_table(DRAWS_TABLE)] == expected
+    assert [found.theta_id for found in read_draws("demo_wide", H1)] == list(range(DRAWS_PER_SEED[0]))
+    assert read_draws("demo_cook_wide", H1, 1)[3][:4] == ("demo_wide", H1, 1, 3)
+
+
+def test_the_table_is_as_published(tmp_path):
+    """Writing what was read gives the same bytes."""
+    write_draws_table(tmp_path / "again.jsonl", reversed(read_draws_table(DRAWS_TABLE)))
+    assert (tmp_path / "again.jsonl").read_bytes() == DRAWS_TABLE.read_bytes()
+
+
+def test_numbers_of_the_table_are_possible():
+    for found in read_draws_table(DRAWS_TABLE):
+        assert found.nearest.split("/")[0] == HEURISTIC_KINDS[found.family] != found.other.split("/")[0]
+        assert 0 <= found.distance <= 1 >= found.other_distance >= 0
+        assert min(found.stay, found.random, found.oracle) >= -20
+
+
+@pytest.mark.parametrize("layout", TESTED_ON)
+def test_no_chosen_teammate_acts_like_a_test_instance(layout):
+    for seed in DRAWS_PER_SEED:
+        families = hosted_families(layout, seed)
+        usable = [found for family in families for found in read_draws(layout, family, seed) if found.admissible]
+        headroom = [found for found in usable if found.headroom]
+        teammates = drawn_teammates(layout, families, len(headroom or usable), seed)
+        assert {found for _, found in teammates} == {*(headroom or usable)}
+        assert all(found.distance >= 0.02 for _, found in teammates)
+        with pytest.raises(OptionError, match="distinct draws"):
+            drawn_teammates(layout, families, len(teammates) + 1, seed)
+        for family in {*HEURISTIC_FAMILIES} - {*families}:
+            with pytest.raises(OptionError, match=f"{layout} cannot host drawn teammates of {family}: "):
+                drawn_teammates(layout, [family], 1, seed)
+
+
+def test_entries_are_those_of_the_sampler():
+    family = hosted_families("demo_wide")[0]
+    for base_seed in DRAWS_PER_SEED:
+        for entry, found in drawn_teammates("demo_wide", [family], 2, base_seed):
+            assert entry == sample_teammate(family, found.theta_id, "train", base_seed)
+            assert (entry["base_seed"], found.base_seed) == (base_seed, base_seed)
+
+
+def test_no_validation_teammate_is_a_training_teammate():
+    for track in TRACKS:
+        for task in validation_tasks(track):
+            layout, family = task.layout.name, task.teammate["family"]
+            assert task.teammate["base_seed"] == 1
+            count = sum(found.admissible for found in read_draws(layout, family))
+            thetas = [sample_teammate(family, k, "train")["theta"] for k in range(DRAWS_PER_SEED[0])]
+            assert count <= len(thetas)
+            assert task.teammate["theta"] not in thetas
+
+
+def test_validation_tasks_are_four_a_layout_where_draws_allow_it():
+    tasks = [task for track in TRACKS for task in validation_tasks(track)]
+    found = Counter(task.layout.name for task in tasks)
+    for layout in TESTED_ON:
+        usable = [one for family in HEURISTIC_FAMILIES for one in read_draws(layout, family, 1) if one.admissible]
+        usable = [one for one in usable if one.headroom] or usable
+        assert found[layout] == min(4, len(usable))
+        families = Counter(task.teammate["family"] for task in tasks if task.layout.name == layout)
+        assert {*families} == {*hosted_families(layout, 1)[:4]}
+    assert len({task.task_id for task in tasks}) == len(tasks)
+
+
+# Which draws, in which order.
+
+
+def test_families_take_turns_and_behaviours_come_first(monkeypatch, tmp_path):
+    h1 = [draw(H1, 0), draw(H1, 1), draw(H1, 2, behaviour=4), draw(H1, 3, behaviour=4), draw(H1, 4, behaviour=2)]
+    with_table(monkeypatch, tmp_path, *h1, draw(H3, 5), draw(H3, 6))
+    assert chosen([H1], 5) == [(H1, 0), (H1, 2), (H1, 4), (H1, 1), (H1, 3)]
+    assert chosen([H3, H1], 6) == [(H3, 5), (H1, 0), (H3, 6), (H1, 2), (H1, 4), (H1, 1)]
+    assert chosen([H3, H1, H3], 2) == [(H3, 5), (H1, 0)]
+    assert chosen([], 0) == chosen([H1], 0) == []
+
+
+def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):
+    with_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
+    assert hosted_families("demo_wide") == [H1]
+    assert chosen([H1], 1) == [(H1, 1)]
+    with pytest.raises(OptionError, match=f"1 draws act like a test instance .*at most 0.000, to H3/t0.*1 of {H1}"):
+        drawn_teammates("demo_wide", [H1, H2], 1)
+
+
+def test_draws_without_headroom_are_left_out_if_others_have_it(monkeypatch, tmp_path):
+    flat, wide = draw(H1, 0, oracle=5.9), draw(H1, 1, oracle=6.0)
+    with_table(monkeypatch, tmp_path, flat, wide, draw(H3, 0, oracle=5.9))
+    assert chosen([H1], 1) == [(H1, 1)]
+    with pytest.raises(OptionError, match=f"{H3}: the ego matters with none of its admissible draws"):
+        drawn_teammates("demo_wide", [H3], 1)
+    with_table(monkeypatch, tmp_path, flat, wide._replace(distance=0.01), draw(H3, 0, oracle=5.9))
+    assert chosen([H1, H3], 2) == [(H1, 0), (H3, 0)]
+
+
+def test_seeds_are_apart(monkeypatch, tmp_path):
+    with_table(monkeypatch, tmp_path, draw(H1, 0, oracle=2.0), draw(H3, 4, base_seed=1))
+    assert chosen([H1], 1) == [(H1, 0)]
+    assert chosen([H3], 1, base_seed=1) == [(H3, 4)]
+    with pytest.raises(OptionError, match="has no draws there"):
+        drawn_teammates("demo_wide", [H1], 1, base_seed=1)
+
+
+def test_headroom_also_counts_an_oracle_that_hinders():
+    assert draw(H1, 0, oracle=-4.0).headroom
+    assert not draw(H1, 0, oracle=1.5).headroom
+
+
+# Bad input.
+
+
+def test_wrong_names():
+    with pytest.raises(OptionError, match=f"unknown teammate family 'H4'; valid: {H1}, "):
+        drawn_teammates("demo_wide", ["H4"], 1)
+    with pytest.raises(UnknownNameError, match="unknown training layout 'asymm_right'"):
+        read_draws("asymm_right", H1)
+    with pytest.raises(UnknownNameError, match="unknown layout 'demo'"):
+        drawn_teammates("demo", [H1], 1)
+    with pytest.raises(UnknownNameError, match="unknown base_seed of draws 2; valid: 0, 1"):
+        read_draws("demo_wide", H1, 2)
+
+
+def test_a_damaged_table_is_named_with_its_line(tmp_path):
+    path = tmp_path / "draws.jsonl"
+    write_draws_table(path, [draw(H1, 0)])
+    for line in ("[1]", "{", '{"layout":"demo_wide"}'):
+        path.write_text(path.read_text().splitlines()[0] + f"\n{line}\n")
+        with pytest.raises(TaskFormatError, match=r"draws\.jsonl, line 2: expected the fields layout, family"):
+            read_draws_table(path)
+
+
+# The command.
+
+
+def test_a_stopped_measurement_resumes(monkeypatch, tmp_path):
+    measured: list[str] = []
+
+    def measure(layout):
+        if len(measured) == 1 and layout.name == "cramped_up":
+            measured.append("stopped")
+            raise KeyboardInterrupt
+        measured.append(layout.name)
+        return [found for found in reversed(read_draws_table(DRAWS_TABLE)) if found.layout == layout.name]
+
+    monkeypatch.setattr(measuring, "measure_draws", measure)
+    path = tmp_path / "draws.jsonl"
+    arguments = ["draws", "--out", str(path), "--layout", "demo_wide", "--layout", "cramped_up"]
+    assert CliRunner().invoke(cli, arguments).exit_code != 0
+    assert {found.layout for found in read_draws_table(path)} == {"demo_wide"}
+    for _ in range(2):
+        result = CliRunner().invoke(cli, arguments)
+        assert result.exit_code == 0, result.output
+    assert measured == ["demo_wide", "stopped", "cramped_up"]
+    bundled = [line for line in DRAWS_TABLE.read_text().splitlines() if '"demo_wide"' in line or '"cramped_up"' in line]
+    assert path.read_text().splitlines() == bundled
+    assert CliRunner().invoke(cli, [*arguments, "--overwrite"]).exit_code == 0
+    assert measured[3:] == ["demo_wide", "cramped_up"]
+
+
+def test_layouts_without_training_tasks_are_refused(tmp_path):
+    result = CliRunner().invoke(cli, ["draws", "--layout", "asymm_right", "--out", str(tmp_path / "draws.jsonl")])
+    assert "unknown training layout 'asymm_right'" in str(result.exception)
+    assert not list(tmp_path.iterdir())
