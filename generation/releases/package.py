@@ -186,7 +186,7 @@ def _new_task(
     return _ppo_task(found, learned, profile, suite, files)
 
 
-def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: Mapping[str, Path]) -> NewTask:
+def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
     """A task of the source "noise", whose labels are the actions of its script."""
     earned = made.references
     expert = ExpertLabels(
@@ -205,9 +205,7 @@ def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files:
     return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
 
 
-def _ppo_task(
-    found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: Mapping[str, Path]
-) -> NewTask:
+def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: dict[str, Path]) -> NewTask:
     """A task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
     task = found.task
     for number, folder in enumerate(found.folders):
