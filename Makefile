@@ -28,7 +28,7 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
-demo: install ## load, sample, verify, train, evaluate and report on the bundled release (at most 10 minutes)
+demo: install ## load, sample, verify, train, evaluate on validation tasks and draw it (at most 10 minutes)
 	$(BIN)/python -m baselines demo
 
 generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|mini|paper, OUT=folder, OPTIONS=...

@@ -1,27 +1,39 @@
-"""`make demo`: from the bundled release's histories to a report of a model trained on them."""
+"""`make demo`: from the bundled release's histories to a model that learns within its context, and a report of it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 
 from baselines.agents.egos import AGENTS, find_agent
 from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import PROTOCOLS, Protocol
+from baselines.evaluate.protocols import Protocol, get_protocol
+from baselines.evaluate.results import Result
 from baselines.methods.options import SIZES, ModelOptions
-from baselines.report.overlap import overlap_legend, overlap_marks
+from baselines.plotting import plot_family_curves
+from baselines.report.lead import (
+    FLOOR,
+    FamilyReturns,
+    describe_rise,
+    family_returns,
+    find_lead,
+    lead_table,
+    lead_verdict,
+)
+from baselines.report.overlap import overlap_legend
 from baselines.report.page import write_page_with_episodes
-from baselines.report.results import EvaluationRun, note_results, read_run
+from baselines.report.results import EvaluationRun, note_results, read_run, shipped_validation_tasks
 from baselines.training.histories import prepare
 from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.run_folder import RUN_CURVES
 from baselines.training.trainer import format_loss, train
-from generation.teammates.instances import published_task
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.options import bars, counted
@@ -29,118 +41,184 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.plotting import plot_learning_curves
+from icrl4aht_data.plotting import plot_layout_curves
 from icrl4aht_data.utils.new_file import check_new_file
 
 DEMO_LAYOUT = "demo_wide"
-DEMO_MODEL = ModelOptions(**SIZES["tiny"].model)
-DEMO_TRAINING = TrainOptions(steps=1000, batch_size=16, context=SIZES["tiny"].context, validate_every=250)
-"""Size tiny, and fewer steps than its own."""
-
+_MODEL = ModelOptions(**SIZES["tiny"].model)
+_TRAINING = TrainOptions(2000, batch_size=16, context=SIZES["tiny"].context, validate_every=500)
+_PROTOCOL = get_protocol("seeded", 20)
 _STEPS = 6
 
 
-def run_demo(
-    out: Path,
-    console: Console,
-    *,
-    model: ModelOptions = DEMO_MODEL,
-    options: TrainOptions = DEMO_TRAINING,
-    families: Sequence[str] = HEURISTICS,
-    protocol: Protocol = PROTOCOLS["seeded"],
-) -> Path:
+@dataclass(frozen=True)
+class DemoSettings:
+    """What the demo trains and measures; the defaults take at most 10 minutes on two cores.
+
+    Attributes:
+        root: folder of the release.
+        model, training: AD's; by default of size tiny, with fewer steps than its own.
+        sources: sources of the histories to train on; all if empty.
+        tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
+        protocol, seeds: of the evaluation.
+    """
+
+    root: Path = MINI
+    model: ModelOptions = _MODEL
+    training: TrainOptions = _TRAINING
+    sources: tuple[str, ...] = ("noise",)
+    tasks: tuple[Task, ...] | None = None
+    protocol: Protocol = _PROTOCOL
+    seeds: Sequence[int] = range(5)
+
+
+def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
     """Load, sample, verify, train, evaluate, report, and print what is done.
 
     Args:
         out: folder; the same call resumes a stopped one.
         console: receives text and progress.
-        model, options: of the trained model.
-        families: teammate families; one task of each is played.
-        protocol: of the evaluation.
+        settings: of training and evaluation.
 
     Returns:
         Path of the report, an HTML page.
 
     Raises:
-        ReleaseError: if the bundled release is damaged.
+        ReleaseError: if the release is damaged.
     """
     started = time.perf_counter()
-    curves, episode, page = (out / name for name in ("learning_curves.png", "episode.gif", "report.html"))
-    for path in (curves, episode, page):
-        check_new_file(path, overwrite=(out / "ad").is_dir())  # of a stopped run
-    out.mkdir(parents=True, exist_ok=True)
+    settings = settings or DemoSettings()
+    model, training = settings.model, settings.training
+    curves, episode, picture, page = _output_files(out)
 
     def say(number: int, text: str) -> None:
         console.print(f"[bold]{number}/{_STEPS}[/bold] ({time.perf_counter() - started:.0f} s) {text}")
 
+    def write(text: str) -> None:
+        console.print(text, highlight=False, markup=False)
+
     say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}")')
-    dataset = load_icrl4aht(split="train", layout=DEMO_LAYOUT)
-    console.print(repr(dataset), highlight=False)
-    plot_learning_curves(load_icrl4aht(), curves)
+    dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT)
+    plot_layout_curves(dataset, curves)
     _draw_best_episode(dataset, episode)
-    console.print(f"learning curves: {curves}\nbest episode: {episode}", highlight=False)
+    write(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
 
     say(2, "ds.ad(batch_size=8, length=500)[0], then ds.dpt(batch_size=8, context=500)[0]")
-    console.print(dataset.ad(batch_size=8, length=500)[0].describe(), highlight=False)
-    console.print()
-    console.print(dataset.dpt(batch_size=8, context=500)[0].describe(), highlight=False)
+    write(f"{dataset.ad(batch_size=8, length=500)[0].describe()}\n")
+    write(dataset.dpt(batch_size=8, context=500)[0].describe())
 
     say(3, "verifying every byte and every step")
-    report = verify_release(MINI, level="deep")
-    if not report.ok:
-        raise ReleaseError(f"{MINI}: {report.findings[0].file}: {report.findings[0].problem}")
-    counts = f"{report.files} files, {report.chunks} chunks, {report.transitions:,} transitions replayed"
-    console.print(f"no problem in {counts}")
+    write(_verify(settings.root))
 
-    say(4, f"training AD, {model.layers} layers of width {model.width}, K = {options.context}: {options.steps} steps")
-    _train_demo(out / "ad", model, options, console)
+    say(4, f"training AD, {model.layers} layers of width {model.width}, K = {training.context}: {training.steps} steps")
+    _train_demo(out / "ad", settings)
+    write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
 
-    say(5, f"evaluating it and {', '.join(AGENTS)} on {len(families)} tasks of {DEMO_LAYOUT}")
-    tasks = [published_task(DEMO_LAYOUT, f"{family}/t0") for family in families]
-    runs = [_evaluate_demo(agent, tasks, protocol, out / "results") for agent in (*AGENTS, str(out / "ad"))]
-    console.print(_format_returns(runs), highlight=False)
-    console.print("(a model this small, trained this briefly, shows the workflow, not the method's ability)")
+    tasks = _demo_tasks() if settings.tasks is None else settings.tasks
+    say(5, f"evaluating it and {', '.join(AGENTS)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
+    compared = _evaluate_all(out, tasks, settings)
+    write(lead_table(compared.families, compared.agent))
 
-    say(6, "drawing the report")
-    write_page_with_episodes(runs, page)
-    console.print(f"[bold]done[/bold] in {time.perf_counter() - started:.0f} s; the report is {page}", highlight=False)
+    say(6, "drawing the curves and the report")
+    _draw_families(compared, picture)
+    write_page_with_episodes(compared.runs, page)
+    write(f"return in each episode: {picture}\nreport: {page}")
+    write(f"done in {time.perf_counter() - started:.0f} s\n\n{_conclusion(compared)}")
     return page
 
 
-def _train_demo(folder: Path, model: ModelOptions, options: TrainOptions, console: Console) -> None:
-    job = prepare("ad", model, options, HistoryOptions((DEMO_LAYOUT,)))
+def _output_files(out: Path) -> list[Path]:
+    """Returns the paths of the files to write into a folder, which is made."""
+    paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
+    for path in paths:
+        check_new_file(path, overwrite=(out / "ad").is_dir())  # of a stopped run
+    out.mkdir(parents=True, exist_ok=True)
+    return paths
+
+
+class _Compared(NamedTuple):
+    """Evaluated agents, the trained one last."""
+
+    agent: str
+    runs: list[EvaluationRun]
+    families: list[FamilyReturns]
+
+
+def _verify(root: Path) -> str:
+    """Returns text on what was verified."""
+    report = verify_release(root, level="deep")
+    if not report.ok:
+        raise ReleaseError(f"{root}: {report.findings[0].file}: {report.findings[0].problem}")
+    return f"no problem in {report.files} files, {report.chunks} chunks, {report.transitions:,} transitions replayed"
+
+
+def _train_demo(folder: Path, settings: DemoSettings) -> None:
+    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=settings.sources)
+    job = prepare("ad", settings.model, settings.training, histories)
     with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
-            show("AD", step, options.steps, format_loss(loss))
+            show("AD", step, job.options.steps, format_loss(loss))
 
         train(job.method, job.data, job.options, folder, job.about, done=done)
-    console.print(f"losses on training and held-out histories: {folder / 'curves.png'}", highlight=False)
 
 
-def _evaluate_demo(name: str, tasks: Sequence[Task], protocol: Protocol, results: Path) -> EvaluationRun:
-    agent = find_agent(name)
-    folder = results / agent.name
-    with bars(edges=True, unit="episodes") as show:
-        played = counted(show, agent.name, len(tasks) * protocol.episodes)
-        evaluate(agent.name, agent.make, tasks, protocol, out=folder, details=agent.details, played=played)
-    note_results(folder, Path(name) if agent.details else None)
-    return read_run(folder)
+def _demo_tasks() -> tuple[Task, ...]:
+    return tuple(task for task in shipped_validation_tasks().values() if task.layout.name == DEMO_LAYOUT)
 
 
-def _format_returns(runs: list[EvaluationRun]) -> str:
-    """Returns text with mean returns, one line per agent, and the meaning of marks behind them."""
-    cells = list(runs[0].cells)
-    lines = [f"{'return with':14}" + "".join(f"{family:>8}  " for _, family in cells)]
-    for run in runs:
-        scores = [f"{run.cells[cell].mean():8.1f}{overlap_marks(run.overlaps([cell])):2}" for cell in cells]
-        lines.append(f"{run.agent:14}" + "".join(scores))
-    return "\n".join([*lines, *overlap_legend(name for run in runs for name in run.overlaps(cells))])
+def _evaluate_all(out: Path, tasks: Sequence[Task], settings: DemoSettings) -> _Compared:
+    """Evaluate the reference egos and the trained model."""
+    protocol, seeds = settings.protocol, settings.seeds
+    results: dict[str, list[Result]] = {}
+    runs = []
+    for name in (*AGENTS, str(out / "ad")):
+        agent = find_agent(name)
+        folder = out / "results" / agent.name
+        with bars(edges=True, unit="episodes") as show:
+            results[agent.name] = evaluate(
+                agent.name,
+                agent.make,
+                tasks,
+                protocol,
+                seeds=seeds,
+                out=folder,
+                details=agent.details,
+                played=counted(show, agent.name, len(tasks) * len(seeds) * protocol.episodes),
+            )
+        note_results(folder, Path(name) if agent.details else None, tasks)
+        runs.append(read_run(folder))
+    return _Compared(runs[-1].agent, runs, family_returns(tasks, results))
+
+
+def _draw_families(compared: _Compared, path: Path) -> None:
+    notes = {}
+    for of_family in compared.families:
+        lead = find_lead(of_family, compared.agent)
+        notes[of_family.family] = f"{lead.mean:+.1f} above {' and '.join(FLOOR)} ({lead.low:+.1f} to {lead.high:+.1f})"
+    panels = {of_family.family: of_family.returns for of_family in compared.families}
+    title = f"{compared.agent} on {DEMO_LAYOUT} with validation teammates: return in each episode of a task"
+    plot_family_curves(panels, compared.agent, path, title, notes)
+
+
+def _conclusion(compared: _Compared) -> str:
+    """Returns what was measured, in few lines, with the limits of that."""
+    run, families = compared.runs[-1], compared.families
+    episodes = families[0].returns[compared.agent].shape[1]
+    pairs = ", ".join(f"{of_family.family} {len(of_family.returns[compared.agent])}" for of_family in families)
+    lines = [
+        f"{lead_verdict(families, compared.agent)}.",
+        f"Within a task, {describe_rise(families, compared.agent)}.",
+        f"Measured on {episodes} episodes of each task and seed ({pairs}). It is one training run: the intervals leave "
+        f"out how much trainings differ. Validation tasks are for choosing models, so this is no test result.",
+        *overlap_legend(run.overlaps(run.cells)),
+    ]
+    return "\n".join(lines)
 
 
 def _draw_best_episode(dataset: Dataset, path: Path) -> None:
-    """Draw the episode with the highest return of the first (best) history, the latest of several."""
-    history = dataset[0]
+    """Draw the episode with the highest return of the history that ends best, the latest of several."""
+    history = dataset[int(np.argmax(dataset.column("return_end")))]
     returns = history.returns()
     best = len(returns) - 1 - int(np.argmax(returns[::-1]))
     steps = slice(best * KEPT_STEPS, (best + 1) * KEPT_STEPS)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from baselines.agents.egos import Acting, find_agent
 from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import get_protocol, limit_tasks
+from baselines.evaluate.protocols import EVALUATION_SPLITS, get_protocol, limit_tasks
 from baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from baselines.methods.registry import get_method
 from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
@@ -135,6 +135,7 @@ class ExperimentPlan:
         model: values of `ModelOptions` for all entries.
         filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
         values: names of the entries to run; all by default.
+        split: split of the tasks to evaluate on: "test", the default, or "validation", on the training layouts.
         families: teammate families to evaluate with; all by default.
         tasks: tasks of each teammate kind and layout, at most.
         episodes: of a task; the protocol's by default.
@@ -156,6 +157,7 @@ class ExperimentPlan:
     model: dict[str, Any] = field(default_factory=dict)
     filters: dict[str, Any] = field(default_factory=dict)
     values: tuple[str, ...] = ()
+    split: str | None = None
     families: tuple[str, ...] = ()
     tasks: int | None = None
     episodes: int | None = None
@@ -195,7 +197,7 @@ def run_experiment(
         progress: called now and then.
 
     Raises:
-        UnknownNameError: for an unknown experiment, method, entry or layout.
+        UnknownNameError: for an unknown experiment, method, entry, layout or split.
         EmptySelectionError: if the release has histories of none of the layouts, or no task is left.
         LabelsMissingError: for DPT on histories without expert actions.
         OptionError: if a context is longer than a history, the plan sets what the experiment varies, or a folder holds
@@ -302,15 +304,23 @@ def _all_layouts(plan: ExperimentPlan) -> list[str]:
 
 
 def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
-    """Returns the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is tested on."""
+    """Returns the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is evaluated on."""
     if layout == ALL_LAYOUTS:
         return [task for name in _all_layouts(plan) for task in _test_tasks(experiment, plan, name)]
     if experiment.held_out:
+        if plan.split:
+            raise OptionError(f"split = {plan.split}: this experiment has tasks of its own, those of the suite's "
+                              f"held-out teammates; leave --split out")  # fmt: skip
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
-        tested_on = TESTED_ON[layout]
-        tasks = read_tasks(manifest_path(track_of(tested_on), "test"))
-        tasks = [task for task in tasks if task.layout.name == tested_on]
+        split = plan.split or "test"
+        if split not in EVALUATION_SPLITS:
+            raise unknown("split to evaluate on", split, EVALUATION_SPLITS)
+        played_on = TESTED_ON[layout] if split == "test" else layout
+        tasks = read_tasks(manifest_path(track_of(played_on), split))
+        tasks = [task for task in tasks if task.layout.name == played_on]
+        if not tasks:
+            raise EmptySelectionError(f"no {split} tasks on {played_on}: choose another --layout, or --split test")
     available = dict.fromkeys(task.teammate_family for task in tasks)
     for family in plan.families:
         if family not in available:
@@ -425,4 +435,5 @@ def _evaluate_entry(
         details=details,
         played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
     )
-    note_results(folder / "results", folder / "run", tasks if experiment.held_out else ())
+    own = experiment.held_out or plan.split == "validation"
+    note_results(folder / "results", folder / "run", tasks if own else ())

@@ -2,6 +2,8 @@
 
 One JSON line for each part:
 
+    noise   recorded transitions/s of noise histories, writing and hashing included, by wall clock and by CPU time, and
+            the seconds to compile them
     speed   recorded transitions/s of the complete path (PPO, recording, writing), and the share of the time that
             recording and writing take
     memory  highest resident memory of a collection with the paper's 1024 environments and of its learner alone, each
@@ -15,6 +17,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import tempfile
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
@@ -27,15 +30,18 @@ import h5py
 import jax
 
 from benchmarks.common import folder_size, peak_memory, print_line
+from generation.collection.noise import run_noise
 from generation.collection.task import make_learner, run_task
 from generation.collection.task_folder import last_timing
 from generation.learners.config import Widths
 from generation.profiles import Profile, load_profile
+from generation.profiles.noise_config import NoiseConfig
 from generation.profiles.work import Work
+from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
-from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.commands.options import COUNT
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
+from icrl4aht_data.benchmark.tasks import make_task, read_tasks
+from icrl4aht_data.commands.options import COUNT, LAYOUT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
@@ -50,6 +56,10 @@ _PAPER_DTYPES = {
     "teammate_actions": "int32",
     "expert_actions": "int32",
 }
+
+
+_NOISE = NoiseConfig(histories=64, episodes=100, finish=(0.5, 1.0))
+"""Noise histories to measure: 640,000 transitions."""
 
 
 class _EnoughError(Exception):
@@ -81,6 +91,28 @@ def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
         "steps_per_second": round(timing["steps_per_second"]),
         "recorded_transitions_per_second": round(timing["steps_per_second"] * KEPT_STEPS / EPISODE_STEPS),
         "recording_and_writing_share": round(timing["recording"] / timing["seconds"], 4),
+    }
+
+
+def noise_speed_facts(layout: str) -> dict[str, Any]:
+    """Speed of a task of noise histories with H4 after another one has compiled it."""
+    profile = replace(load_profile("smoke"), noise=_NOISE, sources=("noise",))
+    mate = heuristic_teammate("utility_greedy", "default", 0)
+    tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
+    wall, cpu = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for task in tasks:
+            began, used = time.perf_counter(), time.process_time()
+            run_noise(Work(task, "noise"), profile, Path(folder) / task.task_id)
+            wall.append(time.perf_counter() - began)
+            cpu.append(time.process_time() - used)
+    transitions = _NOISE.histories * _NOISE.episodes * KEPT_STEPS
+    return {
+        "layout": layout,
+        "transitions": transitions,
+        "transitions_per_second": round(transitions / wall[1]),
+        "transitions_per_cpu_second": round(transitions / cpu[1]),
+        "compile_seconds": round(wall[0] - wall[1], 1),
     }
 
 
@@ -164,19 +196,23 @@ def write_paper_format(root: Path, parts: list[Dataset]) -> None:
                 index.write(json.dumps(history.entry.to_json()) + "\n")
 
 
-PARTS_OF_COLLECTION = ("speed", "memory", "bytes")
+PARTS_OF_COLLECTION = ("speed", "noise", "memory", "bytes")
 
 
 @click.command()
 @click.argument("parts", nargs=-1, type=click.Choice(PARTS_OF_COLLECTION))
 @click.option("--profile", "profile_name", default="smoke", show_default=True, help="Profile of the speed part.")
 @click.option("--updates", type=COUNT, default=30, show_default=True, help="Updates of the speed part.")
+@click.option("--layout", "noise_layout", type=LAYOUT, default="demo_wide", help="Layout of the noise part.")
 @click.option("--wide-updates", type=COUNT, default=4, show_default=True, help="Updates of the memory part.")
 @click.option("--streams", type=COUNT, default=8, show_default=True, help="Histories of each task in the bytes part.")
-def main(parts: tuple[str, ...], profile_name: str, updates: int, wide_updates: int, streams: int) -> None:
+def main(
+    parts: tuple[str, ...], profile_name: str, updates: int, noise_layout: str, wide_updates: int, streams: int
+) -> None:
     """Measure speed, memory and bytes of a collection; one JSON line each. An update of memory has 262,144 steps."""
     measures: dict[str, Callable[[], dict[str, Any]]] = {
         "speed": lambda: collection_speed(profile_name, updates),
+        "noise": lambda: noise_speed_facts(noise_layout),
         "memory": lambda: collection_memory(wide_updates),
         "bytes": lambda: transition_bytes(streams),
     }

@@ -17,6 +17,7 @@ from baselines.commands.options import (
     acting_option,
     default_batch_size,
     episodes_option,
+    evaluation_split_option,
     experiment_options,
     find_ego,
     gifs_option,
@@ -99,6 +100,7 @@ def cli() -> None:
     epilog=examples(
         "python -m baselines evaluate --agent random --out runs/random",
         "python -m baselines evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
+        "python -m baselines evaluate --agent runs/ad --split validation --layout demo_wide --out runs/ad-validation",
         "python -m baselines evaluate --agent oracle --layout demo_wide --tasks 1 --episodes 5 --out runs/oracle",
     ),
 )
@@ -108,12 +110,13 @@ def cli() -> None:
 @click.option(
     "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
 )
+@evaluation_split_option
 @click.option("--layout", type=LAYOUT, multiple=True, help="Only tasks on this layout; repeat for several.")
 @click.option(
     "--manifest",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
-    help="Tasks of this file instead of the tracks' tasks.",
+    help="Tasks of this file instead of the tracks' tasks; not with --split.",
 )
 @tasks_option
 @episodes_option
@@ -125,6 +128,7 @@ def evaluate_command(
     acting: Any,
     protocol: str,
     track: tuple[str, ...],
+    split: str | None,
     layout: tuple[str, ...],
     manifest: Path | None,
     tasks: int | None,
@@ -133,15 +137,18 @@ def evaluate_command(
     seeds: int,
     out: Path,
 ) -> None:
-    """Evaluate an agent on the benchmark's test tasks.
+    """Evaluate an agent on the benchmark's test tasks, or on validation tasks.
 
-    Plays 100 episodes of each task and writes one JSON file per task into OUT/tasks. Finished tasks are kept.
+    Plays 100 episodes of each task and writes one JSON file per task into OUT/tasks. Finished tasks are kept. Choose
+    models by the validation tasks: their layouts are in training, their teammates are in neither training nor test.
     """
     from baselines.evaluate.evaluator import evaluate
     from baselines.evaluate.protocols import get_protocol, limit_tasks
     from baselines.report.results import note_results
 
-    paths = [manifest] if manifest else [manifest_path(name, "test") for name in track]
+    if manifest and split:
+        raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
+    paths = [manifest] if manifest else [manifest_path(name, split or "test") for name in track]
     ego = find_ego("--agent", agent, acting)
     names = {get_layout(name).name for name in layout}
     chosen = limit_tasks(
@@ -166,7 +173,7 @@ def evaluate_command(
             details=ego.details,
             played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
         )
-    note_results(out, Path(agent) if ego.details else None, chosen if manifest else ())
+    note_results(out, Path(agent) if ego.details else None, chosen if manifest or split == "validation" else ())
     noun = "result" if len(chosen) == 1 else "results"
     _console.print(f"{len(chosen)} {noun} in {out}; `python -m baselines report {out}` shows them")
 

@@ -62,6 +62,7 @@ class HostPort(click.ParamType):
 
 EGO_NAME = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
+_EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
@@ -76,6 +77,12 @@ _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (
 acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
 experiment_acting_option = click.option(
     "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
+)
+evaluation_split_option = click.option(
+    "--split",
+    type=_EVALUATION_SPLIT,
+    help="Tasks of this split: test, or validation, by which models are chosen.",
+    show_default="test",
 )
 tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
 episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
@@ -269,6 +276,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         _experiment_size_option,
         history_filters,
         dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs", "labels")),
+        evaluation_split_option,
         tasks_option,
         episodes_option,
         seeds_option,

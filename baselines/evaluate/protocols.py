@@ -32,6 +32,9 @@ class Protocol:
     steps: int = KEPT_STEPS
 
 
+EVALUATION_SPLITS = ("test", "validation")
+"""Splits whose tasks are in the package: the published test tasks, and validation tasks, by which models are chosen."""
+
 PROTOCOLS = {
     "published": Protocol("published", noise="fixed", four_recipes=True),
     "seeded": Protocol("seeded", noise="seeded", four_recipes=False),

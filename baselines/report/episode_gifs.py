@@ -14,7 +14,7 @@ from baselines.agents.egos import AGENTS, find_agent, get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import Protocol
 from baselines.report.overlap import describe_overlap
-from baselines.report.results import EvaluationRun, ResultSource, cell_order, groups_of
+from baselines.report.results import EvaluationRun, ResultSource, cell_of, cell_order, group_of, groups_of
 from generation.policy import Policy
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
@@ -110,7 +110,9 @@ def _draw_result(
 ) -> EpisodeGif:
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
     family = task.teammate_family
-    players = f"{run.label} with {family}/t{task.teammate['theta_id']} on {task.layout.name}"
+    group = group_of(cell_of(task))
+    kind = "" if group == "test" else f" ({group})"  # a number without it names a published teammate
+    players = f"{run.label} with {family}/t{task.teammate['theta_id']}{kind} on {task.layout.name}"
     trained = describe_overlap([task], source.seen)
     origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {trained}"
     try:

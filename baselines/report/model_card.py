@@ -52,7 +52,7 @@ def model_card(run: EvaluationRun) -> str:
         models="\n".join(_model_row(run, sources) for sources in models),
         settings=_settings(models),
         protocol=run.protocol,
-        results="\n\n".join(table for _, table in track_tables(run)),
+        results="\n\n".join(f"### {title[0].upper()}{title[1:]}\n\n{table}" for title, table in track_tables(run)),
         limits="\n".join(f"* {limit}" for limit in limits),
     )
 

@@ -1,4 +1,4 @@
-"""Overlap of training and test: marks for results with teammates or on layouts that the agent was trained with."""
+"""Overlap of training data and tasks: marks for results with teammates or on layouts that were in training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from icrl4aht_data.benchmark.tasks import Task
 
 
 class OverlapKind(NamedTuple):
-    """One way in which training and test overlap.
+    """One way in which the training data and the tasks of an evaluation overlap.
 
     Attributes:
         mark: character behind a score.
@@ -25,8 +25,8 @@ OVERLAPS = {
     "teammate": OverlapKind("‡", "the agent was trained with one of these very teammates"),
     "family": OverlapKind(
         "†",
-        "the agent was trained with teammates of this family, or of this algorithm if they are learned; members of a "
-        "family act alike, so this is no result with unknown teammates",
+        "the agent was trained with other teammates of this family, or of this algorithm if they are learned; members "
+        "of a family may act alike, so this is no result with unknown kinds of teammates",
     ),
     "layout": OverlapKind("§", "the agent was trained on this layout, which the track reserves for tests"),
     "unknown": OverlapKind("?", "unknown training data: nothing says what the agent was trained on"),
@@ -35,10 +35,10 @@ OVERLAPS = {
 
 
 def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[str, ...]:
-    """Returns the names of the kinds of overlap between test tasks and training data, in the order of `OVERLAPS`.
+    """Returns the names of the kinds of overlap between tasks and training data, in the order of `OVERLAPS`.
 
     Args:
-        tasks: tasks that an agent was tested on.
+        tasks: tasks that an agent was evaluated on.
         seen: what it was trained on; None if that is not known.
     """
     if seen is None:
@@ -75,7 +75,7 @@ def overlap_legend(overlaps: Iterable[str]) -> list[str]:
 
 
 def describe_overlap(tasks: Sequence[Task], seen: SeenInTraining | None) -> str:
-    """Returns sentences on the training data of an agent and the tasks of one group that it was tested on."""
+    """Returns sentences on the training data of an agent and the tasks of one group that it was evaluated on."""
     if seen is None:
         return "Unknown training data."
     if not seen.teammates and not seen.layouts:

@@ -133,7 +133,8 @@ def _introduction(runs: Sequence[EvaluationRun], notes: Sequence[str]) -> str:
     marks = "".join(f"<li>{escape(text)}</li>" for text in overlap_legend(overlaps))
     if marks:
         marks = (
-            f"<p>Marks behind a score say how training and test overlap; the tooltip has details:</p><ul>{marks}</ul>"
+            f"<p>Marks behind a score say how training data and tasks overlap; the tooltip has details:</p>"
+            f"<ul>{marks}</ul>"
         )
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return f"""<h1>ICRL4AHT report</h1>
@@ -180,14 +181,17 @@ def _protocol_section(protocol: str, runs: list[EvaluationRun], folder: Path) ->
                 f"their range if there are several. {_overlap_note(some)}"
             )
             parts += [f"<h3>Adaptation curves {name}</h3>", _figure(path, caption)]
-    path = folder / f"{protocol}-gain.png"
-    plot_adaptation_gain([(run.name, {cell: run.gain(cell) for cell in run.cells}) for run in runs], path)
-    caption = (
-        f"{_conditions(runs)}. Mean over a track's test cells, a dot per cell; of the halves, if there are fewer than "
-        f"40 episodes. The paper states no numbers: “small on average” (App. F). {_overlap_note(runs)}"
-    )
-    parts += ["<h3>Adaptation gain</h3>", _figure(path, caption), _gain_table(runs)]
-    return [*parts, "<h3>Headroom</h3>", _headroom_table(protocol)]
+    parts.append("<h3>Adaptation gain</h3>")
+    tested = [run for run in runs if any(group_of(cell) == "test" for cell in run.cells)]
+    if tested:
+        path = folder / f"{protocol}-gain.png"
+        plot_adaptation_gain([(run.name, {cell: run.gain(cell) for cell in run.cells}) for run in tested], path)
+        caption = (
+            f"{_conditions(tested)}. Mean over a track's test cells, a dot per cell; of the halves, if there are fewer "
+            f"than 40 episodes. The paper states no numbers: “small on average” (App. F). {_overlap_note(tested)}"
+        )
+        parts.append(_figure(path, caption))
+    return [*parts, _gain_table(runs), "<h3>Headroom</h3>", _headroom_table(protocol)]
 
 
 def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = None) -> str:
@@ -206,7 +210,7 @@ def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = N
 
 
 def _overlap_note(runs: Sequence[EvaluationRun]) -> str:
-    """Returns a sentence that names the cells of a figure with overlaps of training and test; a figure has no marks."""
+    """Returns a sentence that names the cells of a figure which overlap with training; a figure has no marks."""
     marked = []
     for run in runs:
         cells = [(cell, overlap_marks(run.overlaps([cell]))) for cell in run.cells]
@@ -214,7 +218,7 @@ def _overlap_note(runs: Sequence[EvaluationRun]) -> str:
         if named:
             everywhere = len(named) == len(cells) and len({marks for _, marks in cells}) == 1
             marked.append(f"{run.label}: {f'all cells{cells[0][1]}' if everywhere else ', '.join(named)}")
-    return f"Overlap of training and test: {'; '.join(marked)}." if marked else ""
+    return f"Overlap with the training data: {'; '.join(marked)}." if marked else ""
 
 
 def _table_caption(table: PaperTable, rows: Sequence[TableRow], runs: Sequence[EvaluationRun], protocol: str) -> str:
@@ -269,11 +273,9 @@ def _tooltip(text: str) -> str:
 
 
 def _other_cells(runs: list[EvaluationRun]) -> list[str]:
-    """Returns the tables of cells that no paper table has: training tasks, held-out teammates, tasks of one's own."""
+    """Returns the tables of cells that no paper table has, those of validation, training, held-out and own tasks."""
     cells = sorted({cell for run in runs for cell in run.cells if group_of(cell) in GROUP_TEXTS}, key=cell_order)
-    if not cells:
-        return []
-    parts = ["<h3>Other tasks</h3>"]
+    parts = []
     for group, text in GROUP_TEXTS.items():
         of_group = [cell for cell in cells if group_of(cell) == group]
         if of_group:
@@ -284,7 +286,8 @@ def _other_cells(runs: list[EvaluationRun]) -> list[str]:
             ]
             columns = ["agent", *map(_cell_name, of_group)]
             caption = escape(f"{text} {_conditions(shown, of_group)}.")
-            parts += [f"<p class=caption>{caption}</p>", _html_table(columns, body)]
+            title = f"<h3>{group.capitalize()} tasks</h3>"
+            parts += [title, f"<p class=caption>{caption}</p>", _html_table(columns, body)]
     return parts
 
 

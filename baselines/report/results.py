@@ -2,8 +2,8 @@
 
 Reports group results by cell, a layout and a group of teammates. The cells of the benchmark consist of the published
 test tasks: ("demo_wide", "H4"). Other tasks never share a cell with those, since the paper's numbers and the headroom
-do not apply to them: ("demo_wide", "H4 (training)") are tasks of the split `train`, "(held out)" of the split
-`heldout`, and "(own)" other tasks of the split `test`.
+do not apply to them: ("demo_wide", "H4 (validation)") are tasks of the split `validation`, "(training)" of the split
+`train`, "(held out)" of the split `heldout`, and "(own)" other tasks of the split `test`.
 """
 
 from __future__ import annotations
@@ -33,15 +33,18 @@ TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["te
 """Layouts that the benchmark tests on, in the paper's order."""
 
 OWN_TASKS, TRAINED_RUN = "tasks.jsonl", "run.json"
-"""Files next to results: tasks that are not among the published ones; settings of the evaluated model."""
+"""Files next to results: tasks that are not among the published test tasks; settings of the evaluated model."""
 
 PUBLISHED_PROTOCOL = "published"
 """Name of the protocol that the paper's numbers belong to."""
 
-_GROUPS = {"train": "training", "heldout": "held out", "test": "own"}
+_GROUPS = {"validation": "validation", "train": "training", "heldout": "held out", "test": "own"}
 """Split of tasks that are not published test tasks -> name of their group in reports."""
 
 GROUP_TEXTS = {
+    "validation": "Validation tasks (split validation): training layouts with teammates that are drawn from the "
+    "training ranges and are in no training history. They are for choosing models, so the returns of a model that was "
+    "chosen by them are too high, and they are no test results.",
     "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
     "Their returns do not show generalisation.",
     "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
@@ -125,7 +128,7 @@ class EvaluationRun:
         return self.source(cell).tasks[cell]
 
     def overlaps(self, cells: Iterable[Cell]) -> tuple[str, ...]:
-        """Returns the kinds of overlap between the training data and the tasks of some cells, see `OVERLAPS`."""
+        """Returns the kinds of overlap between training data and the tasks of some cells, see `OVERLAPS`."""
         found = {name for cell in cells for name in find_overlaps(self.tasks(cell), self.source(cell).seen)}
         return tuple(name for name in OVERLAPS if name in found)
 
@@ -173,7 +176,7 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
         results: folder of the results.
         run: run folder of the evaluated model, if it was trained here. Its path, settings, their hash and the hash of
             its data's manifest are written to run.json.
-        tasks: the tasks played, if they are not the published ones; added to tasks.jsonl.
+        tasks: the tasks played, if they are not the published test tasks; added to tasks.jsonl.
 
     Raises:
         OptionError: if `run` is not a run on learning histories.
@@ -222,7 +225,8 @@ def as_run(
     Args:
         results: results of `baselines.evaluate.evaluate`, all under the same settings.
         where: folder of the results, for messages.
-        tasks: the tasks that were played, if they are not the published test tasks.
+        tasks: the tasks that were played, if they are neither the published test tasks nor the package's validation
+            tasks.
         trained: content of run.json, see `note_results`; None for an agent that was not trained here.
 
     Raises:
@@ -232,13 +236,15 @@ def as_run(
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: results of different settings in one run")
     known = published_test_tasks() | {task.task_id: task for task in tasks}
+    if any(result.task_id not in known for result in results):
+        known = shipped_validation_tasks() | known
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
     played: dict[Cell, list[Task]] = defaultdict(list)
     for result in results:
         if result.task_id not in known:
             raise OptionError(
-                f"{where}: {result.task_id!r} is neither a published test task nor in the results' {OWN_TASKS}; "
-                f"evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
+                f"{where}: {result.task_id!r} is neither a published test task, nor a validation task of this package, "
+                f"nor in the results' {OWN_TASKS}; evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
             )
         task = known[result.task_id]
         cells[cell_of(task)].append(np.mean(result.returns, axis=0))
@@ -266,6 +272,12 @@ def _find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: 
 def published_test_tasks() -> dict[str, Task]:
     """Returns the 160 published test tasks by id."""
     return {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))}
+
+
+@cache
+def shipped_validation_tasks() -> dict[str, Task]:
+    """Returns the package's validation tasks by id."""
+    return {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "validation"))}
 
 
 @cache
@@ -340,7 +352,7 @@ def family_of(cell: Cell) -> str:
 
 
 def group_of(cell: Cell) -> str:
-    """Returns the kind of a cell's tasks: "test" for published test tasks, else "training", "held out" or "own"."""
+    """Returns the kind of a cell's tasks: "test" for published test tasks, otherwise one of `GROUP_TEXTS`."""
     return cell[1].partition(" (")[2].removesuffix(")") or "test"
 
 

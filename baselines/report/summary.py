@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
     A row has the agent, the conditions of the evaluation, mean return, std and 95 % interval over the instances (None
     for a single instance), the paper's numbers (None unless the protocol is `published`), the adaptation gain,
     headroom, the normalised score (None for cells without headroom and incomplete cells), and `overlap`: the ways in
-    which training and test overlap, see `baselines.report.overlap.OVERLAPS`.
+    which training data and tasks overlap, see `baselines.report.overlap.OVERLAPS`.
     """
     published: dict[str, Any] = {} if run.variant else published_cells(run.agent)
     headroom = read_headroom(run.protocol)
@@ -111,7 +112,7 @@ def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
 
 
 def markdown(runs: list[EvaluationRun]) -> str:
-    """Returns a Markdown report with one table per run and track: returns by layout and group of teammates."""
+    """Returns a Markdown report with one table per run, track and kind of tasks: returns by layout and family."""
     lines = [
         "# Returns per layout and teammate family",
         "",
@@ -119,29 +120,31 @@ def markdown(runs: list[EvaluationRun]) -> str:
         "`published`: the paper's 5 instances, 100 episodes of 100 steps.",
     ]
     for run in runs:
-        for track, table in track_tables(run):
-            lines += ["", f"## {run.name}, track {track}", "", table]
+        for part, table in track_tables(run):
+            lines += ["", f"## {run.name}, {part}", "", table]
     return "\n".join(lines) + "\n"
 
 
 def track_tables(run: EvaluationRun) -> Iterator[tuple[str, str]]:
-    """Yields each track that was played, and a Markdown table with its caption and the explanation of its marks.
+    """Yields each track and kind of tasks that was played, and a Markdown table with caption and meaning of its marks.
 
-    The table has a column per layout and a row per group of teammates.
+    Test tasks come first, as "track teammate"; others have tables of their own, as "track teammate, validation tasks".
+    A table has a column per layout and a row per family of teammates.
     """
-    cells = {(row["layout"], cell[1]): row for cell, row in zip(run.cells, rows(run), strict=True)}
-    for track, splits in TRACKS.items():
+    cells = dict(zip(run.cells, rows(run), strict=True))
+    for (track, splits), kind in product(TRACKS.items(), ("test", *GROUP_TEXTS)):
         of_track = dict.fromkeys((*splits["test"], *splits["train"]))
-        layouts = [layout for layout in of_track if any(cell[0] == layout for cell in cells)]
-        if layouts:
-            shown = [cell for cell in run.cells if cell[0] in layouts]
+        shown = [cell for cell in run.cells if cell[0] in of_track and group_of(cell) == kind]
+        layouts = [layout for layout in of_track if any(cell[0] == layout for cell in shown)]
+        if shown:
             body = [
                 [group, *(_cell_text((layout, group), cells.get((layout, group))) for layout in layouts)]
                 for group in groups_of(shown)
             ]
             notes = [*table_caption(run, shown), *overlap_legend(run.overlaps(shown))]
             table = markdown_table(["family", *layouts], body)
-            yield track, "\n".join([table, "", *(f"* {note}" for note in notes)])
+            title = f"track {track}" + ("" if kind == "test" else f", {kind} tasks")
+            yield title, "\n".join([table, "", *(f"* {note}" for note in notes)])
 
 
 def table_caption(run: EvaluationRun, cells: Sequence[Cell]) -> list[str]:

@@ -16,6 +16,7 @@ from baselines.report.overlap import describe_overlap
 from baselines.report.results import (
     PUBLISHED_PROTOCOL,
     EvaluationRun,
+    group_of,
     instances_range,
     instances_text,
     normalised_score,
@@ -74,7 +75,7 @@ class TableScore(NamedTuple):
         headroom: (number of measured cells with headroom, number of measured cells).
         played: (number of cells played, number of cells).
         shortfall: instances played, if they are not the published ones, such as "1 of 5 instances"; usually empty.
-        overlaps: the ways in which training and test overlap, see `baselines.report.overlap.OVERLAPS`.
+        overlaps: the ways in which training data and tasks overlap, see `baselines.report.overlap.OVERLAPS`.
         details: what the score is of, with the conditions of the evaluation and the training of the agent; sentences.
     """
 
@@ -209,20 +210,21 @@ def sweep_scores(runs: Sequence[EvaluationRun], quantity: str) -> dict[str, dict
     """Returns layout -> agent -> (value, score) for the runs in which `quantity` was varied: "K" or "size".
 
     A score is the mean over the cells of a layout that were played, with the paper's mean over the four families if
-    the run has its protocol.
+    the run has its protocol. Tasks that are not test tasks have layouts of their own: "demo_wide (validation)".
     """
     panels: dict[str, dict[str, list[tuple[Any, TableScore]]]] = {}
     for run in runs:
         if run.variant is None or run.variant[0] != quantity:
             continue
         value, headroom = run.variant[1], read_headroom(run.protocol)
-        for layout in dict.fromkeys(layout for layout, _ in run.cells):
-            cells = [cell for cell in run.cells if cell[0] == layout]
+        for layout, kind in dict.fromkeys((cell[0], group_of(cell)) for cell in run.cells):
+            is_test = kind == "test"
+            cells = [cell for cell in run.cells if cell[0] == layout and group_of(cell) == kind]
             of_test = [(layout, family) for family in HEURISTICS]
-            group = of_test if set(cells) <= set(of_test) else cells
-            mean = _published_point(quantity, run.agent, layout, value) if group is of_test else None
-            score = score_cells(group, run, headroom, None if mean is None else (mean, None))
-            panels.setdefault(layout, {}).setdefault(run.agent, []).append((value, score))
+            mean = _published_point(quantity, run.agent, layout, value) if is_test else None
+            score = score_cells(of_test if is_test else cells, run, headroom, None if mean is None else (mean, None))
+            panel = layout if is_test else f"{layout} ({kind})"
+            panels.setdefault(panel, {}).setdefault(run.agent, []).append((value, score))
     return panels
 
 

@@ -14,6 +14,8 @@ import jax
 import numpy as np
 from rich import filesize
 
+from generation.collection.noise import noise_bytes
+from generation.collection.noise_rollout import EPISODES_AT_ONCE, play_noisy_episodes
 from generation.collection.record import array_shapes
 from generation.env import Environment
 from generation.learners.config import PPOConfig
@@ -22,6 +24,7 @@ from generation.learners.population.fcp import FCP
 from generation.learners.population.population import Population
 from generation.populations.build import population_runs
 from generation.profiles import Profile
+from generation.profiles.work import Work
 from generation.teammates.learned import build_untrained
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -34,8 +37,8 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
-_MEASUREMENTS = 3
-"""Measurements of an estimate: of egos, of teammates, of releases."""
+_MEASUREMENTS = 4
+"""Measurements of an estimate: of egos, of noise histories, of teammates, of releases."""
 
 _WORTH_MEASURING = 20.0
 """Seconds: a complete update that should take less is measured itself, not only a share of it."""
@@ -61,24 +64,32 @@ class LearnerSpeed(NamedTuple):
 class RebuildCost:
     """Estimated cost of rebuilding a profile.
 
-    Hours include learning and recording: one process trains the populations one after the other, then `devices` devices
-    share the tasks, one task at a time each.
+    Hours include learning, playing and recording: one process trains the populations one after the other, then
+    `devices` devices share the tasks, one task at a time each. A process compiles noise histories once for all tasks of
+    one teammate family on one layout, but a device of several compiles each of its tasks.
 
     Attributes:
         profile: name of the profile.
         populations: number of populations of learned teammates.
         teammate_steps: environment steps of all populations.
         tasks: number of tasks.
-        environment_steps: environment steps of all tasks.
-        recorded_transitions: transitions of all streams, before the stream filter.
-        kept_transitions: transitions after the stream filter.
+        learners: number of egos that learn.
+        environment_steps: environment steps of all of them.
+        noise_histories: number of noise histories.
+        noise_transitions: number of their transitions.
+        recorded_transitions: transitions of all streams and noise histories, before the stream filter.
+        kept_transitions: transitions after the stream filter, at most.
         artefact_bytes: size of the artefacts of all tasks.
         lite_bytes, full_bytes: sizes of a lite and of a full release.
         device: description of the measured device.
         teammate_steps_per_second: measured speed of training populations; None without populations.
-        steps_per_second: measured speed of training egos.
-        compile_seconds: time to compile a task.
+        steps_per_second: measured speed of training egos; None without egos.
+        compile_seconds: time to compile an ego's task; None without egos.
+        noise_steps_per_second: measured speed of playing noise histories; None without any.
+        noise_programs: number of programs to compile for them, one for each layout and teammate family.
+        noise_compile_seconds: time to compile one of them; None without any.
         teammate_hours_on_one: hours to train all populations on one device.
+        noise_hours_on_one: hours to play all noise histories on one device.
         hours_on_one: hours of the complete rebuild on one device.
         devices: number of devices.
         hours_on_devices: hours of the complete rebuild on this number of devices.
@@ -88,7 +99,10 @@ class RebuildCost:
     populations: int
     teammate_steps: int
     tasks: int
+    learners: int
     environment_steps: int
+    noise_histories: int
+    noise_transitions: int
     recorded_transitions: int
     kept_transitions: int
     artefact_bytes: int
@@ -96,9 +110,13 @@ class RebuildCost:
     full_bytes: int
     device: str
     teammate_steps_per_second: float | None
-    steps_per_second: float
-    compile_seconds: float
+    steps_per_second: float | None
+    compile_seconds: float | None
+    noise_steps_per_second: float | None
+    noise_programs: int
+    noise_compile_seconds: float | None
     teammate_hours_on_one: float
+    noise_hours_on_one: float
     hours_on_one: float
     devices: int
     hours_on_devices: float
@@ -114,19 +132,57 @@ class RebuildCost:
             yield "populations of teammates", f"{self.populations:,}"
             yield "environment steps of them", f"{self.teammate_steps:,}"
         yield "tasks", f"{self.tasks:,}"
-        yield "environment steps", f"{self.environment_steps:,}"
+        if self.steps_per_second:
+            yield "learners", f"{self.learners:,}"
+            yield "environment steps", f"{self.environment_steps:,}"
+        if self.noise_steps_per_second:
+            yield "noise histories", f"{self.noise_histories:,}"
+            yield "transitions of them", f"{self.noise_transitions:,}"
         yield "recorded transitions", f"{self.recorded_transitions:,}"
         yield "kept transitions", f"{self.kept_transitions:,}"
         yield "disk, artefacts", filesize.decimal(self.artefact_bytes)
         yield "disk, release lite", filesize.decimal(self.lite_bytes)
         yield "disk, release full", filesize.decimal(self.full_bytes)
-        yield "measured here", f"{self.steps_per_second:,.0f} steps/s on {self.device}"
-        yield "compiling a task", f"{self.compile_seconds:.0f} s"
+        if self.steps_per_second:
+            yield "measured here", f"{self.steps_per_second:,.0f} steps/s on {self.device}"
+            yield "compiling a task", f"{self.compile_seconds:.0f} s"
         if self.teammate_steps_per_second:
             yield "measured, teammates", f"{self.teammate_steps_per_second:,.0f} steps/s"
             yield "hours, teammates", f"{self.teammate_hours_on_one:,.1f}"
+        if self.noise_steps_per_second:
+            yield "measured, noise", f"{self.noise_steps_per_second:,.0f} steps/s on {self.device}"
+            yield "compiling noise", f"{self.noise_programs} x {self.noise_compile_seconds:.0f} s"
+            yield "hours, noise", f"{self.noise_hours_on_one:,.1f}"
         yield "hours on one such device", f"{self.hours_on_one:,.1f}"
         yield f"hours on {self.devices} of them", f"{self.hours_on_devices:,.1f}"
+
+
+class SourceCost(NamedTuple):
+    """Estimated cost of one source's tasks.
+
+    Attributes:
+        tasks: number of tasks.
+        units: number of learners or of noise histories.
+        steps: environment steps of all units.
+        recorded: transitions of all units.
+        kept: those that a release has at most.
+        artefact_bytes: size of the artefacts.
+        speed: measured speed; None without tasks.
+        programs: number of programs that one process compiles.
+        seconds_on_one: time on one device.
+        seconds_on_devices: time if several devices share the tasks.
+    """
+
+    tasks: int = 0
+    units: int = 0
+    steps: int = 0
+    recorded: int = 0
+    kept: int = 0
+    artefact_bytes: int = 0
+    speed: LearnerSpeed | None = None
+    programs: int = 0
+    seconds_on_one: float = 0.0
+    seconds_on_devices: float = 0.0
 
 
 def estimate_cost(
@@ -139,45 +195,113 @@ def estimate_cost(
         devices: number of devices that share the tasks.
         advance: called before each of the measurements with its name, the number of those done, and their number.
     """
-    ego = profile.ego
-    layouts = [
-        layout
-        for layout in profile.layouts
-        for _ in range(profile.tasks_on(layout, "ppo") * profile.learners * ("ppo" in profile.sources))
-    ]
-    tasks = len(layouts)
     advance("measuring how fast egos learn", 0, _MEASUREMENTS)
-    learning = calibrate(ego, partial(task_learner, profile))
-    task_seconds = learning.seconds(ego.updates * ego.steps_per_update)
-    advance("measuring how fast teammates learn", 1, _MEASUREMENTS)
+    ppo = ppo_cost(profile, devices) if "ppo" in profile.sources else SourceCost()
+    advance("measuring how fast noise histories are played", 1, _MEASUREMENTS)
+    noise = noise_cost(profile, devices) if "noise" in profile.sources else SourceCost()
+    advance("measuring how fast teammates learn", 2, _MEASUREMENTS)
     populations = [run.steps for run in population_runs(profile, profile.algorithms, 0)]
     playing = calibrate(profile.teammates.ppo, partial(calibration_population, profile)) if populations else None
-    advance("measuring the size of releases", 2, _MEASUREMENTS)
-    sizes = {kind: bytes_per_transition(kind) for kind in KINDS}
+    advance("measuring the size of releases", 3, _MEASUREMENTS)
+    parts = [(source, part.kept) for source, part in (("ppo", ppo), ("noise", noise)) if part.kept]
+    sizes = {kind: round(sum(kept * bytes_per_transition(kind, source) for source, kept in parts)) for kind in KINDS}
     advance("measured", _MEASUREMENTS, _MEASUREMENTS)
-    population_seconds = [playing.seconds(steps) for steps in populations] if playing else []
-    in_turn = sum(population_seconds) + -(-tasks // devices) * task_seconds
-    kept = tasks * profile.keep * ego.episodes * KEPT_STEPS
+    teammate_seconds = sum(playing.seconds(steps) for steps in populations) if playing else 0.0
     device = jax.devices()[0]
     return RebuildCost(
         profile=profile.name,
         populations=len(populations),
         teammate_steps=sum(populations),
-        tasks=tasks,
-        environment_steps=tasks * ego.updates * ego.steps_per_update,
-        recorded_transitions=tasks * ego.environments * ego.episodes * KEPT_STEPS,
-        kept_transitions=kept,
-        artefact_bytes=artefact_bytes(layouts, ego),
-        **{f"{kind}_bytes": round(kept * size) for kind, size in sizes.items()},
+        tasks=ppo.tasks + noise.tasks,
+        learners=ppo.units,
+        environment_steps=ppo.steps,
+        noise_histories=noise.units,
+        noise_transitions=noise.recorded,
+        recorded_transitions=ppo.recorded + noise.recorded,
+        kept_transitions=ppo.kept + noise.kept,
+        artefact_bytes=ppo.artefact_bytes + noise.artefact_bytes,
+        **{f"{kind}_bytes": size for kind, size in sizes.items()},
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
         teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
-        steps_per_second=round(learning.steps_per_second, 1),
-        compile_seconds=round(learning.compile_seconds, 1),
-        teammate_hours_on_one=round(sum(population_seconds) / 3600, 2),
-        hours_on_one=round((sum(population_seconds) + tasks * task_seconds) / 3600, 2),
+        steps_per_second=round(ppo.speed.steps_per_second, 1) if ppo.speed else None,
+        compile_seconds=round(ppo.speed.compile_seconds, 1) if ppo.speed else None,
+        noise_steps_per_second=round(noise.speed.steps_per_second, 1) if noise.speed else None,
+        noise_programs=noise.programs,
+        noise_compile_seconds=round(noise.speed.compile_seconds, 1) if noise.speed else None,
+        teammate_hours_on_one=round(teammate_seconds / 3600, 2),
+        noise_hours_on_one=round(noise.seconds_on_one / 3600, 2),
+        hours_on_one=round((teammate_seconds + ppo.seconds_on_one + noise.seconds_on_one) / 3600, 2),
         devices=devices,
-        hours_on_devices=round(in_turn / 3600, 2),
+        hours_on_devices=round((teammate_seconds + ppo.seconds_on_devices + noise.seconds_on_devices) / 3600, 2),
     )
+
+
+def ppo_cost(profile: Profile, devices: int) -> SourceCost:
+    """Estimate the cost of a profile's egos, measuring the speed of one of them."""
+    speed = calibrate(profile.ego, partial(task_learner, profile))
+    counts = {layout: profile.tasks_on(layout, "ppo") for layout in profile.layouts}
+    egos = [profile.ego_on(layout) for layout, count in counts.items() for _ in range(count * profile.learners)]
+    histories = {layout: profile.ego_on(layout).episodes * KEPT_STEPS for layout in counts}
+    seconds = [speed.seconds(ego.updates * ego.steps_per_update) for ego in egos]
+    return SourceCost(
+        tasks=sum(counts.values()),
+        units=len(egos),
+        steps=sum(ego.updates * ego.steps_per_update for ego in egos),
+        recorded=sum(ego.environments * ego.episodes * KEPT_STEPS for ego in egos),
+        kept=sum(count * profile.keep * histories[layout] for layout, count in counts.items()),
+        artefact_bytes=sum(
+            count * profile.learners * artefact_bytes([layout], profile.ego_on(layout))
+            for layout, count in counts.items()
+        ),
+        speed=speed,
+        seconds_on_one=sum(seconds),
+        seconds_on_devices=sum(sorted(seconds, reverse=True)[::devices]),  # each round takes as long as its longest
+    )
+
+
+def noise_cost(profile: Profile, devices: int) -> SourceCost:
+    """Estimate the cost of a profile's noise histories, measuring the speed of one batch of episodes."""
+    counts = {layout: profile.tasks_on(layout, "noise") for layout in profile.layouts}
+    tasks, config = sum(counts.values()), profile.noise
+    speed = noise_speed(profile)
+    of_task = config.histories * config.episodes * KEPT_STEPS
+    families = {(work.task.layout.name, work.task.teammate["family"]) for work in _noise_works(profile)}
+    programs = len(families | {(layout, "rl") for layout in profile.algorithms})
+    return SourceCost(
+        tasks=tasks,
+        units=tasks * config.histories,
+        recorded=tasks * of_task,
+        kept=tasks * of_task,
+        artefact_bytes=sum(count * noise_bytes(get_layout(layout), config) for layout, count in counts.items()),
+        speed=speed,
+        programs=programs,
+        seconds_on_one=tasks * of_task / speed.steps_per_second + programs * speed.compile_seconds,
+        seconds_on_devices=-(-tasks // devices) * speed.seconds(of_task),
+    )
+
+
+def noise_speed(profile: Profile) -> LearnerSpeed:
+    """Measure how fast episodes of the profile's first noise task are played, without writing them."""
+    layout, works = get_layout(profile.layouts[0]), _noise_works(profile)
+    if works:
+        layout, teammate = works[0].task.layout, build_teammate(works[0].task.layout, works[0].task.teammate)
+    else:
+        teammate = build_untrained(layout, profile.teammates.ppo.widths)
+    zeros = np.zeros(EPISODES_AT_ONCE, np.int32)
+
+    def play() -> float:
+        began = time.perf_counter()
+        episodes = np.arange(EPISODES_AT_ONCE)
+        jax.block_until_ready(play_noisy_episodes(layout, teammate, 0, zeros, episodes, zeros.astype(np.float32)))
+        return time.perf_counter() - began
+
+    first, second = play(), play()
+    return LearnerSpeed(EPISODES_AT_ONCE * KEPT_STEPS / second, max(first - second, 0.0))
+
+
+def _noise_works(profile: Profile) -> list[Work]:
+    """The noise tasks with heuristic teammates."""
+    return [work for work in profile.works() if work.source == "noise"]
 
 
 def task_learner(profile: Profile, ego: PPOConfig, layout_name: str | None = None) -> Learner:
@@ -228,12 +352,21 @@ def artefact_bytes(layouts: Sequence[str], ego: PPOConfig) -> int:
     return sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for task in arrays for shape, dtype in task)
 
 
-def bytes_per_transition(kind: Kind) -> float:
-    """Size per transition of a release of this kind, measured on one history of each task of the bundled release."""
+def bytes_per_transition(kind: Kind, source: str = "ppo") -> float:
+    """Size per transition of a release of this kind, measured on histories of the bundled release.
+
+    Args:
+        kind: the kind.
+        source: measured is one history of each task of this source, or of each task if the release has none of it.
+    """
     dataset = load_icrl4aht()
+    tasks = read_tasks(dataset.root / TASKS)
+    of_source = {entry.task_id for entry in dataset.entries if entry.source == source}
     with tempfile.TemporaryDirectory() as folder:
         new = [
-            NewTask(task, Provenance(), 1, partial(_first_history, task)) for task in read_tasks(dataset.root / TASKS)
+            NewTask(task, Provenance(), 1, partial(_first_history, task))
+            for task in tasks
+            if not of_source or task.task_id in of_source
         ]
         root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
         shards = sum(path.stat().st_size for path in (root / "data").rglob("*.h5"))

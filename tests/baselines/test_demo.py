@@ -1,7 +1,9 @@
-"""The demo on the bundled release, with a tiny model."""
+"""The demo, with a tiny model on few histories; the slow test also plays and uses the bundled release."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 
@@ -10,49 +12,80 @@ from rich.console import Console
 
 from baselines import demo
 from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.results import Result, write_result
 from baselines.methods.options import ModelOptions
 from baselines.report import episode_gifs
 from baselines.training.options import TrainOptions
-from icrl4aht_data.checking.verify import verify_release
+from generation.teammates.registry import sample_teammate
+from icrl4aht_data.benchmark.tasks import make_task
+from tests.helpers.random_releases import random_release
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
+TASKS = tuple(
+    make_task("teammate", "validation", "demo_wide", sample_teammate(family, 0, "train", 1), seed)
+    for seed, family in enumerate(("utility_greedy", "territory"))
+)
+SETTINGS = demo.DemoSettings(
+    model=ModelOptions(layers=1, width=16, heads=2),
+    training=TrainOptions(steps=2, batch_size=2, context=10),
+    tasks=TASKS,
+    protocol=get_protocol("seeded", 2),
+    seeds=range(2),
+)
+EARNED = {"stay": 0.0, "random": 2.0, "oracle": 50.0}
 
-def run_tiny_demo(out: Path, episodes: int) -> tuple[str, Path]:
-    """Text and report of a demo with a tiny model."""
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory) -> Path:
+    """Random play of both sources."""
+    root = tmp_path_factory.mktemp("demo") / "release"
+    random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("noise", "ppo"))
+    return root
+
+
+def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details, played):
+    """Write results: the model earns 10 more than `random` with H4, and as much as `random` with H2."""
+    settings = {"agent": agent, "seeds": list(seeds), "protocol": asdict(protocol), "code_version": "0"}
+    settings |= {"details": details} if details else {}
+    results = []
+    for task in tasks:
+        value = EARNED.get(agent, 12.0 if task.teammate_family == "H4" else 2.0)
+        results.append(Result(task.task_id, settings, [[value, value] for _ in seeds]))
+        write_result(out, results[-1])
+    return results
+
+
+def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
+    """Text and report of a demo."""
     text = StringIO()
-    page = demo.run_demo(
-        out,
-        Console(file=text, width=300),
-        model=ModelOptions(layers=1, width=16, heads=2),
-        options=TrainOptions(steps=2, batch_size=2, context=10),
-        families=["H4"],
-        protocol=get_protocol("seeded", episodes),
-    )
+    page = demo.run_demo(out, Console(file=text, width=300), settings)
     return text.getvalue(), page
 
 
-def test_every_step_is_taken(tmp_path, monkeypatch):
-    """All steps, without the reference egos and without replaying the release, which other tests do."""
-    monkeypatch.setattr(demo, "AGENTS", ())
-    monkeypatch.setattr(demo, "verify_release", lambda root, **level: verify_release(root, layout="demo_wide"))
+def test_every_step_is_taken(release, tmp_path, monkeypatch):
+    """All steps; the model is trained, and not played."""
+    monkeypatch.setattr(demo, "evaluate", evaluate_without_playing)
     monkeypatch.setattr(episode_gifs, "episode_gif", lambda path, *args, **named: path.write_bytes(b"GIF89a"))
-    text, page = run_tiny_demo(tmp_path, episodes=1)
-    for expected in ("1/6", "target_actions", "context_next_obs", "no problem in", "6/6", "done in", str(page)):
+    text, page = run(tmp_path, replace(SETTINGS, root=release))
+    for expected in ("1/6", "target_actions", "context_next_obs", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in text, expected
-    returns = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.count(" ") > 3}
-    assert returns["AD"][1:] == ["†"], "it was trained with H4"
-    assert "† the agent was trained with teammates of this family" in text
-    assert (tmp_path / "learning_curves.png").stat().st_size > 5_000
+    assert "AD earns more than stay and random with 1 of 2 families: H4; no more with H2." in text
+    assert "H4          0.0      2.0     50.0     12.0   +10.0 (95 % interval +10.0 to +10.0)" in text
+    assert "† the agent was trained with other teammates of this family" in text
+    for name in ("learning_curves.png", "adaptation.png"):
+        assert (tmp_path / name).stat().st_size > 5_000
     assert (tmp_path / "episode.gif").read_bytes()[:6] == b"GIF89a"
-    assert "<h1>ICRL4AHT report</h1>" in page.read_text()
+    assert "<h3>Validation tasks</h3>" in page.read_text()
+    config = json.loads((tmp_path / "ad" / "config.json").read_text())
+    assert {cell["source"] for cell in config["trained_on"]} == {"noise"}
 
 
 @pytest.mark.slow
 def test_the_complete_demo(tmp_path):
-    text, page = run_tiny_demo(tmp_path, episodes=2)
+    text, page = run(tmp_path, replace(SETTINGS, sources=(), tasks=None))
     assert "transitions replayed" in text
-    returns = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.count(" ") > 3}
-    assert returns["stay"] == ["0.0"]
-    assert float(returns["oracle"][0]) > 20
+    rows = {line.split()[0]: line.split() for line in text.splitlines() if "95 % interval" in line}
+    assert len(rows) >= 2, "families of the validation tasks"
+    assert all(float(row[1]) == 0.0 and float(row[3]) > 20 for row in rows.values()), "stay and oracle"
     assert "data:image/gif" in page.read_text()

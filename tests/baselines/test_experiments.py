@@ -96,6 +96,29 @@ def test_a_tiny_experiment_ends_in_a_report(release, tmp_path, monkeypatch):
         run_experiment("tracks", plan, tmp_path)
 
 
+def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, tmp_path, monkeypatch):
+    """The layout track tests on other layouts; its validation tasks are on those of the training."""
+    entry = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 7, "base_seed": 1, "theta": {}}
+    tasks = {track: [make_task(track, "validation", name, entry, 0) for name in names] for track, names in (
+        ("teammate", ("demo_wide", "demo_simple")), ("layout", ("cramped_up",)))}  # fmt: skip
+    monkeypatch.setattr(experiments, "manifest_path", lambda track, split: (track, split))
+    monkeypatch.setattr(experiments, "read_tasks", lambda path: tasks[path[0]] if path[1] == "validation" else [])
+    monkeypatch.setattr(experiments, "_train_entry", lambda *arguments: None)
+    played = []
+    monkeypatch.setattr(experiments, "_evaluate_entry", lambda experiment, entry, tasks, *others: played.append(tasks))
+    monkeypatch.setattr(experiments, "read_run", lambda folder: 1 / 0)
+    plan = dataclasses.replace(SMALL, root=str(release), split="validation")
+    with pytest.raises(ZeroDivisionError):
+        run_experiment("tracks", plan, tmp_path)
+    assert played == [[tasks["teammate"][0]], tasks["layout"]]
+    with pytest.raises(EmptySelectionError, match="no test tasks on demo_wide: choose another --layout"):
+        run_experiment("tracks", dataclasses.replace(plan, split="test"), tmp_path)
+    with pytest.raises(UnknownNameError, match="unknown split to evaluate on 'heldout'; valid: test, validation"):
+        run_experiment("tracks", dataclasses.replace(plan, split="heldout"), tmp_path)
+    with pytest.raises(OptionError, match="split = validation: this experiment has tasks of its own"):
+        run_experiment("heldout-rl", plan, tmp_path)
+
+
 def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_path, monkeypatch):
     """Cached acting has down to 4/5 K steps."""
     chosen = []

@@ -65,3 +65,24 @@ def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         cwd=ROOT,
     )
+
+
+NOISE = """
+[noise]
+histories = 4
+episodes = 10
+start = [0.9, 1.0]
+end = [0.0, 0.1]
+begin = [0.0, 0.2]
+finish = [0.7, 1.0]
+power = [0.5, 2.0]
+
+[release]
+data_version = "0.0.1"
+
+[tasks]
+layouts = ["demo_wide"]
+sources = ["noise"]
+presets = ["default"]
+"""
+"""Noise histories: 40 episodes of each task."""

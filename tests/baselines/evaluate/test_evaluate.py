@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from baselines.agents.egos import get_agent, random, stay
+from baselines.agents.egos import NamedEgo, get_agent, random, stay
 from baselines.agents.host import Percept, from_host
 from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate, play_tasks
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
-from baselines.evaluate.results import read_result
+from baselines.evaluate.results import Result, read_result, write_result
 from baselines.report.headroom import write_headroom_cards
-from baselines.report.results import EvaluationRun, as_run, normalized_return, read_run
+from baselines.report.results import OWN_TASKS, EvaluationRun, as_run, normalized_return, read_run
 from baselines.report.summary import bootstrap_interval, csv_text, markdown
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
-from icrl4aht_data.benchmark.tasks import write_tasks
+from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
@@ -288,6 +288,42 @@ def test_commands(tmp_path):
     (tmp_path / "two.jsonl").write_text("{}\n")
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert "line 1" in str(result.exception)
+
+
+def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
+    """Results of both splits may share a folder, and are read again without the package's manifests."""
+    tasks = [make_task("teammate", "validation", "coord_simple", task.teammate, 5) for task in SIMPLE[:2]]
+    write_tasks(tmp_path / "teammate_validation.jsonl", tasks)
+    write_tasks(tmp_path / "teammate_test.jsonl", SIMPLE)
+    monkeypatch.setattr(
+        "baselines.commands.cli.manifest_path", lambda track, split: tmp_path / f"{track}_{split}.jsonl"
+    )
+    monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, acting: NamedEgo(name, get_agent(name)))
+    settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
+
+    def write_results(name, ego, tasks, protocol, *, out, **options):
+        for task in tasks:
+            write_result(out, Result(task.task_id, settings, [[1.0, 2.0]]))
+
+    monkeypatch.setattr("baselines.evaluate.evaluator.evaluate", write_results)
+    command = ["evaluate", "--agent", "stay", "--track", "teammate", "--out", str(tmp_path / "run")]
+    for split in (["--split", "validation"], ["--split", "test"], []):
+        result = CliRunner().invoke(cli, [*command, *split])
+        assert result.exit_code == 0, result.output
+    assert set(read_tasks(tmp_path / "run" / OWN_TASKS)) == set(tasks)
+    sizes = {cell: len(returns) for cell, returns in read_run(tmp_path / "run").cells.items()}
+    assert sizes == {("coord_simple", "H4"): 5, ("coord_simple", "H4 (validation)"): 2}
+
+
+def test_a_manifest_has_its_own_splits(tmp_path):
+    write_tasks(tmp_path / "tasks.jsonl", SIMPLE)
+    command = ["evaluate", "--agent", "stay", "--out", str(tmp_path / "run"), "--split", "validation"]
+    result = CliRunner().invoke(cli, [*command, "--manifest", str(tmp_path / "tasks.jsonl")])
+    assert result.exit_code == 2
+    assert "--split: not with --manifest" in result.output
+    result = CliRunner().invoke(cli, [*command[:-1], "train"])
+    assert result.exit_code == 2
+    assert "unknown split 'train'; valid: test, validation" in result.output
 
 
 def test_headroom_cards_name_cells_without_headroom(tmp_path):

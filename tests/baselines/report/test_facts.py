@@ -1,4 +1,4 @@
-"""Reports say what a number is: its protocol, its instances and seeds, and how training and test overlap."""
+"""Reports say what a number is: its protocol, its instances and seeds, and how training data and tasks overlap."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ def tasks_of(kind: str, count: int) -> list[Task]:
     makers = {
         "training": lambda k: make_task("layout", "train", "cramped_up", learned(k), k),
         "training H4": lambda k: make_task("teammate", "train", "demo_wide", own_h4(k), k),
+        "validation": lambda k: make_task("teammate", "validation", "demo_wide", own_h4(k), k),
         "held out": lambda k: make_task("layout", "heldout", "cramped_up", learned(k), k),
         "own": lambda k: make_task("teammate", "test", "demo_wide", own_h4(k), k),
     }
@@ -110,7 +111,7 @@ class Kind(NamedTuple):
 
 KINDS = st.builds(
     Kind,
-    st.sampled_from(["test", "layout test", "training", "training H4", "held out", "own"]),
+    st.sampled_from(["test", "layout test", "validation", "training", "training H4", "held out", "own"]),
     st.integers(1, 5),
     st.sampled_from(["published", "seeded"]),
     st.sampled_from(["unknown", "none", "family", "teammate", "layout"]),
@@ -166,6 +167,7 @@ def test_the_page_says_what_each_number_is(write, kind):
     not_run = {tooltip for tooltip, shown in scores if re.match(r"\s*–\s*paper", shown)}
     paper = "Not run. Paper: protocol published, 5 instances, 100 episodes of 100 steps."
     assert not_run == ({paper} if kind.protocol == "published" else set())
+    assert ("Mean over a track's test cells" in unescape(text)) == is_test, "the figure of gains has test cells only"
 
 
 @settings(max_examples=40)
@@ -219,13 +221,20 @@ def test_learned_teammates_of_an_algorithm_that_was_left_out_are_not_marked():
 
 def test_tasks_of_different_splits_never_share_a_cell(write):
     """The paper's numbers and the headroom are those of the published test tasks alone."""
-    tasks = [task for kind in ("test", "training H4", "own") for task in tasks_of(kind, 5)]
+    kinds = ("test", "training H4", "own", "validation")
+    tasks = [task for kind in kinds for task in tasks_of(kind, 5)]
     run = evaluated_run("AD", protocol="published", tasks=tasks)
     assert [(cell, len(returns)) for cell, returns in run.cells.items()] == [
-        (("demo_wide", group), 5) for group in ("H4", "H4 (own)", "H4 (training)")
+        (("demo_wide", group), 5) for group in ("H4", "H4 (own)", "H4 (training)", "H4 (validation)")
     ]
-    assert [row["published_mean"] is None for row in rows(run)] == [False, True, True]
-    assert [row["normalised"] is None for row in rows(run)] == [False, True, True]
+    assert [row["tasks"] for row in rows(run)] == ["test", "own", "training", "validation"]
+    assert [row["published_mean"] is None for row in rows(run)] == [False, True, True, True]
+    assert [row["normalised"] is None for row in rows(run)] == [False, True, True, True]
+    headings = re.findall("^## (.*)$", markdown([run]), flags=re.MULTILINE)
+    assert headings == [
+        f"AD (published), track teammate{kind}"
+        for kind in ("", ", validation tasks", ", training tasks", ", own tasks")
+    ]
     text = write([run])
     assert text.count("demo_wide, H4 (training)</th>") == 2, "scores and gains"
 
@@ -248,6 +257,22 @@ def test_sweeps_compare_with_the_paper_where_all_families_were_played():
     assert sweep_points([complete], "K")["test_wide"]["AD"][0].published == -7.9
     (point,) = sweep_points([one], "K")["test_wide"]["AD"]
     assert (point.published, point.std) == (None, None)
+
+
+def test_sweeps_show_validation_tasks_apart_from_test_tasks():
+    tasks = [task for kind in ("test", "validation") for task in tasks_of(kind, 2)]
+    run = evaluated_run("AD", tasks=tasks, variant=("K", 500))
+    panels = sweep_points([run], "K")
+    assert list(panels) == ["demo_wide", "demo_wide (validation)"]
+    alone = sweep_points([evaluated_run("AD", tasks=tasks[:2], variant=("K", 500))], "K")
+    assert panels["demo_wide"] == alone["demo_wide"]
+
+
+def test_validation_tasks_with_teammates_of_the_training_are_marked():
+    tasks = tasks_of("validation", 2)
+    record = trained_on("teammate", tasks)
+    found = rows(evaluated_run("AD", tasks=tasks, trained_on=record))
+    assert [row["overlap"] for row in found] == ["teammate family"]
 
 
 def test_other_episode_lengths_compare_with_nothing():
@@ -306,4 +331,4 @@ def test_figures_name_the_cells_that_tables_mark(write):
     assert len(captions) == 2
     for caption in captions:
         assert caption.startswith("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances")
-        assert caption.endswith("Overlap of training and test: AD: demo_wide H4 †; mine: all cells ?.")
+        assert caption.endswith("Overlap with the training data: AD: demo_wide H4 †; mine: all cells ?.")

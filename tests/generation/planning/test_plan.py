@@ -13,11 +13,16 @@ import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
+from generation.collection.noise import noise_bytes
 from generation.planning import plan
 from generation.profiles import load_profile
+from generation.profiles.work import Work
+from generation.teammates.registry import heuristic_teammate
+from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.progress import LineProgress
-from tests.helpers.tiny import LEARNED, artefact
+from tests.helpers.tiny import LEARNED, NOISE, artefact
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +80,7 @@ def test_a_long_measurement_prints_lines_on_stderr(measured, monkeypatch):
     monkeypatch.setattr(plan, "calibrate", slow)
     result = CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--json"])
     assert json.loads(result.stdout)["tasks"] == 2
-    line = "planning: measuring how fast egos learn: 0 of 3 (0 %) after 0 s, time left unknown"
+    line = "planning: measuring how fast egos learn: 0 of 4 (0 %) after 0 s, time left unknown"
     assert line in result.stderr.splitlines()
 
 
@@ -136,3 +141,27 @@ def test_measuring_the_learners_of_a_profile(tmp_path, make):
     assert steps == (2 if make is plan.calibration_population else 1) * 8 * 80
     assert speed.steps_per_second > 0
     assert speed.compile_seconds > 0
+
+
+def test_noise_histories(monkeypatch, tmp_path):
+    """Tasks of one family on one layout share a program on one device; on several each task compiles it."""
+    (tmp_path / "noise.toml").write_text(NOISE)
+    profile = load_profile(str(tmp_path / "noise.toml"))
+    mate = heuristic_teammate("utility_greedy", "default", 0)
+    works = [Work(make_task("teammate", "train", "demo_wide", mate, seed), "noise") for seed in range(3)]
+    monkeypatch.setattr(type(profile), "works", lambda profile: works)
+    monkeypatch.setattr(type(profile), "tasks_on", lambda profile, layout, source: 3)
+    monkeypatch.setattr(plan, "noise_speed", lambda profile: plan.LearnerSpeed(100.0, 360.0))
+    monkeypatch.setattr(plan, "bytes_per_transition", lambda kind, source: 2.0 if source == "noise" else 1.0)
+    found = plan.estimate_cost(profile, devices=2)
+    assert (found.tasks, found.learners, found.environment_steps) == (3, 0, 0)
+    assert (found.noise_histories, found.noise_programs) == (12, 1)
+    assert found.noise_transitions == found.kept_transitions == found.recorded_transitions == 12_000
+    assert found.noise_hours_on_one == found.hours_on_one == pytest.approx((120 + 360) / 3600, abs=0.01)
+    assert found.hours_on_devices == pytest.approx(2 * (40 + 360) / 3600, abs=0.01)
+    assert found.artefact_bytes == 3 * noise_bytes(get_layout("demo_wide"), profile.noise)
+    assert found.lite_bytes == 24_000
+    text = dict(found.rows())
+    assert text["measured, noise"].startswith("100 steps/s on ")
+    assert text["compiling noise"] == "1 x 360 s"
+    assert "learners" not in text

@@ -120,7 +120,7 @@ def test_a_remote_is_read_chunk_by_chunk(lite_mixed, tmp_path, monkeypatch):
     assert [history.entry for history in remote] == list(local.entries[2:])
     np.testing.assert_array_equal(remote[3].read("oracle_actions", 7, 60), local[5].read("oracle_actions", 7, 60))
     assert not list((remote.root / "data").rglob("*.h5")), "no shard was downloaded"
-    data = bytearray(memory.cat(f"/mixed/{SHARD}"))
+    data = bytearray((lite_mixed / SHARD).read_bytes())
     shard = Shards(local.origin, local.index).open(SHARD)
     row = next(row for row, history, field in shard.chunks() if (history, field.name) == (2, "oracle_actions"))
     data[shard.table["offset"][row]] ^= 1

@@ -1,0 +1,292 @@
+"""Noise histories: who acts when, one key an episode, and the same bits however a task is cut into pieces."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from generation.collection import noise
+from generation.collection.curate import oracle_labels
+from generation.collection.noise import noise_bytes, run_noise
+from generation.collection.noise_rollout import noise_schedules, play_noisy_episodes
+from generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, last_timing, partial_folder
+from generation.learners.resume import StateFile
+from generation.profiles import Profile, load_profile
+from generation.profiles.noise_config import NoiseConfig
+from generation.profiles.work import Work
+from generation.releases.check import compare_rebuilds
+from generation.teammates.registry import build_teammate, heuristic_teammate
+from icrl4aht_data.benchmark.tasks import make_task, write_tasks
+from icrl4aht_data.errors import DiskFullError, OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.rules import step
+from tests.helpers.tiny import NOISE, start
+
+PIECE = 16
+LAYOUT = get_layout("demo_wide")
+MATE = heuristic_teammate("utility_greedy", "default", 0)
+WORK = Work(make_task("teammate", "train", "demo_wide", MATE, 7), "noise")
+
+COLLECT = """
+import sys, time
+from pathlib import Path
+from generation.collection import noise
+from generation.profiles import load_profile
+from tests.generation.collection.test_noise import PIECE, WORK
+
+def report(history, metrics):
+    print(history, flush=True)
+    time.sleep(0.1)
+
+noise.EPISODES_AT_ONCE = PIECE
+noise.run_noise(WORK, load_profile(sys.argv[1]), Path(sys.argv[2]), report, save_seconds=0)
+"""
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly", "short_pieces")
+
+
+@pytest.fixture(scope="module")
+def short_pieces():
+    """Tasks of 40 episodes in three pieces, the last one half filled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(noise, "EPISODES_AT_ONCE", PIECE)
+        yield
+
+
+@pytest.fixture(scope="module")
+def profile(tmp_path_factory) -> Profile:
+    path = tmp_path_factory.mktemp("noise") / "noise.toml"
+    path.write_text(NOISE)
+    return load_profile(str(path))
+
+
+@pytest.fixture(scope="module")
+def made(profile, short_pieces, tmp_path_factory) -> Path:
+    """A finished artefact."""
+    folder = tmp_path_factory.mktemp("noise") / WORK.name
+    assert run_noise(WORK, profile, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def arrays(made) -> dict[str, np.ndarray]:
+    return {path.stem: np.load(path) for path in made.glob("*.npy")}
+
+
+def stop_after(history: int) -> Callable[[int, dict[str, float]], None]:
+    def report(number, metrics):
+        if number >= history:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_the_arrays(arrays, made, profile):
+    size = 24
+    assert {name: (array.shape, str(array.dtype)) for name, array in arrays.items()} == {
+        "state": ((4, 1000, size), "uint8"),
+        "actions": ((4, 1000), "int8"),
+        "teammate_actions": ((4, 1000), "int8"),
+        "rewards": ((4, 1000), "int8"),
+        "episode_end_state": ((4, 10, size), "uint8"),
+        "oracle_actions": ((4, 1000), "int8"),
+        "noise": ((4, 10), "float32"),
+    }
+    stored = sum(path.stat().st_size for path in made.iterdir() if path.name != METADATA)
+    assert stored == pytest.approx(noise_bytes(LAYOUT, profile.noise), abs=2_000)
+
+
+def test_every_step_follows_the_rules(arrays):
+    states = arrays["state"].reshape(40, 100, -1)
+    after = np.concatenate([states[:, 1:], arrays["episode_end_state"].reshape(40, 1, -1)], axis=1)
+    actions = np.stack([arrays["actions"], arrays["teammate_actions"]], axis=-1).reshape(40, 100, 2).astype(int)
+    found = step(LAYOUT, states, actions, after[..., 6])
+    np.testing.assert_array_equal(found.state, after)
+    np.testing.assert_array_equal(found.reward, arrays["rewards"].reshape(40, 100))
+    assert len(np.unique(states[:, 0], axis=0)) > 30, "episodes start in states of their own"
+
+
+def test_the_oracle_acts_but_for_the_noise(arrays):
+    """A random action is one of six, so it is the oracle's once in six times."""
+    clean = (arrays["actions"] == arrays["oracle_actions"]).reshape(40, 100)
+    expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
+    assert clean[expected[:, 0] == 1].all()
+    assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
+    noisy = arrays["actions"].reshape(40, 100)[~clean]  # none of six actions is the oracle's at every step
+    assert (np.bincount(noisy, minlength=6) > 0.1 * len(noisy)).all()
+
+
+def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
+    found = list(oracle_labels(LAYOUT, arrays["state"], arrays["actions"]))
+    np.testing.assert_array_equal(np.stack(found), arrays["oracle_actions"])
+
+
+def test_returns_rise(arrays, made):
+    returns = arrays["rewards"].reshape(4, 10, 100).sum(axis=-1, dtype=int)
+    assert (returns[:, 5:].mean(axis=1) > returns[:, :5].mean(axis=1) + 5).all()
+    lines = [json.loads(line) for line in (made / METRICS).read_text().splitlines()]
+    assert [line["update"] for line in lines] == [0, 1, 2, 3]
+    assert [line["return_end"] for line in lines] == pytest.approx(returns[:, 5:].mean(axis=1).tolist(), abs=1e-3)
+
+
+def test_an_episode_is_a_function_of_its_numbers(arrays):
+    """One with others in the batch is the one among those of its task."""
+    mate = build_teammate(LAYOUT, MATE)
+    history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
+    chance = arrays["noise"][history, episode % 10]
+    found = play_noisy_episodes(LAYOUT, mate, 7, history, episode, chance)
+    for k in range(2):
+        steps = slice(100 * episode[k], 100 * episode[k] + 100)
+        np.testing.assert_array_equal(np.asarray(found.state)[k], arrays["state"][history[k], steps])
+        np.testing.assert_array_equal(np.asarray(found.actions)[k], arrays["actions"][history[k], steps])
+    other = play_noisy_episodes(LAYOUT, mate, 8, history, episode, chance)
+    assert not np.array_equal(np.asarray(other.state)[0], np.asarray(found.state)[0])
+
+
+@pytest.mark.slow
+def test_the_bits_do_not_depend_on_the_piece(made, profile, tmp_path, monkeypatch):
+    monkeypatch.setattr(noise, "EPISODES_AT_ONCE", 23)
+    run_noise(WORK, profile, tmp_path / "task")
+    assert not compare_rebuilds(tmp_path / "task", made).differences
+
+
+def test_schedules():
+    """The formula, ranges, and a draw for every history that no other history changes."""
+    linear = noise_schedules(NoiseConfig(histories=2, episodes=11), 0)
+    np.testing.assert_allclose(linear, [np.linspace(1, 0, 11)] * 2, atol=1e-6)
+    steep = NoiseConfig(histories=1, episodes=11, begin=(0.2, 0.2), finish=(0.6, 0.6), power=(2, 2), end=(0.1, 0.1))
+    expected = [1, 1, 1, *(0.1 + 0.9 * (1 - x) ** 2 for x in (0.25, 0.5, 0.75)), *[0.1] * 5]
+    np.testing.assert_allclose(noise_schedules(steep, 0)[0], expected, atol=1e-6)
+    sudden = NoiseConfig(histories=1, episodes=11, begin=(0.5, 0.5), finish=(0.5, 0.5))
+    np.testing.assert_array_equal(noise_schedules(sudden, 0)[0], [1] * 5 + [0] * 6)
+    ranges = {"start": (0.8, 1), "end": (0, 0.2), "begin": (0, 0.4), "finish": (0.5, 1), "power": (0.5, 2)}
+    drawn = noise_schedules(NoiseConfig(histories=50, episodes=30, **ranges), 3)
+    assert drawn.dtype == np.float32
+    assert (np.diff(drawn) <= 0).all()
+    assert 0.8 <= drawn[:, 0].min() < 0.85 < 0.95 < drawn[:, 0].max() <= 1
+    assert 0 <= drawn[:, -1].min() < 0.05 < 0.15 < drawn[:, -1].max() <= 0.2
+    np.testing.assert_array_equal(noise_schedules(NoiseConfig(histories=9, episodes=30, **ranges), 3), drawn[:9])
+    assert not np.array_equal(noise_schedules(NoiseConfig(histories=50, episodes=30, **ranges), 4), drawn)
+    # The number of an episode does not tell its chance.
+    assert np.ptp(drawn[:, 15]) > 0.5
+
+
+@pytest.mark.parametrize("history", [0, 2])
+def test_stopped_and_resumed(made, profile, tmp_path, history):
+    folder, seen = tmp_path / WORK.name, []
+    with pytest.raises(KeyboardInterrupt):
+        run_noise(WORK, profile, folder, stop_after(history), save_seconds=0)
+    assert run_noise(WORK, profile, folder, lambda number, metrics: seen.append(number))
+    assert seen[-1] == 3
+    assert not compare_rebuilds(folder, made).differences
+    assert not partial_folder(folder).exists()
+
+
+def test_what_came_after_the_last_save_is_made_again(made, profile, tmp_path):
+    folder = tmp_path / WORK.name
+    with pytest.raises(KeyboardInterrupt):
+        run_noise(WORK, profile, folder, stop_after(2), save_seconds=0)
+    partial = partial_folder(folder)
+    assert StateFile(partial / LEARNER).progress == 1
+    rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
+    rewards.reshape(-1, 100)[PIECE:] = 77
+    rewards.flush()
+    run_noise(WORK, profile, folder)
+    assert not compare_rebuilds(folder, made).differences
+
+
+def test_other_settings_start_again(made, profile, tmp_path):
+    folder = tmp_path / WORK.name
+    shutil.copytree(made, folder)
+    assert not run_noise(WORK, profile, folder, stop_after(0)), "a finished artefact is left alone"
+    (tmp_path / "other.toml").write_text(NOISE.replace("end = [0.0, 0.1]", "end = [0.0, 0.0]"))
+    other = load_profile(str(tmp_path / "other.toml"))
+    with pytest.raises(KeyboardInterrupt):
+        run_noise(WORK, profile, tmp_path / "half", stop_after(2), save_seconds=0)
+    for name in (folder, tmp_path / "half"):
+        assert run_noise(WORK, other, name)
+        assert np.load(name / "noise.npy")[:, -1].tolist() == [0] * 4
+    assert not compare_rebuilds(folder, tmp_path / "half").differences
+
+
+def test_wall_clock_figures_are_apart_from_what_is_hashed(made):
+    assert TIMING not in json.loads((made / METADATA).read_text())["files"]
+    timing = last_timing(made)
+    assert timing is not None
+    assert timing["update"] == 3
+    assert 0 < timing["recording"] < timing["seconds"]
+
+
+def test_a_full_disk(profile, tmp_path, monkeypatch):
+    def fill(history, metrics):
+        if history >= 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
+        run_noise(WORK, profile, tmp_path / "task", fill, save_seconds=0)
+    assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 1
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: type("Usage", (), {"free": 5_000}))
+    with pytest.raises(
+        DiskFullError, match=r"other: the disk is full: this task needs [\d,]{6,} bytes, 5,000 are free"
+    ):
+        run_noise(WORK, profile, tmp_path / "other", stop_after(0))
+    assert not partial_folder(tmp_path / "other").exists()
+
+
+def test_a_learned_teammate_needs_its_suite(profile, tmp_path):
+    mate = {
+        "kind": "rl",
+        "family": "rl",
+        "theta_id": 0,
+        "theta": {"checkpoint": "demo_wide/fcp/m0/c4", "sha256": "0" * 64},
+    }
+    task = make_task("teammate", "train", "demo_wide", mate, 0)
+    with pytest.raises(OptionError, match="give the folder of the suite of teammates"):
+        run_noise(Work(task, "noise"), profile, tmp_path / "task")
+
+
+@pytest.mark.slow
+def test_killed_at_two_moments(made, tmp_path):
+    (tmp_path / "noise.toml").write_text(NOISE)
+    folder = tmp_path / WORK.name
+    command = ["-c", COLLECT, str(tmp_path / "noise.toml"), str(folder)]
+    for _ in range(2):
+        process = start(*command)
+        assert process.stdout is not None
+        printed = process.stdout.readline()
+        time.sleep(0.02)
+        process.kill()
+        _, errors = process.communicate()
+        assert printed, errors
+        assert not folder.exists()
+    output, errors = start(*command).communicate()
+    assert folder.exists(), output + errors
+    assert not compare_rebuilds(folder, made).differences
+
+
+@pytest.mark.slow
+def test_the_commands(tmp_path):
+    """Tasks of a file, generated in one process and on Ray, with the same bits; the release is valid."""
+    (tmp_path / "noise.toml").write_text(NOISE)
+    write_tasks(tmp_path / "tasks.jsonl", [WORK.task])
+    options = ["--profile", str(tmp_path / "noise.toml"), "--tasks", str(tmp_path / "tasks.jsonl")]
+    for name, executor in (("a", ()), ("b", ("--executor", "ray", "--workers", "1"))):
+        process = start("-m", "generation", "generate", *options, *executor, "--out", str(tmp_path / name))
+        output, errors = process.communicate()
+        assert process.returncode == 0, output + errors
+        assert "demo_wide with utility_greedy, noise: finished at " in output
+    for command in (
+        ("-m", "generation", "check", str(tmp_path / "a"), str(tmp_path / "b")),
+        ("-m", "icrl4aht_data", "verify", str(tmp_path / "a" / "lite"), "--deep"),
+    ):
+        process = start(*command)
+        output, errors = process.communicate()
+        assert process.returncode == 0, output + errors
