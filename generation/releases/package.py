@@ -136,7 +136,8 @@ def bundle_release(release: Path) -> Path:
 def recorded_sources(release: Path) -> dict[str, str]:
     """task id -> source, as a release says; empty for a folder that is none."""
     path = release / PROVENANCE
-    return {task_id: made.source for task_id, made in read_provenance(path).items()} if path.is_file() else {}
+    recorded = read_provenance(path) if path.is_file() else {}
+    return {task_id: made.source or "ppo" for task_id, made in recorded.items()}
 
 
 def _recorded_provenance(suite: Path) -> dict[str, Provenance]:
