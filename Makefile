@@ -31,7 +31,7 @@ $(STAMP): pyproject.toml
 demo: install ## load, sample, verify, train, evaluate on validation tasks and draw it (at most 10 minutes)
 	$(BIN)/python -m baselines demo
 
-generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|mini|paper, OUT=folder, OPTIONS=...
+generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|small|mini|paper, OUT=folder, OPTIONS=...
 	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
 teammates: install ## train the suite of learned teammates: PROFILE=smoke|mini|paper

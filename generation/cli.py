@@ -45,7 +45,11 @@ if TYPE_CHECKING:
 console = Console(soft_wrap=True)
 
 _profile_option = click.option(
-    "--profile", "profile_name", default="smoke", metavar="PROFILE", help="smoke, mini or paper, or a TOML file."
+    "--profile",
+    "profile_name",
+    default="smoke",
+    metavar="PROFILE",
+    help="smoke, noise, small, mini or paper, or a TOML file.",
 )
 
 _ego_options = dataclass_options(
