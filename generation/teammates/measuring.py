@@ -67,18 +67,18 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
     for family in np.unique(families):
         behaviours[families == family] = group_behaviours(actions[families == family])
     returns = reference_returns(layout, policies)
-
-    def near(k: int, instance: int) -> tuple[str, float]:
-        return common.instances[instance], round(float(distances[k, instance]), _DIGITS)
-
     return [
         Draw(
             layout.name,
-            *numbers[k],
-            *near(k, nearest[k]),
+            family,
+            base_seed,
+            theta_id,
+            common.instances[nearest[k]],
+            round(float(distances[k, nearest[k]]), _DIGITS),
             int(behaviours[k]),
             *(round(float(returns[ego][k]), _DIGITS) for ego in ("stay", "random", "oracle")),
-            *near(k, others[k]),
+            other=common.instances[others[k]],
+            other_distance=round(float(distances[k, others[k]]), _DIGITS),
         )
-        for k in range(len(numbers))
+        for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
