@@ -137,7 +137,7 @@ def evaluate_command(
     seeds: int,
     out: Path,
 ) -> None:
-    """Evaluate an agent on the benchmark's test tasks, or on validation tasks.
+    """Evaluate an agent on test tasks, or on validation tasks.
 
     Plays 100 episodes of each task and writes one JSON file per task into OUT/tasks. Finished tasks are kept. Choose
     models by the validation tasks: their layouts are in training, their teammates are in neither training nor test.

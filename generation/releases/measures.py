@@ -138,14 +138,12 @@ def _measure(
         for k, task in enumerate(heuristics):
             returns[task.task_id] = [float(egos[ego][k]) for ego in ("stay", "random", "oracle")]
     nearest = _nearest(layout, learned, suite)
-    return {
-        task_id: TeammateFacts(
-            ReferenceEgos(*(round(value, _DIGITS) for value in earned[:3]), REFERENCE_EPISODES),
-            nearest.get(task_id),
-            max(earned) - min(earned) >= LEAST_HEADROOM,
-        )
-        for task_id, earned in returns.items()
-    }
+    facts = {}
+    for task_id, earned in returns.items():
+        stay, random, scripted = (round(value, _DIGITS) for value in earned[:3])
+        references = ReferenceEgos(stay, random, scripted, REFERENCE_EPISODES)
+        facts[task_id] = TeammateFacts(references, nearest.get(task_id), max(earned) - min(earned) >= LEAST_HEADROOM)
+    return facts
 
 
 def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:

@@ -136,7 +136,8 @@ def bundle_release(release: Path) -> Path:
 def recorded_sources(release: Path) -> dict[str, str]:
     """task id -> source, as a release says; empty for a folder that is none."""
     path = release / PROVENANCE
-    return {task_id: made.source for task_id, made in read_provenance(path).items()} if path.is_file() else {}
+    recorded = read_provenance(path) if path.is_file() else {}
+    return {task_id: made.source or "ppo" for task_id, made in recorded.items()}
 
 
 def _recorded_provenance(suite: Path) -> dict[str, Provenance]:
@@ -186,7 +187,7 @@ def _new_task(
     return _ppo_task(found, learned, profile, suite, files)
 
 
-def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: Mapping[str, Path]) -> NewTask:
+def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
     """A task of the source "noise", whose labels are the actions of its script."""
     earned = made.references
     expert = ExpertLabels(
@@ -205,9 +206,7 @@ def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files:
     return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
 
 
-def _ppo_task(
-    found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: Mapping[str, Path]
-) -> NewTask:
+def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: dict[str, Path]) -> NewTask:
     """A task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
     task = found.task
     for number, folder in enumerate(found.folders):

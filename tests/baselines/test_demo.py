@@ -74,7 +74,7 @@ def test_every_step_is_taken(release, tmp_path, monkeypatch):
     assert "H4          0.0      2.0     50.0     12.0   +10.0 (95 % interval +10.0 to +10.0)" in text
     assert "† the agent was trained with other teammates of this family" in text
     for name in ("learning_curves.png", "adaptation.png"):
-        assert (tmp_path / name).stat().st_size > 5_000
+        assert (tmp_path / name).read_bytes()[1:4] == b"PNG"
     assert (tmp_path / "episode.gif").read_bytes()[:6] == b"GIF89a"
     assert "<h3>Validation tasks</h3>" in page.read_text()
     config = json.loads((tmp_path / "ad" / "config.json").read_text())

@@ -310,7 +310,7 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     for split in (["--split", "validation"], ["--split", "test"], []):
         result = CliRunner().invoke(cli, [*command, *split])
         assert result.exit_code == 0, result.output
-    assert set(read_tasks(tmp_path / "run" / OWN_TASKS)) == set(tasks)
+    assert read_tasks(tmp_path / "run" / OWN_TASKS) == tasks
     sizes = {cell: len(returns) for cell, returns in read_run(tmp_path / "run").cells.items()}
     assert sizes == {("coord_simple", "H4"): 5, ("coord_simple", "H4 (validation)"): 2}
 

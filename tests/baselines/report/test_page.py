@@ -208,7 +208,9 @@ def test_trained_models_have_cards(tmp_path):
     assert "| H4 | 11.0 ± 0.0 †<br>" in card
     assert "| H3 | 11.0 ± 0.0<br>" in card
     assert "It is one run, of seed 3" in card
-    assert card.count("* † the agent was trained with teammates of this family") == 2, "at the table, among the limits"
+    assert card.count("* † the agent was trained with other teammates of this family") == 2, (
+        "at the table, among the limits"
+    )
     assert "40 episodes of 100 steps, cached acting, 5" in model_card(
         trained("demo_wide", "demo_wide", 1, acting="cached")
     )
@@ -282,7 +284,9 @@ def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
     text = (tmp_path / "report.html").read_text()
     assert Outside(text).images.count("data:image/gif") == 1
     (task,) = read_tasks(tmp_path / "own.jsonl")
-    assert f"stay with H4/t77 on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
+    assert (
+        f"stay with H4/t77 (training) on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
+    )
     (tmp_path / "run" / "tasks.jsonl").unlink()
-    with pytest.raises(OptionError, match=r"is neither a published test task nor in the results' tasks\.jsonl"):
+    with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
         CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)

@@ -256,6 +256,7 @@ def test_labels_need_the_memory_and_its_restart(labelled):
     np.testing.assert_array_equal(across[:, :100], logits["episode"][:, :100].argmax(axis=-1))
 
 
+@pytest.mark.slow
 def test_oracle_labels_are_what_the_oracle_does():
     """Where the oracle is the ego it does what the labels say, in every episode from the first step on."""
     envs, episodes = 3, 2

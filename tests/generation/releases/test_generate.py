@@ -29,7 +29,7 @@ from generation.learners.config import PPOConfig
 from generation.populations import select
 from generation.populations import train as suite
 from generation.populations.build import build_suite
-from generation.profiles import FOLDER, load_profile
+from generation.profiles import FOLDER, load_profile, profile_names
 from generation.releases import build, package
 from generation.releases.check import compare_rebuilds
 from generation.teammates.registry import build_teammate, recover_teammate
@@ -160,7 +160,7 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
 def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.works()
-    folder = built / "b" / task.task_id
+    folder = built / "b" / work.name
 
     def stop(update, metrics):
         if update == 3:
@@ -206,7 +206,7 @@ def test_nothing_but_lines_where_output_is_no_terminal(built):
 def test_two_collectors_never_do_one_task_together(built):
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.works()
-    folder = built / "c" / task.task_id
+    folder = built / "c" / work.name
 
     def meanwhile(update, metrics):
         with pytest.raises(OptionError, match="another process works in this folder"):
@@ -464,5 +464,5 @@ def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, mo
 def test_unknown_profile_is_one_line(tmp_path):
 
     result = CliRunner().invoke(cli, ["generate", "--profile", "huge", "--out", str(tmp_path)])
-    assert "unknown profile 'huge'; valid: cpu, mini, paper, smoke" in str(result.exception)
+    assert f"unknown profile 'huge'; valid: {', '.join(profile_names())}" in str(result.exception)
     assert callable(main)
