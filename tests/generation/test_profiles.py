@@ -188,7 +188,7 @@ def test_sampled_teammates_of_both_sources(changed):
     assert len({work.name for work in works}) == len(works) == 11
     assert len({work.task.seed for work in works}) == 9  # the learners of a task share its seed
     assert works[0].name + "-l1" == works[1].name
-    teammates = [json.dumps(work.task.teammate["theta"]) for work in works if work.source == "noise"]
+    teammates = [(w.task.layout, json.dumps(w.task.teammate["theta"])) for w in works if w.source == "noise"]
     assert len(set(teammates)) == len(teammates)
     assert {work.task.teammate["base_seed"] for work in works if work.task.split == "validation"} == {1}
     assert [work.task.teammate for work in works[:3:2]] == [works[4].task.teammate, works[8].task.teammate]

@@ -30,13 +30,14 @@ from generation.populations import select
 from generation.populations import train as suite
 from generation.populations.build import build_suite
 from generation.profiles import FOLDER, load_profile, profile_names
-from generation.releases import build, package
+from generation.releases import build, measures, package
 from generation.releases.check import compare_rebuilds
 from generation.teammates.registry import build_teammate, recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -229,6 +230,18 @@ def test_the_teammate_can_be_rebuilt(built):
     spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
     assert (spec["slot"], spec["noise"]) == (1, "seeded")
     assert build_teammate(LAYOUTS["demo_wide"], spec, spec["slot"], spec["noise"]).sees == "state"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_distances():
+    """Distances of learned teammates to the test, which take most of a minute to compile, are not measured here."""
+
+    def numbered(layout, policies) -> list[NearestTest]:
+        return [NearestTest("H4/t0", 0.5, number) for number, _ in enumerate(policies)]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measures, "nearest_test", numbered)
+        yield
 
 
 @pytest.fixture(scope="module")
