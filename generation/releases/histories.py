@@ -65,7 +65,7 @@ def select_histories(
 
     A noise history is always kept, and of the streams of learners the best ones. With `profile.least_improvement`, on
     layouts with headroom, only those streams are kept that improve by this, and tasks are left out with whose teammate
-    the ego does not matter.
+    the ego does not matter. With `profile.least_rise`, so are tasks there whose kept histories rise by less.
 
     Args:
         artefacts: folder of the finished artefacts.
@@ -91,4 +91,9 @@ def select_histories(
         )
     if not len(found.kept):
         return found.left_out(f"the learners did not learn: no stream's end exceeds its start by {least or 0:g}")
+    start, end = curve_ends(found.kept)
+    if headroom and profile.least_rise is not None and end.mean() - start.mean() < profile.least_rise:
+        return found.left_out(
+            f"its histories rise by {end.mean() - start.mean():.1f} on average, expected {profile.least_rise:g}"
+        )
     return found

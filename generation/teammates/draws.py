@@ -69,10 +69,15 @@ class Draw(NamedTuple):
         return self.distance >= SAME_BEHAVIOUR
 
     @property
+    def spread(self) -> float:
+        """Difference of the best and the worst reference ego's return."""
+        returns = (self.stay, self.random, self.oracle)
+        return max(returns) - min(returns)
+
+    @property
     def headroom(self) -> bool:
         """Whether the ego matters."""
-        returns = (self.stay, self.random, self.oracle)
-        return max(returns) - min(returns) >= LEAST_HEADROOM
+        return self.spread >= LEAST_HEADROOM
 
 
 def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
@@ -98,7 +103,7 @@ def drawn_teammates(
 
     The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
     layout, of any family, has headroom. Each family first gives one draw of every behaviour, then its other draws, both
-    by theta_id.
+    by how much the ego matters with them and by theta_id.
 
     Args:
         layout: a training layout.
@@ -157,7 +162,7 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
             f"name other families ({_hosted_text(layout, base_seed)})"
         )
     first = {draw.behaviour: draw for draw in reversed(draws)}
-    return sorted(draws, key=lambda draw: (first[draw.behaviour] != draw, draw.theta_id))
+    return sorted(draws, key=lambda draw: (first[draw.behaviour] != draw, -draw.spread, draw.theta_id))
 
 
 def _usable(layout: str, family: str, base_seed: int) -> list[Draw]:
