@@ -171,12 +171,12 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     from generation.learners.resume import limit_xla_threads
     from generation.profiles import load_profile
 
-    profile = load_profile(name)
-    if threads:
-        profile = replace(profile, xla_threads=threads)
-    if profile.xla_threads:
-        limit_xla_threads(profile.xla_threads)
-    return profile
+    def limit(profile: Profile) -> None:
+        if threads or profile.xla_threads:
+            limit_xla_threads(threads or profile.xla_threads or 1)
+
+    profile = load_profile(name, limit)
+    return replace(profile, xla_threads=threads) if threads else profile
 
 
 @cli.command()

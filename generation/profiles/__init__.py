@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,12 @@ def profile_names() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
-def load_profile(name: str) -> Profile:
+def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile: None) -> Profile:
     """A profile by name, or by the path of a TOML file.
+
+    Args:
+        name: the name or the path.
+        prepare: called with the profile before its teammates are drawn, which starts JAX.
 
     Raises:
         UnknownNameError: for a name that is neither.
@@ -36,16 +41,25 @@ def load_profile(name: str) -> Profile:
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
         raise unknown("profile", name, profile_names())
-    try:
+    with _named_errors(path):
         profile = _profile(path.stem, tomllib.loads(path.read_text(encoding="utf-8")))
+    prepare(profile)
+    with _named_errors(path):
         profile.works()  # raises for unknown presets, and for more sampled teammates than there are
+    return profile
+
+
+@contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """Name the file in errors about its content."""
+    try:
+        yield
     except tomllib.TOMLDecodeError as error:
         raise OptionError(f"{path}: not TOML: {error}") from error
     except KeyError as error:
         raise OptionError(f"{path}: missing key {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise OptionError(f"{path}: {error}") from error
-    return profile
 
 
 def _profile(name: str, content: dict[str, Any]) -> Profile:

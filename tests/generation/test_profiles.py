@@ -423,3 +423,11 @@ def test_policies_of_labellers_are_a_switch_of_the_profile(changed):
     assert load_profile(changed("keep = 8", "keep = 8\npolicies = true")).policies
     with pytest.raises(OptionError, match=r"release\.policies = 1: expected true or false"):
         load_profile(changed("keep = 8", "keep = 8\npolicies = 1"))
+
+
+def test_threads_are_chosen_before_teammates_are_drawn(monkeypatch):
+    """Drawing starts JAX, whose number of threads can then no longer change."""
+    calls: list[str] = []
+    monkeypatch.setattr(Profile, "works", lambda profile: calls.append("works"))
+    load_profile("noise", lambda profile: calls.append(f"threads {profile.xla_threads}"))
+    assert calls == ["threads 1", "works"]
