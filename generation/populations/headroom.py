@@ -69,9 +69,8 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, LearnedHea
         returns = reference_returns(layout, mates)
         self_play = [_paired_return(layout, ego, mate) for ego, mate in zip(partners, mates, strict=True)]
         for k, task in enumerate(own):
-            found[task.task_id] = LearnedHeadroom(
-                *(float(returns[name][k]) for name in ("stay", "random", "oracle")), self_play[k]
-            )
+            stay, random, oracle = (float(returns[name][k]) for name in ("stay", "random", "oracle"))
+            found[task.task_id] = LearnedHeadroom(stay, random, oracle, self_play[k])
     return found
 
 
