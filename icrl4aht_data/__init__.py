@@ -4,7 +4,7 @@ ds = load_icrl4aht(split="train", layout="coord_simple")
 batch = ds.ad(batch_size=64, length=500, seed=0)[0]
 """
 
-from icrl4aht_data.benchmark.facts import FAMILIES, SPLITS, TRACKS
+from icrl4aht_data.benchmark.facts import FAMILIES, SOURCES, SPLITS, TRACKS
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -21,6 +21,7 @@ __all__ = [
     "ACTIONS",
     "FAMILIES",
     "LAYOUTS",
+    "SOURCES",
     "SPLITS",
     "TRACKS",
     "ADBatch",

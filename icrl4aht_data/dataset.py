@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Unpack
@@ -11,11 +12,11 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.errors import NotStoredError, unknown
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
-from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import INFO, PROVENANCE, TASKS
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import INFO, TASKS
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.reading.history import Obs
+from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
@@ -41,6 +42,7 @@ def load_icrl4aht(
     algorithm: FilterValues = None,
     source: FilterValues = None,
     task_id: FilterValues = None,
+    learner: int | Sequence[int] | None = None,
     min_expert_return: float | None = None,
     obs: Obs = "float32",
     cache: CacheMode = "auto",
@@ -60,8 +62,10 @@ def load_icrl4aht(
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
         algorithm: the same as `teammate_kind`: the algorithm that trained the teammate, such as "fcp" or "comedi".
-        source: how the histories were made, such as "ppo".
+        source: how the histories were made: "ppo" (an ego learned by PPO) or "noise" (the scripted oracle acted, and
+            random actions replaced its own ever less often); see docs/format.md.
         task_id: id of a task; a task is a layout, a teammate and a seed.
+        learner: number of the learner, from 0, where a task has several independent ones; or several numbers.
         min_expert_return: only histories whose expert actions come from a policy that earned at least this much per
             episode, acting greedily with the history's teammate: `entry.expert_return`.
         obs: dtype of observations: "float32", "uint8" (the same integers), or "state" for state records instead of
@@ -92,6 +96,7 @@ def load_icrl4aht(
         algorithm=algorithm,
         source=source,
         task_id=task_id,
+        learner=learner,
         min_expert_return=min_expert_return,
     )
 
@@ -119,10 +124,6 @@ class Dataset(Selection):
     @cached_property
     def _tasks(self) -> dict[str, Task]:
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
-
-    @cached_property
-    def _provenance(self) -> dict[str, Provenance]:
-        return read_provenance(self.origin.file(PROVENANCE))
 
     def recover_environment(self, history_id: int) -> dict[str, Any]:
         """Return the parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
@@ -161,7 +162,7 @@ class Dataset(Selection):
             )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        provenance = self._provenance.get(entry.task_id, Provenance())
+        provenance = self.provenance.get(entry.task_id, Provenance())
         return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
@@ -169,10 +170,16 @@ class Dataset(Selection):
         return ADSampler(self, batch_size=batch_size, length=length, **options)
 
     def dpt(
-        self, *, batch_size: int, context: int, order: ContextOrder = "contiguous", **options: Unpack[SamplerOptions]
+        self,
+        *,
+        batch_size: int,
+        context: int,
+        order: ContextOrder = "contiguous",
+        labels: Labels = "expert",
+        **options: Unpack[SamplerOptions],
     ) -> DPTSampler:
         """Return a sampler of queries with contexts of `context` transitions for Decision-Pretrained Transformers.
 
         See `DPTSampler` for the options.
         """
-        return DPTSampler(self, batch_size=batch_size, context=context, order=order, **options)
+        return DPTSampler(self, batch_size=batch_size, context=context, order=order, labels=labels, **options)

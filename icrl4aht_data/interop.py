@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import NotStoredError, OptionError
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.base import Sampler
@@ -111,8 +112,8 @@ def hf_episodes(dataset: Selection) -> datasets.Dataset:
     """The selection's episodes as a `datasets.Dataset`, one row for each episode, in order.
 
     Columns: history_id, task_id, layout, episode (number in its history, from 0), return, and lists with one element
-    for each step: actions, teammate_actions, rewards, expert_actions (null if the history has none) and state (bytes of
-    the state record; see `overcooked.state`).
+    for each step: actions, teammate_actions, rewards, expert_actions and oracle_actions (null if the history has none)
+    and state (bytes of the state record; see `overcooked.state`).
 
     Raises:
         NotStoredError: for a release of observations.
@@ -121,7 +122,7 @@ def hf_episodes(dataset: Selection) -> datasets.Dataset:
     if not dataset.has_states:
         raise NotStoredError(f"{dataset.root}: has observations only, no state records; take hf_windows")
     library = _datasets()
-    step = {name: library.List(library.Value("int8")) for name in ("actions", "teammate_actions", "expert_actions")}
+    step = {name: library.List(library.Value("int8")) for name in ACTION_FIELDS}
     features = library.Features(
         {
             "history_id": library.Value("int64"),
@@ -140,8 +141,8 @@ def hf_episodes(dataset: Selection) -> datasets.Dataset:
 def _episodes(dataset: Selection) -> Iterator[dict[str, Any]]:
     for history in dataset:
         entry = history.entry
-        names = ["actions", "teammate_actions", "rewards", "dones", "state"]
-        arrays = {name: history.read(name) for name in names + ["expert_actions"] * entry.has_expert_actions}
+        present = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
+        arrays = {name: history.read(name) for name in (*present, "rewards", "dones", "state")}
         ends = np.flatnonzero(arrays.pop("dones")) + 1
         for episode, (start, stop) in enumerate(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)):
             part = {name: array[start:stop] for name, array in arrays.items()}
@@ -151,7 +152,7 @@ def _episodes(dataset: Selection) -> Iterator[dict[str, Any]]:
                 "layout": entry.layout,
                 "episode": episode,
                 "return": float(part["rewards"].sum()),
-                "expert_actions": None,
+                **dict.fromkeys(ACTION_FIELDS),
                 **part,
                 "state": [record.tobytes() for record in part["state"]],
             }

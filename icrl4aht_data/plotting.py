@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import SOURCES
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, Cell, has_headroom
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 """Accepted suffixes of a figure's file name."""
 
+_CURVE_PARTS = 25  # of a history, as points of a curve
+
 
 def plot_learning_curves(dataset: Dataset, path: Path) -> None:
     """Plot the return per episode of every task in a selection: mean over streams, band from 10th to 90th percentile.
@@ -38,13 +41,58 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
 
 
 def plot_layout_curves(dataset: Dataset, path: Path) -> None:
-    """Plot the return per episode on every layout in a selection, one curve per split and teammate kind: mean over
-    streams, band from 10th to 90th percentile.
+    """Plot the return over the course of a history on every layout in a selection, see `plot_source_curves`.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    _plot_histories(dataset, path, lambda e: (e.layout, e.layout), lambda e: f"{e.split}, {e.teammate_kind}: mean")
+    curves: SourceCurves = {}
+    for history in dataset:
+        add_curve(curves, history.entry.layout, history.entry.source, history.entry.split, history.returns())
+    plot_source_curves(curves, path)
+
+
+def _curve_order(label: str) -> tuple[int, str]:
+    source = label.partition(",")[0]
+    return SOURCES.index(source) if source in SOURCES else len(SOURCES), label
+
+
+SourceCurves = dict[str, dict[str, list[np.ndarray]]]
+"""layout -> label of a curve -> returns of each history's episodes, (E,)."""
+
+
+def add_curve(curves: SourceCurves, layout: str, source: str, split: str, returns: np.ndarray) -> None:
+    """Add a history's episode returns (E,) to the curve of its layout, source and split."""
+    curves.setdefault(layout, {}).setdefault(source if split == "train" else f"{source}, {split}", []).append(returns)
+
+
+def plot_source_curves(curves: SourceCurves, path: Path) -> None:
+    """Plot small panels, one per layout, of returns over the course of a history: mean over histories, band from 10th
+    to 90th percentile.
+
+    The course of a history is divided into at most 25 equal parts, in which returns are averaged.
+
+    Raises:
+        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
+    """
+    labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
+    figure, grid = _panels(path, len(curves), (2.6, 1.9), columns=min(4, len(curves)))
+    for axes, (layout, of_layout) in zip(grid, curves.items(), strict=True):
+        for label in (label for label in labels if label in of_layout):
+            parts = min(_CURVE_PARTS, *map(len, of_layout[label]))
+            means = np.stack([[part.mean() for part in np.array_split(own, parts)] for own in of_layout[label]])
+            share, (low, high) = (np.arange(parts) + 0.5) / parts, np.percentile(means, (10, 90), axis=0)
+            color = f"C{labels.index(label)}"
+            axes.plot(share, means.mean(axis=0), label=label, color=color, linewidth=1.2)
+            axes.fill_between(share, low, high, alpha=0.2, linewidth=0, color=color)
+        axes.set_title(layout, fontsize=8)
+        axes.set_xlim(0, 1)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+    what = "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
+    figure.suptitle(what, fontsize=8)
+    legend_below(figure)
+    save_figure(figure, path, dpi=80)
 
 
 def _plot_histories(
@@ -134,7 +182,7 @@ def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[s
     save_figure(figure, path, dpi=120)
 
 
-def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, list[Any]]:
+def _panels(path: Path, count: int, size: tuple[float, float], columns: int | None = None) -> tuple[Figure, list[Any]]:
     """Return a figure and its `count` axes, each `size` inches (width, height); checks the suffix of `path`."""
     if path.suffix not in PICTURES:
         raise OptionError(f"{path}: expected a name that ends in {', '.join(PICTURES)}")
@@ -142,7 +190,7 @@ def _panels(path: Path, count: int, size: tuple[float, float]) -> tuple[Figure, 
         from matplotlib.figure import Figure
     except ImportError as error:
         raise OptionError("drawing needs matplotlib: pip install 'icrl4aht-data[plot]'") from error
-    columns = 2 if count == 4 else min(3, count)
+    columns = columns or (2 if count == 4 else min(3, count))
     rows = -(-count // columns)
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]

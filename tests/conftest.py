@@ -26,6 +26,7 @@ from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_releases import random_release
 from tests.helpers.tiny import PAIR, TINY
+from tests.helpers.two_sources import two_source_release
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
@@ -130,6 +131,13 @@ def full(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
 def lite_or_full(request) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
     """`lite`, then `full`."""
     return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope="session")
+def two_sources(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+    """A lite release with both sources, splits train and validation and all labels; and its arrays. Read only."""
+    root = tmp_path_factory.mktemp("releases") / "two_sources"
+    return root, two_source_release(root)
 
 
 @pytest.fixture

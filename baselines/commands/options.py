@@ -124,7 +124,7 @@ def history_filters(command: Any) -> Any:
             "--source",
             metavar="NAME",
             multiple=True,
-            help="Train only on histories made by this learner, such as ppo; repeat for several.",
+            help="Train only on histories of this source, ppo or noise; repeat for several.",
         ),
     ]
 
@@ -159,9 +159,16 @@ model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
 def training_summary(histories: dict[str, Any]) -> str:
-    """Returns the layouts and channels of a training run, one line, from the settings of its histories."""
-    shape = " x ".join(map(str, histories["obs_shape"]))
-    return f"training on {', '.join(histories['layouts'])}; {histories['channels']} channels, observations of {shape}"
+    """Returns layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
+    shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
+    parts = [
+        f"training on {', '.join(histories['layouts'])}",
+        f"{histories['channels']} channels, observations of {shape}",
+        f"{sizes['train']} histories",
+        f"held out {sizes['histories']} with the same teammates"
+        + (f" and {sizes['teammates']} with others (split {split})" if split else ""),
+    ]
+    return "; ".join(parts + ([f"{histories['labels']} labels"] if histories["labels"] else []))
 
 
 def default_batch_size(size: str = "small") -> int:
@@ -268,7 +275,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         ),
         _experiment_size_option,
         history_filters,
-        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs")),
+        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs", "labels")),
         evaluation_split_option,
         tasks_option,
         episodes_option,

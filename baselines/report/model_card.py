@@ -10,6 +10,7 @@ from typing import Any
 from baselines.report.overlap import describe_training, overlap_legend
 from baselines.report.results import EvaluationRun, ResultSource, instances_range
 from baselines.report.summary import track_tables
+from baselines.training.seen import TRAINED_ON
 from icrl4aht_data.utils.templates import fill_template
 
 CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
@@ -105,7 +106,10 @@ def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
     for sources in models:
         config = _trained(sources)["config"]
         channels = config["histories"].get("channels", "own")  # models of earlier versions have a layout's own
+        made_by = sorted({cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell})
+        data = {"sources of histories": ", ".join(made_by), "labels": config["histories"].get("labels")}
         settings = {**config["model"], **config["train"], "channels": channels}
+        settings |= {name: value for name, value in data.items() if value}
         tested_on.setdefault(_bullets(settings), []).extend(sources)
     if len(tested_on) == 1:
         return next(iter(tested_on))

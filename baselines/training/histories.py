@@ -27,6 +27,7 @@ from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
@@ -35,6 +36,9 @@ _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammat
     name: FILTERS[name] for name in ("algorithm", "source")
 }
 """Name in an entry of `training_cells` -> field of the index."""
+
+VALIDATION = "validation"
+"""Split of the histories that are held out where a release has them."""
 
 
 class TrainingTask(NamedTuple):
@@ -56,6 +60,9 @@ class TrainingTask(NamedTuple):
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
     """Returns the training of a method on histories; each process of several gets its share of the batches.
 
+    The held-out part `teammates` are the release's histories of split validation on the training layouts that pass the
+    same filters. Without any, some tasks of the training split are held out instead, see `hold_out`.
+
     Args:
         name: of the method.
         model: its architecture.
@@ -64,19 +71,20 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 
     Raises:
         EmptySelectionError: if no history has a value that the choice of histories filters by.
-        OptionError: if a window or a context is longer than a history, or if the layouts' own channels are asked for
-            and differ in number.
-        LabelsMissingError: for DPT on histories without expert actions.
+        OptionError: if a window or a context is longer than a history, if the layouts' own channels are asked for and
+            differ in number, or if labels are asked for and the method uses none.
+        LabelsMissingError: for DPT on histories without the labels.
     """
-    dataset = _load(histories)
-    split = hold_out(dataset, histories.held_out)
+    dataset, validation = _load(histories)
+    split = hold_out(dataset, histories.held_out, validation=validation)
     view = None if dataset.obs == "state" else plain_view
     canonical = dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
+    labels = _labels_of(method, histories.labels)
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: _number_layouts(
-            _sampler(method, selection, options, model.teammate_actions, histories.order), dataset.layouts
+            _sampler(method, selection, options, model.teammate_actions, histories.order, labels), dataset.layouts
         )
         for part, selection in parts.items()
         if selection is not None
@@ -90,29 +98,63 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "layouts": [layout.name for layout in dataset.layouts],
             "obs": dataset.obs,
             "channels": dataset.channels,
+            "labels": labels,
             "obs_shape": list(dataset.obs_shape),
             "data_version": dataset.info.data_version,
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
+            "teammates_split": None if split.teammates is None else " and ".join(split.teammates.counts("split")),
         },
-        TRAINED_ON: training_cells(split.train),
+        TRAINED_ON: training_cells(split.train, labels),
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
 
 
-def _load(histories: HistoryOptions) -> Dataset:
+def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
+    """Returns the labels that a method learns from, or None for one that learns from the histories' own actions."""
+    if method.data == "dpt":
+        return wanted or "expert"
+    if wanted is not None:
+        raise OptionError(
+            f"labels = {wanted}: {method.name} learns from the histories' own actions; leave out --labels, or train dpt"
+        )
+    return None
+
+
+def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     """Opens the release, with state records if there are any and nothing else is required.
 
     Channels are canonical if all layouts are chosen, or some whose own channels differ, and nothing else is required.
+
+    Returns:
+        The chosen histories, and those of split validation that agree with the choice, if there are any.
     """
     every = ALL_LAYOUTS in histories.layouts
     names = None if every else [get_layout(name).name for name in histories.layouts]
-    found = load_icrl4aht(histories.root, split=histories.split, layout=names, obs=histories.obs or "uint8")
-    found = filter_histories(found, histories.filters)
+    release = load_icrl4aht(histories.root, obs=histories.obs or "uint8")
+    found = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
+    if channels == "own" and differ:
+        raise OptionError(
+            f"channels = own: the layouts {', '.join(layout.name for layout in found.layouts)} have own channels of "
+            f"unequal number: leave out --channels or take canonical, or train on one of them, such as --layout "
+            f"{found.layouts[0].name}"
+        )
     state = "state" if histories.obs is None and found.has_states else None
-    return found.with_options(obs=state, channels=channels)
+    found = found.with_options(obs=state, channels=channels)
+    return found, _validation_part(release.with_options(obs=state, channels=channels), found, histories)
+
+
+def _validation_part(release: Dataset, chosen: Dataset, histories: HistoryOptions) -> Dataset | None:
+    """Returns the histories of split validation on the chosen layouts that pass the filters, if there are any."""
+    if histories.split == VALIDATION:
+        return None
+    filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
+    try:
+        return release.filter(split=VALIDATION, layout=[layout.name for layout in chosen.layouts], **filters)
+    except EmptySelectionError:
+        return None
 
 
 def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
@@ -141,12 +183,13 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
     return dataset.select(passing) if filters else dataset
 
 
-def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
+def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
     """Returns what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
 
-    An entry has these five names, the numbers of `tasks` and `histories`, `tasks_hash`, a hash of the task ids, and
-    `teammates`, the ids of the teammates, see `seen.teammate_ids`; None if the release does not describe them.
-    Histories that are held out for validation do not belong to `dataset`.
+    An entry has these five names, the `labels`, None for a method that uses none, the numbers of `tasks` and
+    `histories`, `tasks_hash`, a hash of the task ids, and `teammates`, the ids of the teammates, see
+    `seen.teammate_ids`; None if the release does not describe them. Histories that are held out for validation do not
+    belong to `dataset`.
     """
     columns = [dataset.column(field) for field in _CELL_FIELDS.values()]
     tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
@@ -157,6 +200,7 @@ def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
     return [
         {
             **dict(zip(_CELL_FIELDS, cell, strict=True)),
+            "labels": labels,
             "tasks": len(set(ids)),
             "histories": len(ids),
             "tasks_hash": json_hash(sorted(set(ids))),
@@ -167,12 +211,18 @@ def training_cells(dataset: Dataset) -> list[dict[str, Any]]:
 
 
 def _sampler(
-    method: Method, dataset: Dataset, options: TrainOptions, teammate_actions: bool, order: ContextOrder
+    method: Method,
+    dataset: Dataset,
+    options: TrainOptions,
+    teammate_actions: bool,
+    order: ContextOrder,
+    labels: Labels | None,
 ) -> Any:
-    shortest = int(dataset.column("T").min())
-    if options.context > shortest:
+    lengths = dataset.column("T")
+    if options.context > lengths.min():
         raise OptionError(
-            f"context = {options.context}: the shortest history of {dataset!r} has {shortest} steps; take fewer"
+            f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
+            + _longer_source(dataset, options.context)
         )
     shared: Any = {
         "batch_size": options.batch_size,
@@ -183,7 +233,15 @@ def _sampler(
     }
     if method.data == "ad":
         return dataset.ad(length=options.context, **shared)
-    return dataset.dpt(context=options.context, order=order, **shared)
+    assert labels is not None
+    return dataset.dpt(context=options.context, order=order, labels=labels, **shared)
+
+
+def _longer_source(dataset: Dataset, context: int) -> str:
+    """Returns the advice to choose a source whose histories all have so many steps, if there is one."""
+    lengths, sources = dataset.column("T"), dataset.column("source")
+    longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
+    return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""
 
 
 class LayoutNumbers:
@@ -223,7 +281,8 @@ class HistorySplit(NamedTuple):
     Attributes:
         train: histories to train on.
         histories: held-out histories of the training tasks.
-        teammates: histories of held-out tasks, whose teammates are in no other part; None if there is one task only.
+        teammates: histories with teammates that are in no other part, of split validation or of held-out tasks; None
+            if there is neither.
     """
 
     train: Dataset
@@ -231,33 +290,49 @@ class HistorySplit(NamedTuple):
     teammates: Dataset | None
 
 
-def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0) -> HistorySplit:
+def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the tasks, and of every other task a share of its histories; at least one each.
 
-    The choice depends on names and the seed alone: adding histories does not move the others between parts.
+    The histories of tasks with one only are trained on. The choice depends on names and the seed alone: adding
+    histories does not move the others between parts.
+
+    Args:
+        dataset: the histories to divide.
+        share: share of the tasks, and of the histories of a task.
+        seed: seed of the choice.
+        validation: histories with other teammates, such as those of split validation: these are the part `teammates`
+            then, and no task of `dataset` is held out.
 
     Raises:
-        OptionError: if the share is not between 0 and 1, or a task has one history only.
+        OptionError: if the share is not between 0 and 1, or every task has one history only.
     """
     if not 0 < share < 1:
         raise OptionError(f"share = {share}: expected a number between 0 and 1")
     names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
     tasks = sorted(np.unique(codes).tolist(), key=lambda code: _rank(seed, names[code]))
-    held_tasks = tasks[: _count(share, len(tasks)) if len(tasks) > 1 else 0]
-    env_idx, held = dataset.column("env_idx"), np.zeros(len(dataset), bool)
+    held_tasks = tasks[: _count(share, len(tasks)) if len(tasks) > 1 and validation is None else 0]
+    streams, held = _stream_names(dataset), np.zeros(len(dataset), bool)
     for code in tasks[len(held_tasks) :]:
-        rows = sorted(np.flatnonzero(codes == code), key=lambda row: _rank(seed, names[code], int(env_idx[row])))
-        if len(rows) < 2:
-            raise OptionError(
-                f"task {names[code]} has one history: expected two or more, one to train on and one to hold out"
-            )
-        held[rows[: _count(share, len(rows))]] = True
+        rows = sorted(np.flatnonzero(codes == code), key=lambda row: _rank(seed, names[code], *streams[row]))
+        if len(rows) > 1:
+            held[rows[: _count(share, len(rows))]] = True
+    if not held.any():
+        raise OptionError(
+            f"every task of {dataset!r} has one history: expected a task with two or more, one to train on and one to "
+            f"hold out"
+        )
     in_held_task = np.isin(codes, held_tasks)
     return HistorySplit(
         train=dataset.select(~held & ~in_held_task),
         histories=dataset.select(held),
-        teammates=dataset.select(in_held_task) if len(held_tasks) else None,
+        teammates=dataset.select(in_held_task) if len(held_tasks) else validation,
     )
+
+
+def _stream_names(dataset: Dataset) -> list[tuple[int, ...]]:
+    """Returns what tells each history from the others of its task: its stream, and its learner after the first one."""
+    pairs = zip(dataset.column("env_idx").tolist(), dataset.column("learner").tolist(), strict=True)
+    return [(stream, learner) if learner else (stream,) for stream, learner in pairs]
 
 
 def _count(share: float, total: int) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import Channels
-from icrl4aht_data.reading.history import Obs
+from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.option_fields import check_fields, option_field
 
@@ -58,7 +58,7 @@ class HistoryOptions:
         split: split of the release.
         teammate_family: families of teammates, "rl" or "H1".."H4"; any by default.
         algorithm: algorithms of learned teammates or kinds of heuristics, such as "fcp"; any by default.
-        source: how histories were made, such as "ppo"; any by default.
+        source: how histories were made, "ppo" or "noise"; any by default.
     """
 
     layouts: tuple[str, ...]
@@ -68,8 +68,16 @@ class HistoryOptions:
     algorithm: tuple[str, ...] = ()
     source: tuple[str, ...] = ()
     order: ContextOrder = option_field("contiguous", "Order of the transitions in DPT's contexts.")
+    labels: Labels | None = option_field(
+        None,
+        "Labels to learn from: expert (greedy actions of a policy) or oracle (a script that knows the full state).",
+        default_text="expert for dpt; the others learn from the histories' own actions",
+    )
     held_out: float = option_field(
-        0.1, "Share of the tasks, and of the other tasks' histories, held out for validation.", above=0, below=1
+        0.1,
+        "Share of each task's histories, and of the tasks if there are none of split validation, held out.",
+        above=0,
+        below=1,
     )
     obs: Obs | None = option_field(
         None,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from generation.experts.oracle import oracle
+from generation.learners.config import Widths
 from generation.learners.network import ActorCritic
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.provenance import StreamFilter, StreamReturns
@@ -29,31 +32,65 @@ def stream_returns(rewards: np.ndarray) -> np.ndarray:
     return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
 
-def best_streams(rewards: np.ndarray, keep: int) -> np.ndarray:
-    """int (keep,): numbers of the streams with the highest end + improvement, best first, ties by number.
+def best_streams(returns: np.ndarray, keep: int, least_improvement: float | None = None) -> np.ndarray:
+    """int (n,), n <= keep: numbers of the streams with the highest end + improvement, best first, ties by number.
 
     Args:
-        rewards: int8 (N, T).
-        keep: how many.
+        returns: (N, E), episode returns of a learner's streams.
+        keep: how many at most.
+        least_improvement: only streams whose end exceeds their start by this; None for all.
     """
-    return np.argsort(-stream_score(stream_returns(rewards)), kind="stable")[:keep]
+    start, end = curve_ends(returns)
+    order = np.argsort(-stream_score(returns), kind="stable")
+    if least_improvement is not None:
+        order = order[(end - start)[order] >= least_improvement]
+    return order[:keep]
 
 
-def filter_report(rewards: np.ndarray, streams: np.ndarray) -> StreamFilter:
-    """Mean returns at the start and at the end of learning, before the filter and after it."""
-    returns = stream_returns(rewards)
+def select_streams(
+    returns: Sequence[np.ndarray], keep: int, least_improvement: float | None = None
+) -> list[np.ndarray]:
+    """Streams of each of a task's learners, `keep` of all together, see `best_streams`.
+
+    The learners have as many as each other where they have enough: every turn each learner gives its next best stream,
+    and the learners whose streams are better give theirs first.
+
+    Args:
+        returns: for each learner (N, E), episode returns of its streams.
+        keep: how many in all at most.
+        least_improvement: only streams whose end exceeds their start by this; None for all.
+
+    Returns:
+        for each learner int (n,), best first; the sum of all n is at most `keep`.
+    """
+    candidates = [best_streams(of_learner, keep, least_improvement) for of_learner in returns]
+    turns = [
+        (turn, -float(stream_score(returns[learner][[stream]])[0]), learner)
+        for learner, streams in enumerate(candidates)
+        for turn, stream in enumerate(streams)
+    ]
+    chosen = [learner for _, _, learner in sorted(turns)[:keep]]
+    return [streams[: chosen.count(learner)] for learner, streams in enumerate(candidates)]
+
+
+def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
+    """Mean returns at the start and at the end of learning, before the filter and after it.
+
+    Args:
+        before: (N, E), episode returns of all streams.
+        after: (n, E), those of the selected streams.
+        least_improvement: what the selected streams had to improve by.
+    """
     sides = []
-    for part in (returns, returns[streams]):
+    for part in (before, after):
         start, end = (round(float(values.mean()), 3) for values in curve_ends(part))
         sides.append(StreamReturns(len(part), start, end))
-    return StreamFilter(before=sides[0], after=sides[1])
+    return StreamFilter(before=sides[0], after=sides[1], least_improvement=least_improvement)
 
 
-def plot_filter(path: Path, title: str, rewards: np.ndarray, streams: np.ndarray) -> None:
-    """Draw the learning curves of all streams and of the selected ones into a PNG."""
-    returns = stream_returns(rewards)
-    curves = {f"before: {len(returns)} streams": returns, f"after: {len(streams)} streams": returns[streams]}
-    plot_curves(path, [(title, curves)])
+def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -> None:
+    """Draw the learning curves of all streams, returns (N, E), and of the selected ones, (n, E), into a PNG."""
+    plot_curves(path, [(title, {f"before: {len(before)} streams": before, f"after: {len(after)} streams": after})])
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
@@ -70,14 +107,69 @@ def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[
     Yields:
         int8 (T,) for each stream.
     """
+    greedy = _compiled_greedy(layout, network.widths)
+    for stream in states:
+        yield _by_step(greedy(params, _by_episode(stream)))
+
+
+def oracle_labels(layout: Layout, states: Iterable[np.ndarray], actions: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields the scripted oracle's action at every step of each stream.
+
+    The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
+    took, and says at each state what it would do now.
+
+    Args:
+        layout: the layout.
+        states: uint8 (T, S) for each stream.
+        actions: int8 (T,) for each stream, the ego's.
+
+    Yields:
+        int8 (T,) for each stream.
+    """
+    follow = _compiled_oracle(layout)
+    for stream, taken in zip(states, actions, strict=True):
+        yield _by_step(follow(_by_episode(stream), _by_episode(taken)))
+
+
+def _by_episode(stream: np.ndarray) -> jax.Array:
+    """(T, ...) -> (100, E, ...)."""
+    return jnp.asarray(stream.reshape(-1, KEPT_STEPS, *stream.shape[1:]).swapaxes(0, 1))
+
+
+def _by_step(labels: jax.Array) -> np.ndarray:
+    """(100, E) -> (T,)."""
+    return np.asarray(labels).swapaxes(0, 1).reshape(-1)
+
+
+@lru_cache(maxsize=8)
+def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array], jax.Array]:
+    """A function of parameters and records (100, E, S) to greedy actions, int8 (100, E); for all egos of a layout."""
+    network = ActorCritic(widths)
 
     @jax.jit
-    def greedy(records):  # (100, E, S)
+    def greedy(params: Any, records: jax.Array) -> jax.Array:
         steps, episodes, _ = records.shape
         reset = jnp.zeros((steps, episodes), bool)
         result: Any = network.apply(params, network.initial_hidden(episodes), observe(layout, records, EGO), reset)
         return jnp.argmax(result[1], axis=-1).astype(jnp.int8)
 
-    for stream in states:
-        episodes = stream.reshape(-1, KEPT_STEPS, stream.shape[-1]).swapaxes(0, 1)
-        yield np.asarray(greedy(jnp.asarray(episodes))).swapaxes(0, 1).reshape(-1)
+    return greedy
+
+
+@lru_cache(maxsize=8)
+def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """A function of records (100, E, S) and the ego's actions (100, E) to the oracle's actions, int8 (100, E)."""
+    script, key = oracle(layout), jax.random.key(0)  # which draws nothing
+    act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
+
+    @jax.jit
+    def follow(records: jax.Array, taken: jax.Array) -> jax.Array:
+        def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+            record, action = now
+            wanted, memory = act((), memory, record, key)
+            return memory._replace(action=action.astype(jnp.int32)), wanted.astype(jnp.int8)
+
+        memory = jax.vmap(lambda _: script.init((), key))(jnp.arange(records.shape[1]))
+        return jax.lax.scan(step, memory, (records, taken))[1]
+
+    return follow

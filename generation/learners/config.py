@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.rules import WRONG_DELIVERY_REWARD
 from icrl4aht_data.utils.option_fields import check_fields, option_field
 
 EncoderKind = Literal["paper", "words", "mlp"]
@@ -89,6 +90,12 @@ class PPOConfig:
     max_grad_norm: float = option_field(0.25, "Largest global norm of a gradient.", above=0)
     shaping_horizon: int = option_field(
         PAPER_EGO_STEPS, "Environment steps until shaped rewards have the weight 0.", at_least=1
+    )
+    forgiveness: float = option_field(
+        0.0,
+        "Shaped reward of a wrong delivery: with 20, its penalty grows from 0 to 20 as the shaping ends.",
+        at_least=0,
+        at_most=-WRONG_DELIVERY_REWARD,
     )
     widths: Widths = field(default_factory=Widths)
 

@@ -108,7 +108,8 @@ class Learner:
         # Only for the value of the observation after the roll-out: the action is drawn again in the next one.
         after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
         shaping = shaping_weight(self.config, state.update)
-        played = sequences(self.view, rollout, EGO, ego.agent_slots, state.carry.memories[EGO], after.value, shaping)
+        memory, forgiveness = state.carry.memories[EGO], self.config.forgiveness
+        played = sequences(self.view, rollout, EGO, ego.agent_slots, memory, after.value, shaping, forgiveness)
         params, optimizer, losses = self.ppo.learn(state.params, state.optimizer, played, learn_key)
         metrics = losses | episode_metrics(rollout) | {"shaping": shaping}
         return (

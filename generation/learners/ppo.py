@@ -22,6 +22,7 @@ from generation.learners.encoder import CompactView, Seen
 from generation.learners.network import ActorCritic
 from generation.learners.rollout import Rollout, slot_records
 from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.rules import PRESS_REWARD
 
 
 def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -76,6 +77,7 @@ def sequences(
     hidden: Array,
     last_value: Array,
     shaping: Array,
+    forgiveness: float = 0.0,
 ) -> Sequences:
     """Returns the sequences in one player's agent slots, all with partner 0 and weight 1.
 
@@ -87,16 +89,19 @@ def sequences(
         hidden: float32 (M, H), the player's recurrent state before the roll-out.
         last_value: float32 (M,), the critic's estimates for the observations after the roll-out.
         shaping: float32 scalar or (M,), weight of shaped rewards.
+        forgiveness: shaped reward of a wrong delivery, see `PPOConfig`.
     """
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
     choice = rollout.choices[player]
+    # Presses of both agents cost less than a wrong delivery, so the team's reward shows whether there was one.
+    shaped = rollout.shaped[:, env, agent] + forgiveness * (rollout.reward[:, env] < 2 * PRESS_REWARD)
     return Sequences(
         seen=view(slot_records(rollout.record, agent_slots)),
         reset=rollout.reset[:, env],
         action=choice.action,
         log_prob=choice.log_prob,
         value=choice.value,
-        reward=rollout.reward[:, env] + shaping * rollout.shaped[:, env, agent],
+        reward=rollout.reward[:, env] + shaping * shaped,
         done=rollout.done[:, env],
         hidden=hidden[None],
         partner=jnp.zeros((1, agent_slots.size), jnp.int32),

@@ -17,7 +17,7 @@ from generation.policy import Policy
 from generation.populations.train import RESPONSES
 from generation.teammates.draws import LEAST_HEADROOM
 from generation.teammates.learned import build_learned
-from generation.teammates.references import EPISODES, reference_returns
+from generation.teammates.references import REFERENCE_EPISODES, reference_returns
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.checkpoints import checkpoint_folder
@@ -88,17 +88,17 @@ def _paired_return(layout: Layout, ego: Policy, mate: Policy) -> float:
 
 @lru_cache(maxsize=8)
 def _compiled(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
-    """A function of both policies' parameters that returns the returns, float32 (EPISODES,)."""
+    """A function of both policies' parameters that returns the returns, float32 (REFERENCE_EPISODES,)."""
     env = Environment(layout, KEPT_STEPS)
 
     @jax.jit
     def play(ego_params: Any, mate_params: Any) -> jax.Array:
         players = [
-            policy_player(env, ego, ego_params, EGO, EPISODES),
-            policy_player(env, mate, mate_params, TEAMMATE, EPISODES),
+            policy_player(env, ego, ego_params, EGO, REFERENCE_EPISODES),
+            policy_player(env, mate, mate_params, TEAMMATE, REFERENCE_EPISODES),
         ]
         episodes, actions = jax.random.split(jax.random.key(_SEED))
-        carry = init_rollout(env, players, jax.random.split(episodes, EPISODES))
+        carry = init_rollout(env, players, jax.random.split(episodes, REFERENCE_EPISODES))
         return roll_out(env, players, carry, KEPT_STEPS, actions)[1].reward.sum(axis=0)
 
     return play

@@ -18,6 +18,8 @@ from icrl4aht_data.overcooked.layouts import get_layout
 
 FOLDER = Path(__file__).parent
 
+_LEAST = ("least_improvement", "least_rise")
+
 
 def profile_names() -> list[str]:
     """Names of the shipped profiles."""
@@ -49,7 +51,7 @@ def load_profile(name: str) -> Profile:
 def _profile(name: str, content: dict[str, Any]) -> Profile:
     _check_keys(content, "", {"xla_threads", "ego", "teammates", "noise", "release", "tasks"})
     release, tasks = content["release"], content["tasks"]
-    _check_keys(release, "release.", {"keep", "data_version", "policies", "oracle_actions", "least_improvement"})
+    _check_keys(release, "release.", {"keep", "data_version", "policies", "oracle_actions", *_LEAST})
     _check_keys(tasks, "tasks.", {"layouts", "sources", "learners", "presets", "sampled", "algorithms"})
     layouts = _layouts("tasks.layouts", tasks["layouts"])
     sources = _names("tasks.sources", tasks.get("sources", ["ppo"]))
@@ -77,7 +79,7 @@ def _profile(name: str, content: dict[str, Any]) -> Profile:
         algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
         policies=_switch("release.policies", release.get("policies", False)),
         oracle_actions=_switch("release.oracle_actions", release.get("oracle_actions", False)),
-        least_improvement=_number("release.least_improvement", release.get("least_improvement")),
+        **{name: _number(f"release.{name}", release.get(name)) for name in _LEAST},
         xla_threads=_typed("xla_threads", content["xla_threads"], int) if "xla_threads" in content else None,
     )
 

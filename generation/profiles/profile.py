@@ -114,6 +114,8 @@ class Profile:
         policies: whether the release has the policies that label its histories.
         oracle_actions: whether the release has the scripted oracle's action at every step.
         least_improvement: how much a stream's end must exceed its start to be kept; None keeps the best in any case.
+        least_rise: how much the end of a task's kept histories must exceed their start, on average, for the release to
+            have the task; None has it in any case. Neither holds on layouts where the ego matters with no teammate.
         xla_threads: threads of XLA on a CPU, so that every machine computes the same bits; None for all cores.
 
     Raises:
@@ -136,6 +138,7 @@ class Profile:
     policies: bool = False
     oracle_actions: bool = False
     least_improvement: float | None = None
+    least_rise: float | None = None
     xla_threads: int | None = None
 
     def __post_init__(self) -> None:

@@ -12,16 +12,19 @@ from generation.collection.job import CollectionError
 from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
 from generation.populations.build import build_suite
-from generation.populations.headroom import learned_headroom
+from generation.populations.headroom import LearnedHeadroom, learned_headroom
 from generation.populations.select import THRESHOLD, make_tasks
 from generation.profiles import Profile
 from generation.profiles.work import Work
 from generation.progress import progress_bars
+from generation.releases.measures import teammate_facts
 from generation.releases.package import check_release_folder, package_release
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.format.info import read_info
+from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.utils.locks import process_lock
+from icrl4aht_data.writing.card_content import read_content
+from icrl4aht_data.writing.card_tables import print_learning, teammate_name
 from icrl4aht_data.writing.statistics import print_statistics
 
 SUITE = "suite"
@@ -63,39 +66,65 @@ def build_releases(
     for kind in kinds:
         check_release_folder(out / kind, profile)  # before the long work, not after it
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
-    works = train_teammates(profile, suite, seed, console) if tasks is None else profile.works_of(tasks, sources or {})
+    if tasks is None:
+        works, headroom, left_out = train_teammates(profile, suite, seed, console)
+    else:
+        works, headroom, left_out = profile.works_of(tasks, sources or {}), {}, []
     collect_tasks(works, profile, out, console, options or CollectOptions(), suite)
-    number = len({work.task.task_id for work in works})
+    members = {work.task.task_id: work.task for work in works}
     releases = []
     with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
+        facts = teammate_facts(members.values(), out / "artefacts", suite, headroom)
         for kind in kinds:
             with progress_bars(console) as bars:
                 steps = [f"choosing labellers for {kind}", f"packing {kind}"]
-                rows = [bars.add_task(step, total=number, note="", unit="tasks") for step in steps]
+                rows = [bars.add_task(step, total=len(members), note="", unit="tasks") for step in steps]
 
                 def advance(step: int, bars=bars, rows=rows) -> None:
                     bars.advance(rows[step])
 
-                releases.append(package_release(out / "artefacts", out / kind, works, profile, suite, kind, advance))
+                package_release(
+                    out / "artefacts",
+                    out / kind,
+                    works,
+                    profile,
+                    suite,
+                    kind,
+                    advance,
+                    facts=facts,
+                    left_out=left_out,
+                )
+            releases.append(out / kind)
         for release in releases:
             print_statistics(read_info(release), console)
+            print_learning(read_content(release), console)
     return releases
 
 
-def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) -> list[Work]:
+def train_teammates(
+    profile: Profile, suite: Path, seed: int, console: Console
+) -> tuple[list[Work], dict[str, LearnedHeadroom], list[LeftOutTask]]:
     """The units of work of a profile, for which its learned teammates are trained first.
+
+    Returns:
+        The units; task id -> how much an ego matters with learned teammates; the tasks that are not collected, because
+        it does not.
 
     Raises:
         CollectionError: if there is no task, because no teammate is good enough.
     """
     if not profile.algorithms:
-        return profile.works()
+        return profile.works(), {}, []
     selections = build_suite(profile, suite, profile.algorithms, seed, console)
     learned = make_tasks(suite, selections, "train")
     headroom = learned_headroom(learned, suite)
+    left_out = []
     for task in learned:
         if not headroom[task.task_id].matters:
-            console.print(f"{task.task_id}: left out, the ego does not matter: {headroom[task.task_id].describe()}")
+            reason = f"the ego does not matter: {headroom[task.task_id].describe()}"
+            console.print(f"{task.task_id}: left out, {reason}")
+            name, layout = teammate_name(task), task.layout.name
+            left_out.append(LeftOutTask(task.task_id, layout, name, "ppo", 0, 0, None, None, reason))
     works = profile.works([task for task in learned if headroom[task.task_id].matters])
     if not works:
         names = dict.fromkeys(chain(*profile.algorithms.values()))
@@ -103,4 +132,4 @@ def train_teammates(profile: Profile, suite: Path, seed: int, console: Console) 
             f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
-    return works
+    return works, headroom, left_out

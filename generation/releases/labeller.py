@@ -2,14 +2,15 @@
 
 The labeller is the last checkpoint, the paper's, unless an earlier one earns clearly more when it acts greedily, as
 labellers do. A policy that was trained to draw its actions can repeat the action "stay" when it always takes the most
-probable one, and a model that is trained on its labels would learn to do so, too.
+probable one, and a model that is trained on its labels would learn to do so, too. Of several independent learners the
+one whose labeller earns most labels the histories of all.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -50,7 +51,7 @@ class Labeller:
         step: environment steps that it was trained for.
         return_greedy: its mean return with the task's teammate, acting greedily.
         return_sampled: its mean return with sampled actions.
-        last_return_greedy: greedy return of the last checkpoint.
+        last_return_greedy: greedy return of the same learner's last checkpoint.
     """
 
     folder: Path
@@ -61,8 +62,19 @@ class Labeller:
     last_return_greedy: float
 
 
-def choose_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
-    """Measure the checkpoints of a finished artefact, and choose the one that labels its histories.
+def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> Labeller:
+    """Choose the checkpoint that labels the histories of a task: of each learner's choice the one that earns most.
+
+    Args:
+        folders: the finished artefacts of the task's learners.
+        task: the task.
+        suite: folder of the learned teammates.
+    """
+    return max((learner_labeller(folder, task, suite) for folder in folders), key=lambda found: found.return_greedy)
+
+
+def learner_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
+    """Measure the checkpoints of a finished artefact, and choose the one that would label its histories.
 
     The measurements are kept in the artefact, in `LABELLER_RETURNS`, and are not repeated there.
 

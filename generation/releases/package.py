@@ -1,16 +1,18 @@
-"""Artefacts -> a release folder: the best streams of each task, with expert actions."""
+"""Artefacts -> a release folder: the histories of each task, with labels, and a picture of their learning curves."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 
-from generation.collection.curate import best_streams, filter_report, plot_filter, relabel
+from generation.collection.curate import filter_report, oracle_labels, plot_filter, relabel
 from generation.collection.record import HistoryArrays
 from generation.collection.task import TEAMMATE_NOISE
 from generation.collection.task_folder import FILTER_CURVES, METADATA
@@ -19,15 +21,20 @@ from generation.populations.select import THRESHOLD
 from generation.populations.train import population_threads
 from generation.profiles import Profile
 from generation.profiles.work import Work
+from generation.releases.histories import TaskHistories, select_histories
 from generation.releases.labeller import choose_labeller
+from generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
+from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES, Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
+from icrl4aht_data.writing.dataset_card import CURVES_FIGURE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 
@@ -40,31 +47,65 @@ def package_release(
     suite: Path,
     kind: Kind,
     advance: Callable[[Literal[0, 1]], None] = lambda step: None,
+    *,
+    facts: Mapping[str, TeammateFacts] | None = None,
+    left_out: Sequence[LeftOutTask] = (),
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
-    The histories of a task are labelled by the checkpoint of its ego that `choose_labeller` returns.
+    What is kept, `select_histories` says. The histories of learners are labelled by the checkpoint of their egos that
+    `choose_labeller` returns, those of the source "noise" by their script.
 
     Args:
-        artefacts: folder of the tasks' finished artefacts.
+        artefacts: folder of the finished artefacts.
         target: the release folder; a release of this profile there is replaced atomically.
         works: the units of work, by task in the release's order.
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
-        advance: called after each task with 0, when its labeller is chosen, and with 1, when it is written.
+        advance: called after each task with 0, when its histories are chosen, and with 1, when it is written.
+        facts: task id -> what is known of its teammate; by default it is looked up and measured.
+        left_out: tasks that were not collected, for the list in meta/info.json.
 
     Raises:
-        OptionError: if something else is at `target`, see `check_release_folder`.
+        OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
     """
     check_release_folder(target, profile)
-    recorded, new = _recorded_provenance(suite), []
-    for task in {work.task.task_id: work.task for work in works}.values():
-        new.append(_new_task(artefacts / task.task_id, task, profile, suite, recorded))
+    tasks: dict[str, list[Work]] = {}
+    for work in works:
+        tasks.setdefault(work.task.task_id, []).append(work)
+    if facts is None:
+        facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
+    headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
+    recorded, new, omitted, curves = _recorded_provenance(suite), [], list(left_out), SourceCurves()
+    for task_id, members in tasks.items():
+        task = members[0].task
+        found = select_histories(artefacts, members, profile, facts[task_id], headroom=task.layout.name in headroom)
+        if isinstance(found, LeftOutTask):
+            omitted.append(found)
+            advance(1)
+        else:
+            new.append(_new_task(found, profile, suite, facts[task_id], recorded))
+            for returns in found.kept:
+                add_curve(curves, task.layout.name, found.source, task.split, returns)
         advance(0)
-    return write_release(
-        target, kind, new, data_version=profile.data_version, overwrite=True, done=lambda task: advance(1)
-    )
+    if not new:
+        raise OptionError(f"{target}: no task has histories to keep: {'; '.join(one.reason for one in omitted)}")
+    if profile.sampled is not None:
+        omitted += unhosted_families(profile.layouts)
+    with TemporaryDirectory() as folder:
+        picture = Path(folder) / "curves.png"
+        plot_source_curves(curves, picture)
+        return write_release(
+            target,
+            kind,
+            new,
+            data_version=profile.data_version,
+            left_out=omitted,
+            files={CURVES_FIGURE: picture},
+            overwrite=True,
+            done=lambda task: advance(1),
+        )
 
 
 def check_release_folder(target: Path, profile: Profile) -> None:
@@ -118,48 +159,89 @@ def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[st
     )
 
 
-def _new_task(folder: Path, task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> NewTask:
-    metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
-    rewards = np.load(folder / "rewards.npy", mmap_mode="r")
-    streams = best_streams(rewards, profile.keep)
-    plot_filter(folder / FILTER_CURVES, f"{task.layout.name} with {task.teammate_kind}", rewards, streams)
-    labeller = choose_labeller(folder, task, suite)
-    provenance = Provenance(
+def _new_task(
+    found: TaskHistories, profile: Profile, suite: Path, facts: TeammateFacts, recorded: Mapping[str, Provenance]
+) -> NewTask:
+    task, metadata = found.task, json.loads((found.folders[0] / METADATA).read_text(encoding="utf-8"))
+    made = Provenance(
         profile=metadata["profile"],
         profile_hash=profile.hash,
-        ego=metadata["ego"],
-        ego_hash=metadata["ego_hash"],
         code_version=metadata["code_version"],
         jax_version=metadata["jax_version"],
         platform=metadata["platform"],
         xla_threads=metadata["xla_threads"],
         seed=task.seed,
+        source=found.source,
+        references=facts.references,
+        nearest_test=facts.nearest,
         teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
-        streams_recorded=metadata["ego"]["environments"],
-        streams_kept=profile.keep,
-        filter=filter_report(rewards, streams),
-        expert=ExpertLabels(
-            policy_sha256=labeller.sha256,
-            action="greedy, recurrent",
-            step=labeller.step,
-            return_greedy=labeller.return_greedy,
-            return_sampled=labeller.return_sampled,
-            episodes=LABEL_EPISODES,
-            last_return_greedy=labeller.last_return_greedy,
-        ),
+        streams_recorded=len(found.recorded),
+        streams_kept=len(found.kept),
         suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
-    if profile.policies:
-        files |= expert_files(labeller.folder, labeller.sha256)
-    return NewTask(task, provenance, profile.keep, lambda: _histories(folder, task, streams, labeller.folder), files)
+    if found.source == "noise":
+        return _noise_task(found, replace(made, noise=metadata["noise"]), profile, files)
+    learned = replace(made, ego=metadata["ego"], ego_hash=metadata["ego_hash"], learners=len(found.folders))
+    return _ppo_task(found, learned, profile, suite, files)
 
 
-def _histories(folder: Path, task: Task, streams: np.ndarray, labeller: Path) -> Iterator[NewHistory]:
-    arrays = HistoryArrays(**{name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields})
-    network, params, _ = load_policy(labeller)
-    labels = relabel(task.layout, network, params, (arrays.state[stream] for stream in streams))
-    dones = episode_ends(arrays.actions.shape[1], KEPT_STEPS)
-    for stream, expert in zip(streams, labels, strict=True):
-        recorded = {name: np.asarray(array[stream]) for name, array in arrays._asdict().items()}
-        yield NewHistory(int(stream), recorded | {"dones": dones, "expert_actions": expert})
+def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: Mapping[str, Path]) -> NewTask:
+    """A task of the source "noise", whose labels are the actions of its script."""
+    earned = made.references
+    expert = ExpertLabels(
+        policy_sha256=None,
+        action="scripted oracle, which sees the full state",
+        return_greedy=None if earned is None else earned.oracle,
+        episodes=None if earned is None else earned.episodes,
+    )
+
+    def load() -> Iterator[NewHistory]:
+        for _, stream, arrays in _recorded_histories(found):
+            labels = np.load(found.folders[0] / "oracle_actions.npy", mmap_mode="r")[stream]
+            wanted = {"oracle_actions": labels} if profile.oracle_actions else {}
+            yield NewHistory(stream, arrays | {"expert_actions": labels} | wanted)
+
+    return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
+
+
+def _ppo_task(
+    found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: Mapping[str, Path]
+) -> NewTask:
+    """A task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
+    task = found.task
+    for number, folder in enumerate(found.folders):
+        title = f"{task.layout.name} with {task.teammate_kind}" + f", learner {number}" * (len(found.folders) > 1)
+        plot_filter(folder / FILTER_CURVES, title, found.returns[number], found.returns[number][found.streams[number]])
+    labeller = choose_labeller(found.folders, task, suite)
+    expert = ExpertLabels(
+        policy_sha256=labeller.sha256,
+        action="greedy, recurrent",
+        step=labeller.step,
+        return_greedy=labeller.return_greedy,
+        return_sampled=labeller.return_sampled,
+        episodes=LABEL_EPISODES,
+        last_return_greedy=labeller.last_return_greedy,
+    )
+    effect = filter_report(found.recorded, found.kept, found.least_improvement)
+
+    def load() -> Iterator[NewHistory]:
+        network, params, _ = load_policy(labeller.folder)
+        for learner, stream, arrays in _recorded_histories(found):
+            (labels,) = relabel(task.layout, network, params, [arrays["state"]])
+            wanted = {"expert_actions": labels}
+            if profile.oracle_actions:
+                (wanted["oracle_actions"],) = oracle_labels(task.layout, [arrays["state"]], [arrays["actions"]])
+            yield NewHistory(stream, arrays | wanted, learner)
+
+    policies = expert_files(labeller.folder, labeller.sha256) if profile.policies else {}
+    return NewTask(task, replace(made, expert=expert, filter=effect), len(found.kept), load, files | policies)
+
+
+def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+    """Yields learner, stream, and recorded arrays of the kept histories, which are read when they are used."""
+    for learner, (folder, streams) in enumerate(zip(found.folders, found.streams, strict=True)):
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields}
+        dones = episode_ends(arrays["actions"].shape[1], KEPT_STEPS)
+        for stream in streams.tolist():
+            yield learner, stream, {name: array[stream] for name, array in arrays.items()} | {"dones": dones}

@@ -27,6 +27,7 @@ from generation.teammates.references import player_in_some, reference_egos, stac
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, TESTED_ON
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
@@ -35,20 +36,6 @@ _EPISODES = 10
 """Episodes of each test instance with each of the two egos."""
 
 _SEED = 5
-
-
-class NearestTest(NamedTuple):
-    """The published test instance that acts most like a teammate.
-
-    Attributes:
-        name: the instance, such as "H3/t1".
-        distance: share of the common states on which the two act differently, 0..1.
-        behaviour: number that the teammate shares with those of its group that act like it, from 0.
-    """
-
-    name: str
-    distance: float
-    behaviour: int
 
 
 class CommonStates(NamedTuple):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
-from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -24,12 +24,6 @@ from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
 
 DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
 """Table of all draws."""
-
-SAME_BEHAVIOUR = 0.02
-"""Hamming distance below which two teammates count as one behaviour."""
-
-LEAST_HEADROOM = 5.0
-"""Difference of the reference egos' returns from which the ego matters."""
 
 DRAWS_PER_SEED = {0: 32, 1: 8}
 """base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""
@@ -75,10 +69,15 @@ class Draw(NamedTuple):
         return self.distance >= SAME_BEHAVIOUR
 
     @property
+    def spread(self) -> float:
+        """Difference of the best and the worst reference ego's return."""
+        returns = (self.stay, self.random, self.oracle)
+        return max(returns) - min(returns)
+
+    @property
     def headroom(self) -> bool:
         """Whether the ego matters."""
-        returns = (self.stay, self.random, self.oracle)
-        return max(returns) - min(returns) >= LEAST_HEADROOM
+        return self.spread >= LEAST_HEADROOM
 
 
 def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
@@ -104,7 +103,7 @@ def drawn_teammates(
 
     The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
     layout, of any family, has headroom. Each family first gives one draw of every behaviour, then its other draws, both
-    by theta_id.
+    by how much the ego matters with them and by theta_id.
 
     Args:
         layout: a training layout.
@@ -163,7 +162,7 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
             f"name other families ({_hosted_text(layout, base_seed)})"
         )
     first = {draw.behaviour: draw for draw in reversed(draws)}
-    return sorted(draws, key=lambda draw: (first[draw.behaviour] != draw, draw.theta_id))
+    return sorted(draws, key=lambda draw: (first[draw.behaviour] != draw, -draw.spread, draw.theta_id))
 
 
 def _usable(layout: str, family: str, base_seed: int) -> list[Draw]:

@@ -18,13 +18,15 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
-EPISODES = 20
+REFERENCE_EPISODES = 20
 """Episodes over which the return of a reference ego is measured."""
 
 _SEED = 11
 
 
-def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int = EPISODES) -> dict[str, np.ndarray]:
+def reference_returns(
+    layout: Layout, teammates: Sequence[Policy], episodes: int = REFERENCE_EPISODES
+) -> dict[str, np.ndarray]:
     """Measures the reference egos with teammates, in episodes of 100 steps.
 
     All pairs play from the same starts, and a teammate's returns do not depend on the other teammates. There is one

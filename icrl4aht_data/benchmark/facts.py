@@ -74,6 +74,12 @@ PAPER_TEAMMATE_STEPS = 30_000_000
 PAPER_TEAMMATES = 20
 """Training teammates of each algorithm and layout (paper, App. B.1)."""
 
+LEAST_HEADROOM = 5.0
+"""Difference of the reference egos' returns with a teammate from which the ego matters."""
+
+SAME_BEHAVIOUR = 0.02
+"""Hamming distance below which two teammates count as one behaviour."""
+
 
 def track_of(layout: str) -> str:
     """The track whose train or test layouts include `layout` (short name).

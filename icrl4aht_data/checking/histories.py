@@ -83,6 +83,10 @@ def _history_faults(history: History, kept_steps: int, deep: bool) -> Iterator[s
         values = history.read(name)
         if values.min() < 0 or values.max() >= len(ACTIONS):
             yield f"{name}: expected 0..{len(ACTIONS) - 1}, found {values.min()}..{values.max()}"
+    if entry.source == "noise" and entry.has_expert_actions and entry.has_oracle_actions:
+        wrong = np.flatnonzero(history.read("expert_actions") != history.read("oracle_actions"))
+        if len(wrong):
+            yield f"expert_actions: {len(wrong)} differ from the script's, oracle_actions, first step {wrong[0]}"
     if (rewards != np.rint(rewards)).any() or np.abs(rewards).max() > np.iinfo(FIELDS["rewards"].compact).max:
         yield f"rewards: expected integers that fit into a byte, found {rewards.min()}..{rewards.max()}"
     possible = True

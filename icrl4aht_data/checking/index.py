@@ -40,6 +40,9 @@ def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
     _check_disjoint_teammates(tasks, report)
     if not index.entries:
         report.add(HISTORIES, "no histories")
+    for task in index.info.left_out:
+        if index.entries.code("task_id", task.task_id) is not None:
+            report.add(INFO, f"left_out: task {task.task_id!r} has histories in the index")
     _check_info(index, tasks, provenance, report)
     shards = {entry.shard for entry in index.entries}
     for shard in shards:

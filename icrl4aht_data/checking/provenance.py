@@ -63,14 +63,43 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
         yield f"seed: expected the task's {seed}, found {found.seed}"
     if found.ego is not None and found.ego_hash not in (None, json_hash(found.ego)):
         yield f"ego_hash: expected {json_hash(found.ego)} of `ego`, found {found.ego_hash}"
-    environments = None if found.ego is None else found.ego["environments"]
-    if None not in (environments, found.streams_recorded) and environments != found.streams_recorded:
-        yield f"streams_recorded: expected the learner's {environments} environments, found {found.streams_recorded}"
+    if found.source not in (None, entries[0].source):
+        yield f"source: expected {entries[0].source!r} as in the index, found {found.source!r}"
     names = found.suite and found.suite.algorithms
     names = names.get(entries[0].layout) if isinstance(names, dict) else names
     if names is not None and entries[0].teammate_kind not in names:
         yield f"suite.algorithms: {names}, but the teammate is of {entries[0].teammate_kind}"
+    yield from _noise_faults(found, entries)
+    yield from _learner_faults(found, entries)
     yield from _stream_faults(found, entries)
+
+
+def _noise_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
+    """Compare the number and the episodes of noise histories with the index."""
+    histories, episodes = ((found.noise or {}).get(name) for name in ("histories", "episodes"))
+    if histories is not None and histories < len(entries):
+        yield f"noise.histories: expected at least the {len(entries)} of the index, found {histories}"
+    for entry in entries:
+        if episodes not in (None, entry.episodes):
+            yield f"noise.episodes: expected the {entry.episodes} of history {entry.history_id}, found {episodes}"
+            return
+
+
+def _learner_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
+    """Compare the learners' number and environments with the streams that were recorded and those of the index."""
+    learners = found.learners or 1
+    last = max(entries, key=lambda entry: entry.learner)
+    if last.learner >= learners:
+        yield f"history {last.history_id}: learner {last.learner}, but learners are {learners}"
+    if found.ego is None:
+        return
+    environments = found.ego["environments"]
+    if found.streams_recorded not in (None, learners * environments):
+        each = f"the learner's {environments}" if learners == 1 else f"{environments} of each of {learners} learners'"
+        yield f"streams_recorded: expected {each} environments, found {found.streams_recorded}"
+    last = max(entries, key=lambda entry: entry.env_idx)
+    if learners > 1 and last.env_idx >= environments:
+        yield f"history {last.history_id}: env_idx {last.env_idx}, but a learner has {environments} environments"
 
 
 def _stream_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:

@@ -6,8 +6,11 @@ cell.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
+
+import numpy as np
 
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.checking.files import (
@@ -41,6 +44,13 @@ _WITHOUT_HASHES = (
     "format version {version} has no chunk hashes: reading checks chunks by CRC-32 only, which a forger can satisfy; "
     "`icrl4aht-data convert --to {kind}` writes a release with hashes"
 )
+_NOT_RECOMPUTED = {
+    "oracle_actions": "oracle actions of {count} histories: only their range was checked, not the script's choices",
+    "references": "returns of reference egos, of {count} tasks: taken from meta/provenance.json, not measured again",
+    "nearest_test": "nearest test teammates, of {count} tasks: taken from meta/provenance.json, not measured again",
+    "noise": "noise schedules, of {count} tasks: taken from meta/provenance.json, not compared with the actions",
+}
+"""Values that verification cannot compute -> what a report says of them."""
 
 
 def verify_release(
@@ -121,6 +131,8 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
     check_references(listed, index, tasks, report)
     provenance = _read_provenance(origin, report)
+    if report.level == "deep":
+        _note_what_is_believed(index, provenance or {}, report)
     if provenance is not None:
         check_provenance(index, tasks, provenance, listed, report)
     check_index(index, tasks, provenance, report)
@@ -134,6 +146,15 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         check_checkpoints(origin.folder, tasks, report)
         check_experts(origin.folder, provenance or {}, report)
         _check_shards(index, shards, report, advance)
+
+
+def _note_what_is_believed(index: Index, provenance: Mapping[str, Provenance], report: Report) -> None:
+    """Add a note on every kind of value that was not computed again."""
+    for name, note in _NOT_RECOMPUTED.items():
+        told = sum(getattr(of_task, name, None) is not None for of_task in provenance.values())
+        count = np.count_nonzero(index.entries.column("has_oracle_actions")) if name == "oracle_actions" else told
+        if count:
+            report.notes.append(note.format(count=count))
 
 
 def _read_provenance(origin: ReleaseLocation, report: Report) -> dict[str, Provenance] | None:

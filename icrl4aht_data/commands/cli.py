@@ -6,12 +6,10 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import click
 from rich.console import Console
-from rich.table import Table
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.checking.report import Report
@@ -36,11 +34,12 @@ from icrl4aht_data.commands.options import (
     run,
     version_option,
 )
+from icrl4aht_data.commands.summaries import summarize_selection, summarize_tasks, task_table
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import describe, read_info
+from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import ALL_KINDS, FORMAT_VERSION, OBSERVATIONS, Entry
+from icrl4aht_data.format.schema import ALL_KINDS, FORMAT_VERSION, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
@@ -107,40 +106,15 @@ def cli() -> None:
 def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
     """List the tasks of a release.
 
-    Prints one line per task: layout, teammate, histories, transitions, the mean return of an episode at the start and
-    at the end of learning, and what the policy earns that the expert actions come from, acting greedily ("-" where
-    nobody measured it).
+    Prints one line per task: layout, teammate, source, histories, their learners, transitions, the mean return of an
+    episode at the start and at the end of learning, and the labels: expert, with what the policy earns that they come
+    from, acting greedily (if somebody measured it), and oracle.
     """
-    by_task: dict[str, list[Entry]] = {}
-    for entry in _load(root, filters).entries:
-        by_task.setdefault(entry.task_id, []).append(entry)
-    tasks = [
-        {
-            "task_id": task_id,
-            "layout": entries[0].layout,
-            "track": entries[0].track,
-            "split": entries[0].split,
-            "teammate": f"{entries[0].teammate_family}/{entries[0].teammate_kind}",
-            "histories": len(entries),
-            "transitions": sum(entry.T for entry in entries),
-            "return_start": fmean(entry.return_start for entry in entries),
-            "return_end": fmean(entry.return_end for entry in entries),
-            "source": entries[0].source,
-            "expert_return": entries[0].expert_return,
-            "expert_return_sampled": entries[0].expert_return_sampled,
-        }
-        for task_id, entries in by_task.items()
-    ]
+    tasks = summarize_tasks(_load(root, filters).entries)
     if as_json:
         click.echo(json.dumps(tasks, indent=2))
         return
-    table = Table("layout", "track", "split", "teammate", "histories", "transitions", "return", "labels", "task")
-    for task in tasks:
-        names = (task[name] for name in ("layout", "track", "split", "teammate"))
-        returns = f"{task['return_start']:.1f} -> {task['return_end']:.1f}"
-        labels = "-" if task["expert_return"] is None else f"{task['expert_return']:.1f}"
-        table.add_row(*names, str(task["histories"]), f"{task['transitions']:,}", returns, labels, task["task_id"])
-    Console(width=None if sys.stdout.isatty() else 200, markup=False).print(table)
+    Console(width=None if sys.stdout.isatty() else 230, markup=False).print(task_table(tasks))
 
 
 @cli.command()
@@ -160,7 +134,8 @@ def show(
 ) -> None:
     """Show a release, a part of it or one history.
 
-    Prints kind, versions, counts and layouts; for one history everything in its index entry. Only --plot writes a file.
+    Prints kind, versions, counts, layouts, splits, sources and labels; for one history everything in its index entry.
+    Only --plot writes a file.
     """
     if overwrite and plot is None:
         raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
@@ -168,16 +143,7 @@ def show(
         check_new_file(plot, overwrite)
     dataset = _load(root, filters)
     if history_id is None:
-        info = dataset.info
-        facts = {
-            "root": str(dataset.origin),
-            **({"revision": remote.revision, "folder": str(dataset.root)} if (remote := dataset.origin.remote) else {}),
-            **describe(
-                info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
-            ).to_json(),
-            **({"missing": missing} if (missing := _missing(dataset)) else {}),
-            "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
-        }
+        facts = summarize_selection(dataset)
     else:
         dataset = dataset.select([history_id])
         facts = {
@@ -196,17 +162,6 @@ def show(
         click.echo(repr(dataset))
     for name, value in facts.items():
         click.echo(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
-
-
-def _missing(dataset: Dataset) -> list[str]:
-    """Return the parts of a full or lite release that this one does not have, in words."""
-    without = len(dataset) - int(dataset.column("has_teammate_actions").sum())
-    missing = {
-        "state records: nothing can be replayed or drawn, obs='state' is refused": not dataset.has_states,
-        "tasks: teammates are known by family and kind only": not dataset.knows_tasks,
-        f"teammate actions of {without} histories": without > 0,
-    }
-    return [what for what, is_missing in missing.items() if is_missing]
 
 
 @cli.command(
@@ -261,7 +216,7 @@ def download(
 @click.option("--quick", is_flag=True, help="Check only names, sizes and the index.")
 @click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
 @click.option("--repair", is_flag=True, help="Fetch damaged and missing files again, then verify once more.")
-@click.option("--from", "source", metavar="ADDRESS", help="Repair from here.", show_default="the origin of ROOT")
+@click.option("--from", "origin", metavar="ADDRESS", help="Repair from here.", show_default="the origin of ROOT")
 @quiet_option
 @json_option
 def verify(
@@ -269,7 +224,7 @@ def verify(
     quick: bool,
     deep: bool,
     repair: bool,
-    source: str | None,
+    origin: str | None,
     quiet: bool,
     as_json: bool,
     **filters: tuple[str, ...],
@@ -282,16 +237,16 @@ def verify(
     if quick and (deep or repair):
         raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
     level = "quick" if quick else "deep" if deep else "full"
-    if source and not repair:
+    if origin and not repair:
         raise click.UsageError("--from is the source of a repair: give --repair with it")
     wanted = _wanted(filters)
     with bars(quiet) as advance:
         report = verify_release(root, level=level, advance=advance, **wanted)
         if repair and not report.ok:
-            if root is None and source is None:
+            if root is None and origin is None:
                 raise OptionError("the bundled release is repaired by installing the package again")
             first = report
-            outcome, traffic = repair_files(MINI if root is None else root, first.files_at_fault, source=source)
+            outcome, traffic = repair_files(MINI if root is None else root, first.files_at_fault, source=origin)
             report = verify_release(root, level=level, advance=advance, **wanted)
             report.repaired = [name for name, error in outcome.items() if error is None]
             report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
@@ -328,7 +283,7 @@ def _verdict(report: Report) -> str:
         "icrl4aht-data convert path/to/published --out lite",
     )
 )
-@click.argument("source", type=Root())
+@click.argument("root", type=Root(), metavar="SOURCE")
 @click.option(
     "--out",
     "target",
@@ -351,7 +306,7 @@ def _verdict(report: Report) -> str:
 @filter_options
 @quiet_option
 def convert(
-    source: str | Path,
+    root: str | Path,
     target: Path,
     overwrite: bool,
     form: str | None,
@@ -371,11 +326,11 @@ def convert(
     with bars(quiet) as show:
         advance = partial(show, "histories")
         advance(0, None)  # the total is not known yet
-        if isinstance(source, Path) and (source / HISTORIES_H5).exists():
+        if isinstance(root, Path) and (root / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, without filters")
             form = from_published(
-                source,
+                root,
                 target,
                 form,
                 tasks=tasks,
@@ -385,14 +340,14 @@ def convert(
                 advance=advance,
             )
         else:
-            dataset = _load(source, filters)
+            dataset = _load(root, filters)
             if form is None and dataset.info.format_version < FORMAT_VERSION:
                 form = dataset.info.kind
             if form is None:
                 raise click.UsageError("give the form to convert to: --to full, lite, observations, published, parquet")
             if tasks or family_map or kept_steps != KEPT_STEPS:
                 raise click.UsageError(
-                    f"{source} is a release: --tasks, --family-map and --kept-steps are for published files"
+                    f"{root} is a release: --tasks, --family-map and --kept-steps are for published files"
                 )
             if form in ALL_KINDS:
                 to_release(dataset, target, form, overwrite=overwrite, advance=advance)

@@ -204,6 +204,7 @@ def filter_options(command: Any) -> Any:
         click.option(
             "--teammate-kind", multiple=True, metavar="KIND", help="Only this kind, such as utility_greedy or fcp."
         ),
+        click.option("--source", multiple=True, metavar="NAME", help="Only histories of this source: ppo or noise."),
     ]
     for option in reversed(options):
         command = option(command)

@@ -43,10 +43,12 @@ class StreamFilter:
     Args:
         before: all recorded streams.
         after: the streams that the release keeps.
+        least_improvement: how much a stream's end had to exceed its start; None where it did not have to.
     """
 
     before: StreamReturns
     after: StreamReturns
+    least_improvement: _Return | None = None
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ class Provenance:
     def to_json(self) -> dict[str, Any]:
         """The object to write, without what was not recorded."""
         content = _recorded(asdict(self))
-        for name in {"expert", "nearest_test", "suite"} & content.keys():
+        for name in {"expert", "filter", "nearest_test", "suite"} & content.keys():
             content[name] = _recorded(content[name])
         if self.expert is not None:  # null says that the labels come from a script
             content["expert"] = {"policy_sha256": self.expert.policy_sha256} | content["expert"]

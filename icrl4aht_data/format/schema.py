@@ -179,8 +179,8 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return_mean: mean return of all episodes.
         source: how the history was made: a name in `facts.SOURCES`, or another one.
         expert_return: mean return of 200 episodes of 100 steps of the policy that the expert actions come from, acting
-            greedily with the task's teammate; None where it was not measured. All histories of a task agree in this
-            and the next two fields.
+            greedily with the task's teammate, or of a script in `ExpertLabels.episodes`; None where it was not
+            measured. All histories of a task agree in this and the next two fields.
         expert_return_sampled: the mean return with sampled actions.
         expert_step: environment steps that the policy was trained for; None where it is unknown, or for a script.
         learner: which of the task's independent learners made the history, from 0.

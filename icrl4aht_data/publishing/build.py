@@ -25,12 +25,12 @@ from icrl4aht_data.utils.files import parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import files_below
 from icrl4aht_data.utils.templates import card_file, fill_template
+from icrl4aht_data.writing.card_content import PARQUET_INDEX
 from icrl4aht_data.writing.dataset_card import (
     CURVES_FIGURE,
     HEADROOM_FIGURE,
     HEADROOM_PROTOCOL,
     LAYOUTS_FIGURE,
-    PARQUET_INDEX,
     RELEASE_CARD,
     SOURCE_CARD,
     dataset_card,

@@ -22,6 +22,12 @@ OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
 """Presentations of observations: float32 (the paper's interface), uint8 (the same integers), or the state records that
 `icrl4aht_data.overcooked.observe` renders, if the release has them."""
 
+Labels = Literal["expert", "oracle"]
+LABELS: tuple[Labels, ...] = ("expert", "oracle")
+"""Kinds of labels, actions that a model learns to predict at any step: "expert", those of the policy that
+`Entry.expert_return` describes, acting greedily, or "oracle", those of the scripted oracle, which knows the full state.
+They are the fields `expert_actions` and `oracle_actions`."""
+
 
 class History:
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
@@ -54,7 +60,8 @@ class History:
             f"History({e.history_id}: {e.layout} with {e.teammate_kind}, T={e.T}, {e.episodes} episodes, "
             f"return {e.return_start:.1f} -> {e.return_end:.1f}"
             + ("" if e.expert_return is None else f", labels {e.expert_return:.1f}")
-            + (")" if e.source == "ppo" else f", source {e.source})")
+            + f", source {e.source}"
+            + (f", learner {e.learner})" if e.learner else ")")
         )
 
     @property
@@ -73,7 +80,7 @@ class History:
 
         Raises:
             UnknownNameError: for a name that is not a field.
-            LabelsMissingError: for expert or teammate actions of a history without them.
+            LabelsMissingError: for expert, oracle or teammate actions of a history without them.
             NotStoredError: for states of a release without state records.
             ShardCorruptError: names the chunk whose checksum is wrong.
         """
@@ -170,6 +177,14 @@ class History:
         `entry.expert_step`.
         """
         return self._lazy("expert_actions")
+
+    @property
+    def oracle_actions(self) -> LazyArray:
+        """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
+
+        In a history of source "noise" these are what the ego meant to do: its actions without the noise.
+        """
+        return self._lazy("oracle_actions")
 
     @property
     def episode_end_state(self) -> LazyArray:

@@ -12,10 +12,11 @@ import numpy as np
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, Entry
+from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.reading.history import OBS, History, Obs
+from icrl4aht_data.reading.history import LABELS, OBS, History, Obs
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import (
     CACHE_MODES,
@@ -161,6 +162,11 @@ class Selection:
         """The release's versions, kind, environment and totals, as in meta/info.json."""
         return self.index.info
 
+    @cached_property
+    def provenance(self) -> dict[str, Provenance]:
+        """How the histories of each task of the release were made, as in meta/provenance.json: task id -> record."""
+        return read_provenance(self.origin.file(PROVENANCE))
+
     @property
     def has_states(self) -> bool:
         """Whether the release has state records; a release of observations has none."""
@@ -190,9 +196,44 @@ class Selection:
         canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
+            f"{self._named_counts('split')}; {self._named_counts('source')}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}{canonical}; "
             f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
         )
+
+    def _named_counts(self, name: str) -> str:
+        """The values of an index field in words, such as "source ppo" or "sources ppo (120), noise (64)"."""
+        counts = self.counts(name)
+        if len(counts) == 1:
+            return f"{name} {next(iter(counts))}"
+        return f"{name}s " + ", ".join(f"{value} ({number})" for value, number in counts.items())
+
+    def counts(self, name: str) -> dict[str, int]:
+        """Return the number of histories with each value of an index field of names, such as "split" or "source".
+
+        Args:
+            name: the field; or "labels", which counts histories with expert and with oracle actions.
+
+        Returns:
+            Value -> number of histories, above 0; values in order of first appearance in the release.
+
+        Raises:
+            UnknownNameError: if there is no such field of names.
+        """
+        if name == "labels":
+            found = {kind: int(self.column(f"has_{kind}_actions").sum()) for kind in LABELS}
+            return {kind: number for kind, number in found.items() if number}
+        field = ALIASES.get(name, name)
+        if ENTRY_HINTS.get(field) is not str:
+            raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of is str)))
+        numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
+        return {value: number for value, number in zip(self.index.values(field), numbers, strict=False) if number}
+
+    def describe(self) -> str:
+        """Return the selection as text, one fact per line: numbers of histories by split, source, layout and others."""
+        fields = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
+        counts = {name: ", ".join(f"{value} ({n})" for value, n in self.counts(name).items()) for name in fields}
+        return "\n".join([repr(self), *(f"{name}: {text or 'none'}" for name, text in counts.items())])
 
     def history(self, history_id: int) -> History:
         """Return one history of the release, whether selected or not.
@@ -330,19 +371,26 @@ class Selection:
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 
-    def filter(self, *, min_expert_return: float | None = None, **wanted: FilterValues) -> Self:
+    def filter(
+        self,
+        *,
+        min_expert_return: float | None = None,
+        learner: int | Sequence[int] | None = None,
+        **wanted: FilterValues,
+    ) -> Self:
         """Return the histories of this selection whose index fields have one of the wanted values.
 
         Args:
             min_expert_return: only histories whose labels come from a policy that earned at least this much, acting
                 greedily: `Entry.expert_return`.
+            learner: only histories of these learners, numbered from 0 within each task: `Entry.learner`.
             wanted: field=value, several values, or None for any: split, layout, track, teammate_family, teammate_kind
                 (or algorithm, which is the same), source or task_id, as in `load_icrl4aht`.
 
         Raises:
             UnknownNameError: for a field or value that does not exist.
             EmptySelectionError: if no history is left.
-            OptionError: if `min_expert_return` is not a number.
+            OptionError: if `min_expert_return` is not a number, or `learner` not an integer or several.
             NotStoredError: for `min_expert_return`, if of some history that is left it is not known.
         """
         matching = self.index.query(**wanted)
@@ -350,7 +398,24 @@ class Selection:
         if not len(ids):
             raise EmptySelectionError(f"{self.root}: no history of this selection has {wanted}; it is {self!r}")
         found = type(self)(self.origin, self.index, self._shards, self.options, ids)
+        if learner is not None:
+            found = found._of_learners(learner)
         return found if min_expert_return is None else found._earning(min_expert_return)
+
+    def _of_learners(self, wanted: int | Sequence[int]) -> Self:
+        """The histories of some learners; see `filter`."""
+        numbers = np.atleast_1d(np.asarray(wanted))
+        if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
+            raise OptionError(f"learner = {wanted!r}: expected the number of a task's learner, from 0, or several")
+        learners = self.column("learner")
+        kept = np.isin(learners, numbers)
+        if not kept.any():
+            known = ", ".join(map(str, np.unique(learners).tolist()))
+            raise EmptySelectionError(
+                f"{self.root}: no history of this selection has learner = {wanted!r}; its learners: {known}; it is "
+                f"{self!r}"
+            )
+        return self.select(kept)
 
     def _earning(self, least: float) -> Self:
         """The histories whose labels come from a policy that earned at least so much; see `filter`."""

@@ -8,7 +8,9 @@ from typing import Any, Literal, NamedTuple, Unpack
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, OptionError, WeakLabelsWarning, unknown
+from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import are_labels_weak
+from icrl4aht_data.reading.history import LABELS, Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
 from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
@@ -29,7 +31,8 @@ class DPTBatch(NamedTuple):
 
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
-        query_target: int32 (B,): the expert's action at the query step, 0..5, which a model learns to predict.
+        query_target: int32 (B,): the label of the query step, an expert's or the oracle's action 0..5, which a model
+            learns to predict.
         context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
         context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
         context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations after them, in the same episode.
@@ -65,22 +68,23 @@ class DPTSampler(Sampler[DPTBatch]):
     stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
 
     Args:
-        dataset: a selection whose histories all have expert actions, with observations of one shape: of layouts with as
-            many channels, or channels="canonical".
+        dataset: a selection whose histories all have the wanted labels, with observations of one shape: of layouts with
+            as many channels, or channels="canonical".
         batch_size: B, over all processes.
         context: K, in transitions.
         order: "contiguous" or "random".
+        labels: "expert" or "oracle"; see `history.LABELS`.
         options: options shared with `ADSampler`: `seed`; `teammate_actions`, whether batches have
             `context_teammate_actions`; `weights`, probabilities of the histories of a task; `episodes` and
             `curriculum`, the part of each history that queries and contexts are drawn from; `process_index` and
             `process_count`.
 
     Warns:
-        WeakLabelsWarning: for tasks whose expert actions come from a policy that earns less than half of what their
-            histories earn at the end, as far as the release says what it earns.
+        WeakLabelsWarning: for tasks whose labels are actions of a policy, or of the oracle, that earns less than half
+            of what their histories earn at the end, as far as the release says what it earns.
 
     Raises:
-        LabelsMissingError: if a history has no expert actions.
+        LabelsMissingError: if a history does not have these labels; says which labels the selection has.
         OptionError: for impossible options, a selection with observations of several shapes, or contiguous contexts
             longer than some history, or than the part of it that `episodes` or `curriculum` selects.
     """
@@ -95,27 +99,23 @@ class DPTSampler(Sampler[DPTBatch]):
         batch_size: int,
         context: int,
         order: ContextOrder = "contiguous",
+        labels: Labels = "expert",
         **options: Unpack[SamplerOptions],
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         if order not in CONTEXT_ORDERS:
             raise unknown("order", order, CONTEXT_ORDERS)
-        unlabelled = dataset.ids[~dataset.column("has_expert_actions")]
-        if len(unlabelled):
-            raise LabelsMissingError(
-                f"DPT needs expert actions, but {len(unlabelled)} of {len(dataset)} histories have none "
-                f"(first: {unlabelled[0]}); select labelled ones: entry.has_expert_actions"
-            )
+        self.labels = check_labels(dataset, labels)
         ranges = (map(self._transitions, self._draws.steps(i)) for i in (0, 2**62))  # a curriculum's first and last
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
         self.order: ContextOrder = order
-        _warn_of_weak_labels(dataset)
+        _warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
         excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
-        return super().options() | {"order": self.order} | excluded
+        return super().options() | {"order": self.order, "labels": self.labels} | excluded
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
@@ -145,7 +145,7 @@ class DPTSampler(Sampler[DPTBatch]):
         else:
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
         reads = [
-            ReadRequest("expert_actions", query, query_step, batch.query_target[:, None]),
+            ReadRequest(f"{self.labels}_actions", query, query_step, batch.query_target[:, None]),
             ReadRequest(observer.field, query, query_step, query_records[:, None]),
             ReadRequest("actions", context, rows, batch.context_actions),
             ReadRequest("rewards", context, rows, batch.context_rewards),
@@ -217,30 +217,65 @@ class DPTSampler(Sampler[DPTBatch]):
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
 
 
+def check_labels(dataset: Selection, labels: Labels) -> Labels:
+    """Check that all histories of a selection have these labels.
+
+    Returns:
+        The labels.
+
+    Raises:
+        UnknownNameError: for labels that do not exist.
+        LabelsMissingError: if a history does not have them; says which labels the selection has.
+    """
+    if labels not in LABELS:
+        raise unknown("labels", labels, LABELS)
+    has = {name: dataset.column(f"has_{name}_actions") for name in LABELS}
+    if has[labels].all():
+        return labels
+    total, missing = len(dataset), np.flatnonzero(~has[labels])
+    choices = [f"take {name} as labels, which all have" for name in LABELS if has[name].all()] or [
+        "choose histories or a release with labels"
+    ]
+    if has[labels].any():
+        sources = " and ".join(sorted(set(dataset.column("source")[has[labels]].tolist())))
+        choices.append(f"choose the {total - len(missing)} with {labels} actions (source {sources})")
+    others = " and ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS if name != labels)
+    raise LabelsMissingError(
+        f"labels = {labels}: {len(missing)} of {total} histories have no {labels} actions (first: history "
+        f"{dataset.ids[missing[0]]}), {others}: {', or '.join(choices)}"
+    )
+
+
 _NAMED = 5  # tasks that a warning names
 
 
-def _warn_of_weak_labels(dataset: Selection) -> None:
+def _warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     """Warn of tasks whose labels come from a policy that earns less than half of what their histories earn at the end.
 
     The end is the mean of `return_end` over a task's selected histories, see `schema.are_labels_weak`.
     """
     codes, first, task = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     ends = np.bincount(task, dataset.column("return_end")) / np.bincount(task)
-    greedy, sampled = (dataset.column(name)[first] for name in ("expert_return", "expert_return_sampled"))
-    weak = np.flatnonzero(are_labels_weak(greedy, ends))
+    values = dataset.index.values("task_id")
+    names = [values[code] for code in codes.tolist()]
+    if labels == "expert":
+        earned, sampled = (dataset.column(name)[first] for name in ("expert_return", "expert_return_sampled"))
+        texts = [f"labels {one:.1f}, sampled {other:.1f}" for one, other in zip(earned, sampled, strict=True)]
+        advice = "leave these tasks out by min_expert_return, or select by ds.column('expert_return')"
+    else:
+        references = [(dataset.provenance.get(name) or Provenance()).references for name in names]
+        earned = np.array([np.nan if one is None else one.oracle for one in references])
+        texts = [f"labels {one:.1f}" for one in earned]
+        advice = "leave these tasks out, or take expert as labels"
+    weak = np.flatnonzero(are_labels_weak(earned, ends))
     if not len(weak):
         return
-    names = dataset.index.values("task_id")
-    named = ", ".join(
-        f"{names[codes[k]]} (labels {greedy[k]:.1f}, sampled {sampled[k]:.1f}, histories {ends[k]:.1f})"
-        for k in weak[:_NAMED].tolist()
-    )
+    named = ", ".join(f"{names[k]} ({texts[k]}, histories {ends[k]:.1f})" for k in weak[:_NAMED].tolist())
     more = f" and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
+    player = "a policy that earns, acting greedily," if labels == "expert" else "the oracle, which earns"
     warnings.warn(
-        f"the expert actions of {len(weak)} of {len(codes)} tasks come from a policy that earns, acting greedily, less "
-        f"than half of what their histories earn at the end: {named}{more}. A model would learn to play worse than its "
-        f"contexts: leave these tasks out by min_expert_return, or select by ds.column('expert_return')",
+        f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} less than half of what their "
+        f"histories earn at the end: {named}{more}. A model would learn to play worse than its contexts: {advice}",
         WeakLabelsWarning,
         stacklevel=4,  # the call of Dataset.dpt
     )

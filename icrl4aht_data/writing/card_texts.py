@@ -14,7 +14,8 @@ def card_texts(section: str) -> dict[str, str]:
     """Return a section of the file, name -> text.
 
     Args:
-        section: "sentences", "kinds" (of release), "arrays" (`schema.FIELDS`) or "index" (fields of `schema.Entry`).
+        section: "sentences", "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`) or "index"
+            (fields of `schema.Entry`).
     """
     return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
 
@@ -22,3 +23,8 @@ def card_texts(section: str) -> dict[str, str]:
 def sentence(name: str, **values: object) -> str:
     """Return a sentence with every $name replaced by its value."""
     return Template(card_texts("sentences")[name].strip("\n")).substitute(values)
+
+
+def count_in_words(number: int, noun: str) -> str:
+    """Return a number and a noun, such as "1 task" or "1,200 tasks"."""
+    return f"{number:,} {noun}" + "s" * (number != 1)

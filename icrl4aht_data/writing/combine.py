@@ -50,14 +50,17 @@ def combine_releases(
     check_target(target, overwrite, roots)
     datasets = [load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)
-    first = datasets[0].info
+    first, tasks = datasets[0].info, _tasks(datasets)
+    written = {new.task.task_id for new in tasks}
+    left_out = dict.fromkeys(task for dataset in datasets for task in dataset.info.left_out)
     return write_release(
         target,
         first.kind,
-        _tasks(datasets),
+        tasks,
         data_version=data_version or _common_version(datasets),
         source_card=_source_card(datasets),
         kept_steps=first.environment.kept_steps,
+        left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,
         sources=roots,
         done=done,
@@ -80,19 +83,23 @@ def _check_compatible(datasets: Sequence[Dataset]) -> None:
 
 
 def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
-    owners: dict[str, str] = {}
+    owners: dict[str, tuple[str, str]] = {}
     tasks = []
     for dataset in datasets:
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
         for task in release_tasks(dataset):
-            if task.task_id in owners:
-                raise OptionError(
-                    f"{dataset.origin}: task {task.task_id} is also in {owners[task.task_id]}; leave one of them out"
-                )
-            owners[task.task_id] = str(dataset.origin)
             histories = dataset.select(dataset.index.query(task_id=task.task_id))
-            source = provenance.get(task.task_id, Provenance())
-            tasks.append(stored_task(histories, task, source, dataset.info.kind))
+            source, (owner, other) = histories[0].entry.source, owners.get(task.task_id, ("", ""))
+            if other not in ("", source):
+                raise OptionError(
+                    f"{dataset.origin}: task {task.task_id} is of source {source!r}, but in {owner} of {other!r}: a "
+                    f"task has one source; leave one of them out, or generate it with another seed"
+                )
+            if owner:
+                raise OptionError(f"{dataset.origin}: task {task.task_id} is also in {owner}; leave one of them out")
+            owners[task.task_id] = str(dataset.origin), source
+            made = provenance.get(task.task_id, Provenance())
+            tasks.append(stored_task(histories, task, made, dataset.info.kind))
     return tasks
 
 

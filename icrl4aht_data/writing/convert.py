@@ -64,6 +64,7 @@ def to_release(
         data_version=dataset.info.data_version,
         source_card=read_text(dataset.origin.file(SOURCE_CARD)) if SOURCE_CARD in listed else None,
         kept_steps=dataset.info.environment.kept_steps,
+        left_out=[task for task in dataset.info.left_out if task.layout in {one.name for one in dataset.layouts}],
         overwrite=overwrite,
         sources=[dataset.root],
     )

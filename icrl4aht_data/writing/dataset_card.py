@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
     FAMILIES,
-    KEPT_STEPS,
-    LABEL_EPISODES,
+    LEAST_HEADROOM,
     PAPER_EGO_STEPS,
     PAPER_TEAMMATE_STEPS,
     PAPER_TEAMMATES,
+    SAME_BEHAVIOUR,
     SPLITS,
     TRACKS,
 )
 from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
-from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.provenance import Provenance, TeammateSuite, read_provenance
-from icrl4aht_data.format.schema import FIELDS, KINDS, PROVENANCE, TASKS, Entry, are_labels_weak
+from icrl4aht_data.format.provenance import Provenance, TeammateSuite
+from icrl4aht_data.format.schema import FIELDS, KINDS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.paths import files_below
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
-from icrl4aht_data.writing.card_texts import card_texts, sentence
+from icrl4aht_data.writing.card_content import PARQUET_INDEX, CardContent, mean_rise, read_content
+from icrl4aht_data.writing.card_tables import (
+    curves_table,
+    have_weak_labels,
+    labels_table,
+    left_out_table,
+    range_in_words,
+    teammate_name,
+    teammates_table,
+)
+from icrl4aht_data.writing.card_texts import card_texts, count_in_words, sentence
 from icrl4aht_data.writing.statistics import layout_statistics, statistics_rows
 
 RELEASE_CARD = "README.md"
@@ -45,9 +48,6 @@ CURVES_FIGURE, LAYOUTS_FIGURE, HEADROOM_FIGURE = (
 )
 """Figures of a release that is built for publication."""
 
-PARQUET_INDEX = "index"
-"""Folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""
-
 SOURCE_CARD = "meta/source_card.md"
 """Cards of the releases that a release was combined from, or its own earlier card if this template did not make it."""
 
@@ -56,42 +56,8 @@ _SIZE_NAMES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1
 
 _NO_SHARED_ROOM = ("coord_simple", "test_simple")
 
-
-@dataclass(frozen=True)
-class CardContent:
-    """The parts of a release that its card describes.
-
-    Args:
-        info: meta/info.json.
-        entries: the index.
-        tasks: the tasks; empty if they are unknown.
-        provenance: task id -> how its histories were made.
-        files: paths in the release; the card refers to those figures, Parquet files and source cards that are there.
-    """
-
-    info: ReleaseInfo
-    entries: Sequence[Entry]
-    tasks: Sequence[Task]
-    provenance: Mapping[str, Provenance]
-    files: frozenset[str] = field(default_factory=frozenset)
-
-    @property
-    def has_parquet(self) -> bool:
-        """Whether the release has the index as Parquet files."""
-        return any(name.startswith(f"{PARQUET_INDEX}/") for name in self.files)
-
-    def distinct(self, name: str) -> list[Any]:
-        """Return the values of a field of the tasks' provenance, each once."""
-        values = [getattr(of_task, name) for of_task in self.provenance.values()]
-        found = {json.dumps(value, default=asdict): value for value in values if value is not None}
-        return [found[text] for text in sorted(found)]
-
-    def groups(self, *names: str) -> dict[tuple[str, ...], list[Entry]]:
-        """Return the index entries grouped by the values of some fields, in order of first appearance."""
-        groups: dict[tuple[str, ...], list[Entry]] = {}
-        for entry in self.entries:
-            groups.setdefault(tuple(getattr(entry, name) for name in names), []).append(entry)
-        return groups
+CLEAR_RISE = 10
+"""What the end of a task's histories should exceed their start by where the ego matters: half a delivery."""
 
 
 def dataset_card(root: Path) -> str:
@@ -103,9 +69,7 @@ def dataset_card(root: Path) -> str:
     Raises:
         ReleaseError: if the release cannot be read.
     """
-    index, provenance = read_index(root), read_provenance(root / PROVENANCE)
-    files = frozenset(files_below(root))
-    return render_card(CardContent(index.info, list(index.entries), read_tasks(root / TASKS), provenance, files))
+    return render_card(read_content(root))
 
 
 def render_card(release: CardContent) -> str:
@@ -127,8 +91,11 @@ def render_card(release: CardContent) -> str:
         viewer=" The dataset viewer shows the index, one row per history." if parquet else "",
         limits=_bullets(_limits(release)),
         statistics=markdown_table(["property", *statistics], statistics_rows(statistics), right=len(statistics)),
+        made=_bullets(_sources(release)),
+        curves=_figure(release, CURVES_FIGURE, "Learning curves") + curves_table(release),
+        teammates=teammates_table(release),
+        left_out=left_out_table(info.left_out),
         labels=_labels(release),
-        curves=_figure(release, CURVES_FIGURE, "Learning curves") + _curves_table(release),
         layouts=_figure(release, LAYOUTS_FIGURE, layouts_caption) + _layouts_table(release),
         protocol=HEADROOM_PROTOCOL,
         headroom=_figure(release, HEADROOM_FIGURE, "Headroom") + headroom,
@@ -182,39 +149,86 @@ def _facts(release: CardContent) -> list[str]:
     teammates = [f"the heuristic {family} (`{min(found[family])}`)" for family in FAMILIES[1:] if family in found]
     if algorithms := [name for name in ALGORITHMS if name in found.get("rl", ())]:
         teammates.append(f"policies learned by {', '.join(algorithms)}, which act greedily")
-    labelled = sum(entry.has_expert_actions for entry in entries)
+    sources = [f"`{source}` ({len(members):,} histories)" for (source,), members in release.groups("source").items()]
     return [
         sentence(
             "size",
             histories=f"{len(entries):,}",
-            tasks=f"{len({entry.task_id for entry in entries}):,}",
+            tasks=f"{len(release.histories):,}",
             transitions=f"{info.transitions:,}",
             length=f"{shortest:,}" if shortest == longest else f"{shortest:,} to {longest:,}",
         ),
+        sentence("sources_found", names=", ".join(sources)),
         sentence("layouts", names=", ".join(info.layouts)),
         sentence("teammates", names="; ".join(teammates)),
         sentence("episodes", max_steps=info.environment.max_steps, kept_steps=info.environment.kept_steps),
-        sentence("expert", histories="every history" if labelled == len(entries) else f"{labelled:,} histories"),
+        sentence(
+            "labels_found",
+            expert=_share_in_words(sum(entry.has_expert_actions for entry in entries), len(entries)),
+            oracle=_share_in_words(sum(entry.has_oracle_actions for entry in entries), len(entries)),
+        ),
         sentence("kind", kind=info.kind, stored=card_texts("kinds")[info.kind], format_version=info.format_version),
     ]
 
 
+def _share_in_words(number: int, total: int) -> str:
+    return "every history" if number == total else f"{number:,} histories" if number else "none"
+
+
+def _sources(release: CardContent) -> Iterable[str]:
+    """Yield for each source what its histories are, and what they are not."""
+    texts = card_texts("sources")
+    for (source,), _ in release.groups("source").items():
+        yield f"`{source}`: " + texts.get(source, texts["other"]).strip("\n")
+
+
 def _limits(release: CardContent) -> list[str]:
-    limits = []
-    if families := {entry.teammate_family for entry in release.entries if entry.split != "test"} - {"rl"}:
-        limits.append(sentence("heuristics_in_training", families=", ".join(sorted(families))))
-    limits += [*_missing_teammates(release), *_smaller_scale(release)]
+    limits = [*_heuristics_in_training(release), *_missing_teammates(release), *_smaller_scale(release)]
     if release.info.kind not in KINDS:
         limits.append(sentence("not_replayable"))
+    if flat := [layout for layout, has in release.headroom.items() if not has]:
+        limits.append(sentence("no_headroom", layouts=", ".join(flat), least=f"{LEAST_HEADROOM:g}"))
     if rooms := [name for name in _NO_SHARED_ROOM if name in release.info.layouts]:
         button = sentence("button") if "coord_simple" in rooms else ""
         limits.append(sentence("no_shared_room", layouts=" and ".join(rooms), button=button))
-    limits.append(sentence("dependent_streams"))
+    sources = {source for (source,) in release.groups("source")}
+    if "ppo" in sources:
+        limits.append(sentence("dependent_streams"))
+    if "noise" in sources:
+        limits.append(sentence("noise_is_no_learning"))
     if release.distinct("filter"):
         limits.append(sentence("filtered"))
-    if weak := sum(_labels_are_weak(members) for members in release.groups("task_id").values()):
-        limits.append(sentence("weak_limit", weak=_tasks_in_words(weak)))
+    limits += _flat_tasks(release)
+    if weak := sum(map(have_weak_labels, release.histories.values())):
+        limits.append(sentence("weak_limit", weak=count_in_words(weak, "task")))
     return limits
+
+
+def _heuristics_in_training(release: CardContent) -> Iterable[str]:
+    """Yield limits about heuristics among the teammates of histories that models are trained on."""
+    families: dict[bool, set[str]] = {True: set(), False: set()}
+    for members in release.histories.values():
+        first, of_task = members[0], release.provenance.get(members[0].task_id, Provenance())
+        if first.split != "test" and first.teammate_family != "rl":
+            near = of_task.nearest_test
+            families[near is not None and near.distance >= SAME_BEHAVIOUR].add(first.teammate_family)
+    if families[True]:
+        yield sentence("drawn_in_training", families=", ".join(sorted(families[True])), least=f"{SAME_BEHAVIOUR:g}")
+    if families[False]:
+        yield sentence("heuristics_in_training", families=", ".join(sorted(families[False])))
+
+
+def _flat_tasks(release: CardContent) -> Iterable[str]:
+    """Yield a limit that names the tasks on layouts with headroom whose histories hardly rise."""
+    names = {task.task_id: teammate_name(task) for task in release.tasks}
+    flat = [
+        f"{members[0].layout} with {names.get(task_id, members[0].teammate_kind)} ({members[0].source}, "
+        f"{mean_rise(members):z.1f})"
+        for task_id, members in release.histories.items()
+        if release.headroom.get(members[0].layout) and mean_rise(members) < CLEAR_RISE
+    ]
+    if flat:
+        yield sentence("flat_tasks", tasks=count_in_words(len(flat), "task"), names=", ".join(flat), rise=CLEAR_RISE)
 
 
 def _missing_teammates(release: CardContent) -> Iterable[str]:
@@ -264,50 +278,10 @@ def _figure(release: CardContent, path: str, caption: str) -> str:
     return f"![{caption}]({path})\n\n" if path in release.files else ""
 
 
-def _curves_table(release: CardContent) -> str:
-    filters = {task_id: of_task.filter for task_id, of_task in release.provenance.items() if of_task.filter}
-    filtered = all(entry.task_id in filters for entry in release.entries)
-    header = ["layout", "split", "teammate", "tasks", "histories", "first", "last"]
-    header += ["last, before the stream filter"] if filtered else []
-    rows = []
-    for names, members in release.groups("layout", "split", "teammate_kind").items():
-        tasks = {entry.task_id for entry in members}
-        means = [np.mean([entry.return_start for entry in members]), np.mean([entry.return_end for entry in members])]
-        means += [np.mean([filters[task].before.return_end for task in tasks])] if filtered else []
-        rows.append([*names, f"{len(tasks):,}", f"{len(members):,}", *(f"{mean:z.1f}" for mean in means)])
-    return markdown_table(header, rows, right=len(header) - 3)
-
-
 def _labels(release: CardContent) -> str:
-    """Return a table of what the policy behind each task's expert actions earns, with an explanation."""
-    header = ["layout", "split", "teammate", "step", "greedy", "sampled", "last"]
-    teammates = {task.task_id: f"{task.teammate_kind}/t{task.teammate.get('theta_id', 0)}" for task in release.tasks}
-    rows, weak = [], 0
-    for (task_id,), members in release.groups("task_id").items():
-        first = members[0]
-        if first.expert_return is None:
-            continue
-        sampled = "unknown" if first.expert_return_sampled is None else f"{first.expert_return_sampled:z.1f}"
-        row = [first.layout, first.split, teammates.get(task_id, first.teammate_kind)]
-        row += ["unknown" if first.expert_step is None else f"{first.expert_step:,}"]
-        row += [f"{first.expert_return:z.1f}", sampled, f"{_mean_end(members):z.1f}"]
-        is_weak = _labels_are_weak(members)
-        rows.append([f"**{cell}**" for cell in row] if is_weak else row)
-        weak += is_weak
-    if not rows:
-        return sentence("unmeasured_labels")
-    explained = sentence("labels", episodes=LABEL_EPISODES, steps=KEPT_STEPS)
-    verdict = sentence("weak_labels", weak=_tasks_in_words(weak)) if weak else sentence("no_weak_labels")
-    return f"{explained} {verdict}\n\n{markdown_table(header, rows, right=4)}"
-
-
-def _labels_are_weak(histories: Sequence[Entry]) -> bool:
-    """Whether the labels of a task's histories earn less than half of the histories' end."""
-    return are_labels_weak(histories[0].expert_return, _mean_end(histories))
-
-
-def _mean_end(histories: Sequence[Entry]) -> float:
-    return float(np.mean([entry.return_end for entry in histories]))
+    text = labels_table(release)
+    has_oracle = any(entry.has_oracle_actions for entry in release.entries)
+    return f"{text}\n\n{sentence('oracle_labels')}" if has_oracle else text
 
 
 def _labellers(release: CardContent) -> str:
@@ -318,10 +292,6 @@ def _labellers(release: CardContent) -> str:
     if earlier:
         return sentence("earlier_labels", earlier=earlier, tasks=len(measured))
     return sentence("last_labels") if measured else ""
-
-
-def _tasks_in_words(number: int) -> str:
-    return "1 task" if number == 1 else f"{number:,} tasks"
 
 
 def _layouts_table(release: CardContent) -> str:
@@ -356,12 +326,7 @@ def _arrays_table(release: CardContent) -> str:
 
 
 def _provenance(release: CardContent) -> list[str]:
-    lines = []
-    if egos := release.distinct("ego"):
-        sizes = [f"{ego['total_steps']:,} steps over {ego['environments']:,} environments" for ego in egos]
-        lines.append(sentence("ego", sizes=" or ".join(sizes)))
-    counts = {(p.streams_recorded or 0, p.streams_kept) for p in release.provenance.values() if p.streams_kept}
-    lines += [sentence("streams", kept=f"{kept:,}", recorded=f"{recorded:,}") for recorded, kept in sorted(counts)]
+    lines = [*_egos(release), *_noise(release)]
     for suite in release.distinct("suite"):
         layouts: dict[str, list[str]] = {}
         for layout, names in _algorithms(release, suite).items():
@@ -392,6 +357,34 @@ def _provenance(release: CardContent) -> list[str]:
     if SOURCE_CARD in release.files:
         lines.append(sentence("sources", file=SOURCE_CARD))
     return lines or [sentence("unknown_source")]
+
+
+def _egos(release: CardContent) -> Iterable[str]:
+    """Yield sentences about the learning egos and the streams that are kept."""
+    if egos := release.distinct("ego"):
+        sizes = [f"{ego['total_steps']:,} steps over {ego['environments']:,} environments" for ego in egos]
+        learners = range_in_words([of_task.learners or 1 for of_task in release.provenance.values() if of_task.ego], 0)
+        what = "learner" if learners == "1" else "independent learners"
+        yield sentence("ego", learners=f"{learners} {what}", sizes=" or ".join(sizes))
+    streams: dict[tuple[int, float | None], list[int]] = {}
+    for of_task in release.provenance.values():
+        if of_task.filter is not None and of_task.streams_kept:
+            key = of_task.streams_recorded or 0, of_task.filter.least_improvement
+            streams.setdefault(key, []).append(of_task.streams_kept)
+    for (recorded, least), kept in streams.items():
+        name = "streams" if least is None else "rising_streams"
+        yield sentence(name, kept=range_in_words(kept, 0), recorded=f"{recorded:,}", least=f"{least or 0:g}")
+
+
+def _noise(release: CardContent) -> Iterable[str]:
+    """Yield a sentence on each kind of noise schedule."""
+    for noise in release.distinct("noise"):
+        settings = {
+            name: range_in_words(value, 2) if isinstance(value, list | tuple) else f"{value:,}"
+            for name, value in noise.items()
+        }
+        if {"histories", "episodes", "start", "end", "begin", "finish", "power"} <= settings.keys():
+            yield sentence("noise", **settings)
 
 
 def _bullets(lines: Iterable[str]) -> str:

@@ -3,7 +3,8 @@
 The published code keeps all histories in `histories.h5`, one group each, with observations as float32 in gzip-6 chunks
 of 4096 steps and action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3).
 Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl`, `provenance.json` and
-`files.sha256`, which the published readers ignore; converted back they lose only the checkpoints of learned teammates.
+`files.sha256`, which the published readers ignore; converted back they lose only checkpoints and oracle actions. The
+published index does not have learners: streams of several learners of a task are numbered consecutively in it.
 Files without states, which observations do not determine, become a release of observations; files without tasks one
 that knows its tasks by name.
 """
@@ -55,7 +56,7 @@ from icrl4aht_data.writing.release_folder import (
     check_target,
     write_listing,
 )
-from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays
+from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays, with_source
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
@@ -91,25 +92,32 @@ def to_published(
         OptionError: if `target` may not be written, see `release_folder.check_target`.
     """
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
+    sources = {entry.task_id: entry.source for entry in dataset.entries}
+    recorded = read_provenance(dataset.origin.file(PROVENANCE))
+    provenance = {name: with_source(of_task, sources[name]) for name, of_task in recorded.items() if name in sources}
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root], keep_equal=True) as folder:
         with new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = new.file.create_group(f"/{number}")
-                for field in history.entry.stored_fields(kind):
+                for field in (one for one in history.entry.stored_fields(kind) if one.name != "oracle_actions"):
                     _write_published(group, field.name, history.read(field.name), chunk)
                     new.check()
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
+                line["env_idx"] += history.entry.learner * _streams_each(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
-        wanted = {entry.task_id for entry in dataset.entries}
-        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in wanted]
+        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in sources]
         if tasks:
             write_tasks(folder / "tasks.jsonl", tasks)
-        provenance = read_provenance(dataset.origin.file(PROVENANCE))
-        kept = {task_id: of_task.to_json() for task_id, of_task in provenance.items() if task_id in wanted}
-        write_json(folder / "provenance.json", kept)
+        write_json(folder / "provenance.json", {name: of_task.to_json() for name, of_task in provenance.items()})
         write_listing(folder)
     return target
+
+
+def _streams_each(provenance: Provenance | None) -> int:
+    """Return how many numbers of streams each learner of a task has in the published index."""
+    ego = None if provenance is None else provenance.ego
+    return 2**31 if ego is None else ego["environments"]
 
 
 def _write_published(group: h5py.Group, name: str, array: np.ndarray, chunk: int) -> None:
@@ -166,10 +174,14 @@ def from_published(
     with _wrap_errors(f"{path}: cannot be opened as HDF5"):
         file = h5py.File(path, "r")
 
-    def load(groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
+    def load(task: Task, groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
         seen: dict[bytes, _PublishedHistory] = {}
+        made = provenance.get(task.task_id, Provenance())
         for group in groups:
-            yield NewHistory(group.line["env_idx"], LazyArrays(group.field_names(), group.read))
+            learner, stream = 0, group.line["env_idx"]
+            if (made.learners or 1) > 1:
+                learner, stream = divmod(stream, _streams_each(made))
+            yield NewHistory(stream, LazyArrays(group.field_names(), group.read), learner)
             _check_content(group, seen)
             advance(next(numbers), len(lines))
 
@@ -183,7 +195,7 @@ def from_published(
                 task,
                 _with_notes(provenance.get(task.task_id, Provenance()), members[0]),
                 len(members),
-                lambda members=members: load(members),
+                lambda task=task, members=members: load(task, members),
             )
             for task, members in _tasks(histories, source, tasks, found)
         ]

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import msgspec
@@ -39,7 +40,9 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.files import write_json
-from icrl4aht_data.writing.dataset_card import RELEASE_CARD, SOURCE_CARD, CardContent, render_card
+from icrl4aht_data.utils.paths import files_below
+from icrl4aht_data.writing.card_content import CardContent
+from icrl4aht_data.writing.dataset_card import RELEASE_CARD, SOURCE_CARD, render_card
 from icrl4aht_data.writing.release_folder import atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
 from icrl4aht_data.writing.statistics import layout_statistics
@@ -99,6 +102,7 @@ def write_release(
     source_card: str | None = None,
     kept_steps: int = KEPT_STEPS,
     left_out: Sequence[LeftOutTask] = (),
+    files: Mapping[str, Path] = MappingProxyType({}),
     shard_histories: int = 1024,
     shard_bytes: int = SHARD_BYTES,
     overwrite: bool = False,
@@ -117,6 +121,7 @@ def write_release(
         source_card: cards of the releases that this one is made of, to keep with its own.
         kept_steps: steps of every episode.
         left_out: tasks without histories, to be listed in meta/info.json.
+        files: path in the release -> file to copy there, such as a figure that the card shows.
         shard_histories: maximum number of histories in a shard.
         shard_bytes: intended size of a shard, estimated from the first history of each layout.
         overwrite: replace a release at `target`, if nothing else is in its folder.
@@ -146,13 +151,13 @@ def write_release(
             groups[one.task.track, one.task.layout.name, one.task.split].append(one)
         for (track, layout, split), members in groups.items():
             writer.write(f"data/{track}/{layout}/{split}", members)
-        for name, source in chain.from_iterable(one.files.items() for one in new):
+        for name, source in chain(files.items(), *(one.files.items() for one in new)):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, root / name)
         content = _write_meta(root, kind, new, writer.entries, data_version, kept_steps, left_out)
         if source_card is not None:
             (root / SOURCE_CARD).write_text(source_card, encoding="utf-8")
-            content = replace(content, files=frozenset({SOURCE_CARD}))
+        content = replace(content, files=frozenset(files_below(root)))
         (root / RELEASE_CARD).write_text(render_card(content) if card is None else card, encoding="utf-8")
         write_manifest(root)
     return target
@@ -250,10 +255,10 @@ class _ShardWriter:
             raise OptionError(
                 f"task {task.task_id}: env_idx: expected a stream's number from 0, found {history.env_idx}"
             )
-        if not 0 <= history.learner < (new.provenance.learners or 2**63):
+        if not 0 <= history.learner < (learners := new.provenance.learners or 1):
             raise OptionError(
-                f"task {task.task_id}: learner: expected 0 to {(new.provenance.learners or 2**63) - 1}, found "
-                f"{history.learner}"
+                f"task {task.task_id}: learner: expected 0 to {learners - 1}, since provenance has {learners} "
+                f"learners, found {history.learner}"
             )
         needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():

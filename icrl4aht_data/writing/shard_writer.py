@@ -23,6 +23,7 @@ from icrl4aht_data.format.chunks import (
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import add_filename
+from icrl4aht_data.utils.threads import in_slices, usable_cores
 
 _BLOCK = 2000  # steps: one chunk of scalars, two of records
 
@@ -64,11 +65,14 @@ def write_shard(
         file.attrs["layout"] = layout.name
         for group in dict.fromkeys(entry.h5_group for entry in entries):
             _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
+        opened: dict[str, Any] = {}  # looking a dataset up takes as long as writing a chunk
         for entry, chunks in zip(entries, histories, strict=True):
-            group: Any = file[entry.h5_group]
             for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
-                group[field.name].id.write_direct_chunk(position, data)
+                name = f"{entry.h5_group}/{field.name}"
+                if name not in opened:
+                    opened[name] = file[name]
+                opened[name].id.write_direct_chunk(position, data)
             checksums += [_checksums(chunk.data) for chunk in chunks]
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = [crc32 for crc32, _ in checksums]
@@ -146,7 +150,7 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
     Raises:
         OptionError: if the stored dtype cannot hold a value, or an array does not have the entry's length.
     """
-    layout, chunks = get_layout(entry.layout), []
+    layout, parts = get_layout(entry.layout), []
     for field in entry.stored_fields(kind):
         element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
         where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
@@ -156,7 +160,16 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
         if not np.array_equal(stored, array):
             raise OptionError(f"{where} has values that {element.base} cannot hold")
         length = min(field.chunk, rows)
-        for start in range(0, rows, length):
-            data = encode_chunk(stored[start : start + length], length, element.itemsize)
-            chunks.append(EncodedChunk(field, start, data))
-    return chunks
+        parts += [
+            (field, start, stored[start : start + length], length, element.itemsize) for start in range(0, rows, length)
+        ]
+    encoded = [b""] * len(parts)
+    threads = min(usable_cores(), len(parts))
+
+    def encode(first: int, stop: int) -> None:
+        for thread in range(first, stop):  # every thread gets parts of all fields, since some take longer
+            for number in range(thread, len(parts), threads):
+                encoded[number] = encode_chunk(*parts[number][2:])
+
+    in_slices(encode, threads, threads)
+    return [EncodedChunk(field, start, data) for (field, start, *_), data in zip(parts, encoded, strict=True)]

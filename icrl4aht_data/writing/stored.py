@@ -75,7 +75,9 @@ def stored_task(
     files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
-    source = dataset.entries[0].source
-    if source != (provenance.source or "ppo"):  # version 3 has the source in the index only
-        provenance = replace(provenance, source=source)
-    return NewTask(task, provenance, len(dataset), load, files)
+    return NewTask(task, with_source(provenance, dataset.entries[0].source), len(dataset), load, files)
+
+
+def with_source(provenance: Provenance, source: str) -> Provenance:
+    """Return provenance that says how the histories were made, which releases of version 3 say in the index only."""
+    return provenance if source == (provenance.source or "ppo") else replace(provenance, source=source)

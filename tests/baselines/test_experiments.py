@@ -242,7 +242,7 @@ def test_the_page_shows_the_reported_agent(ablated, tmp_path):
 def test_impossible_trainings_fail_before_any_work(release, tmp_path):
     random_release(tmp_path / "plain", layouts=("demo_wide",), teammates=1, streams=2, episodes=6, labels=False)
     plan = dataclasses.replace(SMALL, root=str(tmp_path / "plain"), methods=("ad", "dpt"))
-    with pytest.raises(LabelsMissingError, match=r"dpt none on demo_wide: DPT needs expert actions.* leave it out, by"):
+    with pytest.raises(LabelsMissingError, match=r"dpt none on demo_wide: labels = expert: .* leave it out, by"):
         run_experiment("ablate ta", dataclasses.replace(plan, train=TRAIN | {"context": 8}), tmp_path / "out")
     with pytest.raises(OptionError, match=r"ad K1000 on demo_wide: context = 1000: the shortest history of .* has 600"):
         run_experiment("sweep context", dataclasses.replace(plan, root=str(release)), tmp_path / "out")

@@ -170,6 +170,45 @@ def test_learned_teammates_on_some_layouts(changed):
     assert profile.tasks_on("cramped_up", "ppo") == 2 + 2 * profile.teammates.train
 
 
+def test_sampled_teammates_of_both_sources(changed):
+    sampled = 'families = { coord_simple = ["assembly_line", "recipe_aware_button"], cramped_up = ["assembly_line"] }'
+    profile = load_profile(
+        changed(
+            'presets = ["default", "high_inertia"]',
+            'sources = ["ppo", "noise"]\nlearners = 2\n[tasks.sampled]\n'
+            f"{sampled}\nper_layout = {{ coord_simple = 3, cramped_up = 2 }}\nppo = 1\nvalidation = 1",
+        )
+    )
+    works = profile.works()
+    made = [(work.source, work.task.layout.name, work.task.split, work.learner) for work in works]
+    of_ppo = [("ppo", layout, "train", learner) for layout in profile.layouts for learner in (0, 1)]
+    of_noise = [("noise", "coord_simple", "train", 0)] * 3 + [("noise", "coord_simple", "validation", 0)]
+    of_noise += [("noise", "cramped_up", "train", 0)] * 2 + [("noise", "cramped_up", "validation", 0)]
+    assert made == of_ppo + of_noise
+    assert len({work.name for work in works}) == len(works) == 11
+    assert len({work.task.seed for work in works}) == 9  # the learners of a task share its seed
+    assert works[0].name + "-l1" == works[1].name
+    teammates = [json.dumps(work.task.teammate["theta"]) for work in works if work.source == "noise"]
+    assert len(set(teammates)) == len(teammates)
+    assert {work.task.teammate["base_seed"] for work in works if work.task.split == "validation"} == {1}
+    assert [work.task.teammate for work in works[:3:2]] == [works[4].task.teammate, works[8].task.teammate]
+    learned = make_task("layout", "train", "cramped_up", LEARNED_ENTRY, 7)
+    assert [work.task for work in profile.works([learned]) if work.task.teammate == LEARNED_ENTRY] == [
+        learned,
+        learned,
+        make_task("layout", "train", "cramped_up", LEARNED_ENTRY, 2_000_007),
+    ]
+
+
+LEARNED_ENTRY = {
+    "kind": "rl",
+    "family": "fcp",
+    "theta_id": 0,
+    "base_seed": 0,
+    "theta": {"checkpoint": "cramped_up/fcp/m0/c4", "sha256": "0" * 64},
+}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -230,6 +269,59 @@ def test_learned_teammates_on_some_layouts(changed):
             '["coord_simple", "cramped_room_up"]',
             "[]",
             r"expected at least one of tasks\.layouts, and one of tasks\.presets, tasks\.sampled or tasks\.algorithms",
+        ),
+        (
+            "presets =",
+            'sources = ["ppo", "nois"]\npresets =',
+            r"tasks\.sources: unknown source 'nois'; .*Did you mean 'noise'\?",
+        ),
+        ("presets =", "sources = []\npresets =", r"tasks\.sources = \[\]: expected at least one of ppo, noise"),
+        ("presets =", "learners = 0\npresets =", r"learners = 0: expected at least 1"),
+        ("[release]", "[noise]\nstart = 1.5\n[release]", r"noise\.start = 1\.5: .*within 0\.\.1"),
+        ("[release]", "[noise]\nend = [0.3, 0.1]\n[release]", r"noise\.end = \[0\.3, 0\.1\]: expected a range"),
+        (
+            "[release]",
+            "[noise]\nbegin = [0, 0.7]\nfinish = 0.5\n[release]",
+            r"noise\.begin = \[0\.0, 0\.7\]: expected it to end before finish = \[0\.5, 0\.5\]",
+        ),
+        ("[release]", "[noise]\nstart = 0.5\nend = 0.6\n[release]", r"noise\.start = .*: expected no value below"),
+        ("[release]", "[noise]\npower = 0\n[release]", r"noise\.power = 0: expected a range .* above 0"),
+        ("[release]", "[noise]\nepisodes = 3\n[release]", r"noise\.episodes = 3: expected an integer at least 10"),
+        (
+            "[release]",
+            "[ego.layouts.demo_wide]\nentropy = 0.02\n[release]",
+            r"ego\.layouts\.demo_wide: expected one of tasks\.layouts",
+        ),
+        (
+            "[release]",
+            "[ego.layouts.cramped_up]\nentropi = 0.02\n[release]",
+            r"unknown key 'ego\.layouts\.cramped_up\.entropi'",
+        ),
+        ("keep = 8", 'keep = 8\nleast_improvement = "5"', r"release\.least_improvement = '5': expected a number"),
+        (
+            "presets =",
+            'sampled = { families = ["territori"], per_layout = 1 }\npresets =',
+            r"tasks\.sampled\.families: unknown family 'territori'; .*mean 'territory'\?",
+        ),
+        (
+            "presets =",
+            "sampled = { families = [], per_layout = 1 }\npresets =",
+            r"tasks\.sampled\.families: none for coord_simple, which has teammates",
+        ),
+        (
+            "presets =",
+            'sampled = { families = ["assembly_line"], per_layout = 2, ppo = 3 }\npresets =',
+            r"tasks\.sampled\.ppo = 3 on coord_simple: expected at most per_layout = 2",
+        ),
+        (
+            "presets =",
+            'sampled = { families = ["assembly_line"], per_layout = 999 }\npresets =',
+            r"coord_simple: 999 drawn teammates requested of assembly_line, which have only \d+ distinct draws",
+        ),
+        (
+            "presets =",
+            'sampled = { families = ["utility_greedy"], per_layout = 1 }\npresets =',
+            r"coord_simple cannot host drawn teammates of utility_greedy: ",
         ),
         ("total_steps = 32000", "total_steps = 13500", r"ego\.total_steps gives 4 episodes .*expected at least 5"),
         ("keep = 8", "keep 8", r"not TOML: "),

@@ -90,7 +90,7 @@ def random_release(
     """Write a release of random actions; returns the written arrays by history id.
 
     `experts` and `sources` say where the labels and the histories of each task come from; `oracle` adds oracle actions,
-    equal to the labels where the source is "noise". Every learner has `streams` histories.
+    equal to the labels where the source is "noise". Every learner has `streams` histories; a noise task has one.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
@@ -98,7 +98,8 @@ def random_release(
     for number, task in enumerate(make_tasks(list(layouts), teammates)):
         histories = []
         source, expert = sources[number] if sources else None, experts[number] if experts else None
-        for learner, stream in itertools.product(range(learners), range(streams)):
+        trained = 1 if source == "noise" else learners
+        for learner, stream in itertools.product(range(trained), range(streams)):
             arrays = random_history(get_layout(task.layout_name), episodes, length, rng)
             if oracle:
                 same = source == "noise"
@@ -107,7 +108,7 @@ def random_release(
                 del arrays["expert_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays, learner))
-        made = Provenance(seed=task.seed, source=source, expert=expert, learners=None if learners == 1 else learners)
+        made = Provenance(seed=task.seed, source=source, expert=expert, learners=None if trained == 1 else trained)
         tasks.append(NewTask(task, made, len(histories), lambda histories=histories: histories))
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)

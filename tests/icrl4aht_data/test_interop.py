@@ -19,6 +19,7 @@ from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, to
 from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
+from tests.helpers.random_releases import random_release
 
 
 @pytest.fixture
@@ -136,6 +137,16 @@ class TestHuggingFace:
             np.frombuffer(b"".join(row["state"]), np.uint8), written[7]["state"][40:60].reshape(-1)
         )
         assert row["return"] == written[7]["rewards"][40:60].sum()
+        assert row["oracle_actions"] is None
+
+    def test_episodes_with_oracle_actions(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
+        written = random_release(
+            tmp_path / "r", layouts=("demo_wide",), streams=2, episodes=5, oracle=True, labels=False
+        )
+        row = hf_episodes(load_icrl4aht(tmp_path / "r"))[6]
+        assert (row["history_id"], row["episode"], row["expert_actions"]) == (1, 1, None)
+        np.testing.assert_array_equal(row["oracle_actions"], written[1]["oracle_actions"][20:40])
 
     def test_windows_and_resuming(self, sampler):
         windows = hf_windows(sampler, stop=3)

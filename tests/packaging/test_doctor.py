@@ -22,7 +22,6 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.requirements import dependencies, extra_with
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.schema import FORMAT_VERSION
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import SHARD
 
@@ -72,7 +71,7 @@ def test_no_problems(elsewhere):
     assert facts["bundled"] == {
         "ok": True,
         "data_version": info.data_version,
-        "format_version": FORMAT_VERSION,
+        "format_version": info.format_version,
         "has_chunk_hashes": True,
         "kind": "lite",
         "histories": info.histories,

@@ -49,6 +49,7 @@ MISUSED = """
 reader: lst | No such command 'lst'. Did you mean 'list'?
 reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 reader: list --split tran | unknown split 'tran'; valid: train, validation, test, heldout. Did you mean 'train'?
+reader: list --source nois | unknown source 'nois'; valid: ppo, noise. Did you mean 'noise'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, fcp
 reader: verify --deeep | No such option
@@ -78,6 +79,7 @@ generation: teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid
 baselines: train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline.
 baselines: train ad --layout demo_wide --size smal | unknown size 'smal'; valid: tiny, small, medium, large.
 baselines: train ad --layout demo_wide --order rnd | 'rnd' is not one of 'contiguous', 'random'.
+baselines: train dpt --layout demo_wide --labels orcale | 'orcale' is not one of 'expert', 'oracle'.
 baselines: train ad --layout demo_wide --batch-size 0 | 0 is not in the range x>=1
 baselines: train ad --layout demo_wide --learning-rate nan | nan is not a finite number
 baselines: train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
@@ -117,6 +119,9 @@ reader: upload none hf://datasets/a/b --dry-run | none: no release here
 generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
+baselines: train ad --layout demo_wide --labels oracle | labels = oracle: ad learns from the histories' own actions;
+baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,
+baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here
 baselines: report empty | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
 baselines: evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in

@@ -290,7 +290,8 @@ class Population:
             last, _ = player.act(carry.memories[number], carry.env, key)
             # A policy that lowers a return must not be paid, nor charged, for the shaped rewards on the way.
             own_shaping = shaping * (weight[slots] >= 0)
-            played = sequences(self.view, rollout, number, slots, state.carry.memories[number], last.value, own_shaping)
+            memory, forgiveness = state.carry.memories[number], self.config.forgiveness
+            played = sequences(self.view, rollout, number, slots, memory, last.value, own_shaping, forgiveness)
             partner = jnp.asarray(self.assignment.partner[slots])[None]
             played = played._replace(partner=partner, weight=weight[slots][None])
 

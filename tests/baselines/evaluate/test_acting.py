@@ -123,8 +123,10 @@ class TestBadRuns:
             (tmp_path / name / "config.json").write_text(json.dumps(config | changes))
             return str(tmp_path / name)
 
-        with pytest.raises(OptionError, match=r"run_format 99, expected 4: written by version .*; use that version"):
+        with pytest.raises(OptionError, match=r"run_format 99, but version \S+ .* reads run_format 4 only: .*--out\)$"):
             find_agent(copy("newer", run_format=99))
+        with pytest.raises(OptionError, match=r"use this run with version 9\.9 of this package, which wrote it$"):
+            find_agent(copy("newest", run_format=99, package_version="9.9"))
         wide = dataclasses.asdict(dataclasses.replace(MODEL, width=32))
         with pytest.raises(OptionError, match=r"not a state of this training: params/.*expected float32 .*, found"):
             find_agent(copy("wider", model=wide))

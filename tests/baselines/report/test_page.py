@@ -179,11 +179,13 @@ def test_models_of_different_layouts_are_one_agent():
 
 
 def test_trained_models_have_cards(tmp_path):
-    def trained(layout, tested_on, size, layers=4, channels=None, **options):
+    def trained(layout, tested_on, size, layers=4, channels=None, data=None, **options):
         histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [layout], "data_version": "1.0.0"}
         histories["sizes"] = {"train": size}
         histories |= {"channels": channels} if channels else {}
+        histories |= {"labels": "oracle"} if data else {}
         config = {"model": {"layers": layers}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+        config |= {"trained_on": data} if data else {}
         found = evaluated_run("AD", (tested_on,), **options)
         source = found.sources[0]._replace(trained={"config": config, "manifest_sha256": "ab12", "run_hash": layout})
         return dataclasses.replace(found, sources=(source,))
@@ -200,6 +202,9 @@ def test_trained_models_have_cards(tmp_path):
     )
     assert "* layers: 4\n* seed: 3\n* channels: own" in card, "as all models before channels could be chosen"
     assert "* seed: 3\n* channels: canonical" in model_card(trained("all", "demo_wide", 1, channels="canonical"))
+    data = [{"source": "ppo"}, {"source": "noise"}, {"source": "ppo"}]
+    settings = "* channels: own\n* sources of histories: noise, ppo\n* labels: oracle"
+    assert settings in model_card(trained("demo_wide", "demo_wide", 1, data=data))
     assert "| H4 | 11.0 ± 0.0 †<br>" in card
     assert "| H3 | 11.0 ± 0.0<br>" in card
     assert "It is one run, of seed 3" in card

@@ -41,6 +41,7 @@ from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, Option
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start
+from tests.helpers.two_sources import two_source_release
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -264,6 +265,48 @@ class TestHeldOut:
         again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.25)
         assert set(again.train.ids) == set(split.train.ids)
 
+    def test_histories_of_split_validation_are_the_part_with_other_teammates(self, two_sources):
+        def job(**choice: Any) -> dict[str, Any]:
+            return prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice)).about
+
+        about = job()
+        assert about["histories"]["sizes"] == {"train": 10, "histories": 4, "teammates": 6}
+        assert about["histories"]["teammates_split"] == "validation"
+        assert {cell["split"] for cell in about["trained_on"]} == {"train"}
+        assert {cell["source"] for cell in about["trained_on"]} == {"ppo", "noise"}
+        learned = job(source=("ppo",))  # no validation histories are of this source
+        assert learned["histories"]["sizes"] == {"train": 3, "histories": 1, "teammates": 4}
+        assert learned["histories"]["teammates_split"] == "train"
+        own = job(split="validation")
+        assert own["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
+
+    def test_tasks_with_one_history_are_trained_on(self, two_sources):
+        dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
+        split = hold_out(dataset[3:8], validation=dataset[:1])  # one history of the first task, four of the second
+        assert split.train.ids.tolist()[0] == dataset.ids[3]
+        assert (len(split.train), len(split.histories)) == (4, 1)
+        with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
+            hold_out(dataset[3:5])
+
+    def test_streams_of_two_learners_are_told_apart(self, two_sources):
+        dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
+        first = [entry.history_id for entry in hold_out(dataset, 0.5).histories.entries]
+        again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.5).histories.ids
+        assert set(first) == set(again.tolist())
+
+    def test_labels(self, two_sources):
+        def job(method: str, **choice: Any) -> Any:
+            return prepare(method, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice))
+
+        for labels, given in (("oracle", {"labels": "oracle"}), ("expert", {})):
+            dpt = job("dpt", **given)
+            assert dpt.about["histories"]["labels"] == labels
+            assert {cell["labels"] for cell in dpt.about["trained_on"]} == {labels}
+            assert {sampler.labels for sampler in (dpt.data.train, *dpt.data.validation.values())} == {labels}
+        assert {cell["labels"] for cell in job("ad").about["trained_on"]} == {None}
+        with pytest.raises(OptionError, match="labels = expert: ad learns from the histories' own actions; leave out"):
+            job("ad", labels="expert")
+
     def test_one_teammate_cannot_be_held_out(self):
         split = hold_out(load_icrl4aht(layout="coord_simple"))
         assert split.teammates is None
@@ -305,7 +348,7 @@ class TestHeldOut:
     def test_impossible_trainings(self, tmp_path, lite):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
         wide = HistoryOptions(("demo_wide",), str(tmp_path / "r"))
-        with pytest.raises(LabelsMissingError, match="DPT needs expert actions"):
+        with pytest.raises(LabelsMissingError, match=r"have no expert actions .*: choose histories or a release"):
             prepare("dpt", MODEL, OPTIONS, wide)
         long = dataclasses.replace(OPTIONS, context=121)
         for name in ("ad", "dpt"):
@@ -313,8 +356,12 @@ class TestHeldOut:
                 OptionError, match=r"context = 121: the shortest history of .* has 120 steps; take fewer"
             ):
                 prepare(name, MODEL, long, HistoryOptions(("demo_wide",), str(lite[0])))
+        two_source_release(tmp_path / "both", layouts=("demo_wide",), ppo_episodes=7)
+        mixed = HistoryOptions(("demo_wide",), str(tmp_path / "both"))
+        with pytest.raises(OptionError, match=r"has 120 steps; take fewer, or choose --source ppo, whose"):
+            prepare("ad", MODEL, long, mixed)
         two = HistoryOptions(("demo_wide", "coord_simple"), str(lite[0]), channels="own")
-        with pytest.raises(OptionError, match=r'unequal shape .*: take channels="canonical"'):
+        with pytest.raises(OptionError, match=r"channels = own: .* coord_simple, demo_wide .*: leave out --channels"):
             prepare("ad", MODEL, OPTIONS, two)
 
 

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from generation.collection import curate, record
+from generation.env import Environment
+from generation.experts.oracle import oracle
 from generation.learners.config import PPOConfig, Widths
 from generation.learners.network import ActorCritic
-from generation.learners.rollout import Rollout
-from icrl4aht_data.overcooked.actions import EGO
+from generation.learners.rollout import Rollout, init_rollout, policy_player, random_player, roll_out
+from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.overcooked.state import record_size, start
 from tests.helpers.states import random_records
 
 LAYOUT = LAYOUTS["cramped_up"]
@@ -129,6 +131,10 @@ def rewards_of(returns: list[list[int]]) -> np.ndarray:
     return rewards.reshape(len(returns), -1)
 
 
+def best(returns: list[list[int]], keep: int, least_improvement: float | None = None) -> list[int]:
+    return curate.best_streams(curate.stream_returns(rewards_of(returns)), keep, least_improvement).tolist()
+
+
 def score_by_hand(curve: list[int]) -> float:
     w = max(5, math.floor(0.1 * len(curve)))
     start, end = sum(curve[:w]) / w, sum(curve[-w:]) / w
@@ -142,9 +148,8 @@ def test_best_streams_follow_the_formula(episodes):
     scores = [score_by_hand(curve) for curve in returns]
     assert len(set(scores)) > 20
     expected = sorted(range(30), key=lambda n: -scores[n])
-    rewards = rewards_of(returns)
-    assert curate.best_streams(rewards, 30).tolist() == expected
-    assert curate.best_streams(rewards, 7).tolist() == expected[:7]
+    assert best(returns, 30) == expected
+    assert best(returns, 7) == expected[:7]
 
 
 def test_best_streams_by_hand():
@@ -155,16 +160,44 @@ def test_best_streams_by_hand():
     busy = [0] * 5 + [200, 200] + [10] * 5  # 10 + 10
     late = [0] * 7 + [0, 0, 0, 0, 175]  # 35 + 35
     assert [score_by_hand(curve) for curve in (flat, risen, fallen, busy, late)] == [60, 80, 40, 20, 70]
-    assert curate.best_streams(rewards_of([flat, risen, fallen, busy, late]), 4).tolist() == [1, 4, 0, 2]
+    assert best([flat, risen, fallen, busy, late], 4) == [1, 4, 0, 2]
 
 
 def test_equal_streams_come_in_the_order_of_their_numbers():
     low, high, also_high = [0] * 10, [0] * 5 + [20] * 5, [10] * 5 + [25] * 5  # 0, 40, 40
-    rewards = rewards_of([low, high, low, also_high, high, low])
-    assert curate.best_streams(rewards, 6).tolist() == [1, 3, 4, 0, 2, 5]
-    assert curate.best_streams(rewards, 2).tolist() == [1, 3]
-    many = np.repeat(rewards_of([low, high]), 100, axis=0)
-    assert curate.best_streams(many, 200).tolist() == [*range(100, 200), *range(100)]
+    curves = [low, high, low, also_high, high, low]
+    assert best(curves, 6) == [1, 3, 4, 0, 2, 5]
+    assert best(curves, 2) == [1, 3]
+    assert best([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
+
+
+def test_streams_that_do_not_improve_are_left_out():
+    flat, fallen = [60] * 10, [60] * 5 + [40] * 5
+    five, four = [0] * 5 + [0, 0, 0, 0, 25], [0] * 5 + [0, 0, 0, 0, 20]  # 5 and 4 more at the end
+    assert best([flat, five, four, fallen], 4, 5.0) == [1]
+    assert best([flat, five, four, fallen], 4) == [0, 3, 1, 2]
+    assert best([flat, fallen], 4, 5.0) == []
+
+
+def learner(*improvements: int) -> np.ndarray:
+    """Returns (N, 10) of streams that start at 0 and improve by this."""
+    return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])
+
+
+@pytest.mark.parametrize(
+    ("learners", "keep", "expected"),
+    [
+        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 4, [[1, 2], [1, 2]]),
+        ([learner(10, 50, 30, 20), learner(15, 40, 25, 5)], 3, [[1, 2], [1]]),  # the better second one
+        ([learner(10, 20), learner(90, 80, 70, 60)], 3, [[1], [0, 1]]),
+        ([learner(30, 20, 40, 50), learner(0, 5, 4, 0)], 4, [[3, 2, 0], [1]]),  # the other has one only
+        ([learner(30, 20, 40, 50), learner(0, 0)], 8, [[3, 2, 0, 1], []]),
+        ([learner(0), learner(0)], 2, [[], []]),
+        ([learner(9), learner(7), learner(8)], 2, [[0], [], [0]]),
+    ],
+)
+def test_streams_are_shared_out_among_learners(learners, keep, expected):
+    assert [streams.tolist() for streams in curate.select_streams(learners, keep, 5.0)] == expected
 
 
 # Labelling.
@@ -221,3 +254,34 @@ def test_labels_need_the_memory_and_its_restart(labelled):
     assert (np.stack(labels) != without).mean() > 0.1
     assert (np.stack(labels)[:, 100:] != across[:, 100:]).any()
     np.testing.assert_array_equal(across[:, :100], logits["episode"][:, :100].argmax(axis=-1))
+
+
+def test_oracle_labels_are_what_the_oracle_does():
+    """Where the oracle is the ego it does what the labels say, in every episode from the first step on."""
+    envs, episodes = 3, 2
+    env = Environment(LAYOUT, 100)
+    players = [policy_player(env, oracle(LAYOUT), (), EGO, envs), random_player(TEAMMATE, envs)]
+
+    @jax.jit
+    def play(key) -> Rollout:
+        carry = init_rollout(env, players, jax.random.split(key, envs))
+        return roll_out(env, players, carry, 100 * episodes, key)[1]
+
+    played = play(jax.random.key(1))
+    states, taken = (np.asarray(array).swapaxes(0, 1) for array in (played.record, played.actions[..., EGO]))
+    assert len(np.unique(taken)) == 6
+    labels = list(curate.oracle_labels(LAYOUT, states, taken.astype(np.int8)))
+    assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * envs
+    np.testing.assert_array_equal(labels, taken)
+
+
+def test_oracle_labels_follow_the_actions_that_the_ego_took():
+    """Two egos that stand still: the oracle waits a step after one that tried to move, and not after one that stays."""
+    cells = LAYOUT.agent_cells
+    free = next(action for action in range(4) if LAYOUT.moves[cells[EGO], action] not in cells)
+    (record,) = start(LAYOUT, np.array([cells], np.uint8), np.zeros((1, 2), np.uint8), LAYOUT.recipe_items[:1])
+    states = np.broadcast_to(record, (2, 200, len(record)))
+    actions = np.repeat([[free], [STAY]], 200, axis=1).astype(np.int8)
+    moves, stays = curate.oracle_labels(LAYOUT, states, actions)
+    assert moves[0] == stays[0] != STAY
+    assert moves[1] == STAY != stays[1]

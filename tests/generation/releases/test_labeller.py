@@ -72,6 +72,8 @@ def task(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "artefacts" / artefact(built / "a").name
     shutil.copytree(artefact(built / "a"), folder)
+    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # what was measured of the teammate
+        shutil.copy(kept, folder.parent)
     return profile.works()[0].task, profile, folder
 
 
@@ -121,7 +123,7 @@ def test_measurements_that_are_damaged_or_of_other_checkpoints_are_made_again(ta
     (folder / LABELLER_RETURNS).write_text(damage(before))
     again = {way: np.array(values) for way, values in json.loads(before).items() if way != "settings"}
     monkeypatch.setattr(labeller, "_measure", lambda *arguments: again)
-    choose_labeller(folder, chosen, tmp_path)
+    choose_labeller([folder], chosen, tmp_path)
     assert (folder / LABELLER_RETURNS).read_text() == before
 
 
@@ -130,7 +132,7 @@ def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
     """Greedy returns of the last checkpoint, by the environment and the policies alone."""
     chosen, _, folder = task
     (folder / LABELLER_RETURNS).unlink()
-    choose_labeller(folder, chosen, tmp_path)
+    choose_labeller([folder], chosen, tmp_path)
     network, params, _ = load_policy(folder / "checkpoints/c4")
     mate = build_teammate(chosen.layout, chosen.teammate, TEAMMATE, "seeded")
     env = Environment(chosen.layout, 400)
@@ -176,7 +178,7 @@ def test_index_provenance_and_card_state_the_labeller(built):
     assert expert.policy_sha256 == file_hash(artefact(built / "a") / f"checkpoints/c{number}/policy.safetensors")
     card = (root / "README.md").read_text()
     assert "## Labels" in card
-    assert f"| demo_wide | train | utility_greedy/t0 | {step:,} | {greedy[number]:.1f} |" in card
+    assert f"| demo_wide | ppo | train | H4/t0 | {step:,} | {greedy[number]:.1f} |" in card
 
 
 def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
@@ -206,7 +208,7 @@ def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_pat
     with_returns(folder, [ends * share] * 5)
     root = package_release(folder.parent, tmp_path / "lite", [Work(chosen)], profile, tmp_path, "lite")
     card = (root / "README.md").read_text()
-    assert ("| **demo_wide** | **train** |" in card) == weak
+    assert ("| **demo_wide** | **ppo** | **train** |" in card) == weak
     assert ("The labels of 1 task earn less than half" in card) == weak
     assert ("No labels earn less than half" in card) != weak
 

@@ -107,7 +107,7 @@ def test_a_test_instance_acts_like_itself(family):
     thetas = published_thetas(SHIPPED.name, family)
     found = nearest_test(SHIPPED, [build_teammate(SHIPPED, {"family": family, "theta": theta}) for theta in thetas])
     assert [near.distance for near in found] == [0.0] * len(thetas)
-    assert found[0].name == {"assembly_line": "H3/t0", "utility_greedy": "H4/t0"}[family]
+    assert found[0].teammate == {"assembly_line": "H3/t0", "utility_greedy": "H4/t0"}[family]
 
 
 @pytest.mark.slow

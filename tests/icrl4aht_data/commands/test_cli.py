@@ -15,6 +15,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run as run_command
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
+from icrl4aht_data.format.schema import FORMAT_VERSION
 from tests.helpers.paths import ROOT
 
 
@@ -40,11 +41,44 @@ def test_list(lite):
 
 def test_show_release_and_history(lite):
     release = json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)
-    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, 3)
+    assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, FORMAT_VERSION)
     history = json.loads(CliRunner().invoke(cli, ["show", "--json", "--history", "7", str(lite[0])]).output)
     assert (history["history_id"], history["layout"], history["T"]) == (7, "demo_wide", 120)
     assert history["teammate"]["family"] == "utility_greedy"
     assert "12 histories" in CliRunner().invoke(cli, ["show", str(lite[0])]).output
+
+
+def test_list_and_show_say_sources_learners_and_labels(two_sources):
+    root = str(two_sources[0])
+
+    def say(*arguments: str) -> str:
+        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    rows = json.loads(say("list", root, "--json", "--layout", "demo_wide"))
+    facts = [(row["split"], row["source"], row["learners"], row["histories"]) for row in rows]
+    assert facts == [("train", "ppo", 2, 4)] * 2 + [("train", "noise", 1, 3)] * 2 + [("validation", "noise", 1, 3)] * 2
+    assert {tuple(row["labels"]) for row in rows} == {("expert", "oracle")}
+    text = say("list", root, "--source", "noise", "--split", "validation")
+    assert "ppo" not in text and text.count("expert 5.0, oracle") == 4
+    shown = json.loads(say("show", root, "--json"))
+    assert (shown["splits"], shown["sources"]) == ({"train": 28, "validation": 12}, {"ppo": 16, "noise": 24})
+    assert (shown["learners"], shown["labels"]) == (2, {"expert": 40, "oracle": 40})
+    assert "sources ppo (16), noise (24)" in say("show", root)
+
+
+def test_filters_by_source_reach_every_command(two_sources, tmp_path):
+    """`verify` and `convert` have arguments and options of their own that were once named source."""
+    root, out = str(two_sources[0]), str(tmp_path / "noise")
+    for command in (
+        ["verify", root, "--source", "noise"],
+        ["convert", root, "--source", "noise", "--to", "lite", "--out", out],
+        ["verify", out, "--deep"],
+    ):
+        result = CliRunner().invoke(cli, command)
+        assert result.exit_code == 0, result.output
+    assert read_info(tmp_path / "noise").histories == 24
 
 
 def test_show_plots(lite, tmp_path):

@@ -69,7 +69,12 @@ def test_version_3_is_read_and_verified(lite, version_3):
     line = json.loads((version_3 / HISTORIES).read_text().splitlines()[0])
     assert "source" in line and not set(NEW_FIELDS[3]) & line.keys()
     assert list(load_icrl4aht(version_3).entries) == list(load_icrl4aht(lite[0]).entries)
-    assert_equal(*(load_icrl4aht(root, layout="demo_wide").dpt(4, 30, seed=1)[2] for root in (version_3, lite[0])))
+    assert_equal(
+        *(
+            load_icrl4aht(root, layout="demo_wide").dpt(batch_size=4, context=30, seed=1)[2]
+            for root in (version_3, lite[0])
+        )
+    )
     report = verify_release(version_3, level="deep")
     assert report.ok and not report.notes, report
     assert "without chunk hashes" not in repr(load_icrl4aht(version_3))

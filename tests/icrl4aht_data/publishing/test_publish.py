@@ -227,7 +227,7 @@ def test_the_card_describes_the_release(published):
     files = {name for config in facts["configs"] for name in config["data_files"] for name in [name["path"]]}
     assert all(list(published.glob(pattern)) for pattern in files)
     assert "12 histories of 6 tasks, 1,440 transitions; each history has 120 steps." in card
-    assert "| coord_simple | train | utility_greedy | 2 | 4 |" in card
+    assert "| coord_simple | ppo | train | H4 | 2 | 2 | 4 | 480 |" in card
     assert "| teammate | train | coord_simple | 2 | 4 | 480 |" in card
     assert "On coord_simple the ego's room shares nothing" in card
     assert "| family | coord_simple | cramped_down |" in card
@@ -272,7 +272,7 @@ def test_the_card_names_missing_learned_teammates(damaged, algorithms):
     card = dataset_card(damaged)
     assert "Learned teammates on demo_wide: populations of 2 by fcp, 1,000,000 steps per member" in card
     others = ", ".join(name for name in read_info(damaged).layouts if name != "demo_wide")
-    assert f"* No learned teammates on {others}: the profile trains only with presets of H4 there." in card
+    assert f"* No learned teammates on {others}: all training teammates there are heuristics." in card
     assert "fewer training teammates than its profile asks for: fcp on demo_wide (0 of 3)." in card
 
 

@@ -91,7 +91,7 @@ def test_filters_of_sources_and_algorithms(measured):
     assert load_icrl4aht(measured, source="search").ids.tolist() == [4, 5, 6, 7]
     both = load_icrl4aht(measured).filter(source=["ppo", "search"], algorithm="utility_greedy")
     assert both.ids.tolist() == [*range(8)]
-    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, search"):
+    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, noise, search"):
         load_icrl4aht(measured, source="sac")
     with pytest.raises(UnknownNameError, match=r"unknown algorithm 'utility'; .* mean 'utility_greedy'"):
         load_icrl4aht(measured, algorithm="utility")
@@ -119,7 +119,7 @@ def test_filter_by_what_the_labels_earn(measured):
 
 def test_a_history_names_what_its_labels_earn(measured):
     dataset = load_icrl4aht(measured)
-    assert "labels 9.5)" in repr(dataset[0])
+    assert "labels 9.5, source ppo)" in repr(dataset[0])
     assert "labels -30.0, source search)" in repr(dataset[4])
     assert "labels" not in repr(dataset[6])
 

@@ -338,7 +338,7 @@ class TestBatches:
         for order in ("contiguous", "random"):
             with pytest.raises(OptionError, match="the shortest history has 0 transitions"):
                 load_icrl4aht(tmp_path / "o").dpt(batch_size=2, context=1, order=order)
-        with pytest.raises(LabelsMissingError, match="DPT needs expert actions, but 1 of 1 histories have none"):
+        with pytest.raises(LabelsMissingError, match="labels = expert: 1 of 1 histories have no expert actions"):
             load_icrl4aht(converted_release, task_id="task_b").dpt(batch_size=2, context=5)
 
     def test_positions_of_other_contexts_are_not_resumed(self, lite, reconverted_release):

@@ -1,0 +1,188 @@
+"""Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
+
+Of drawn teammates the table `teammates/draws.jsonl` has it. Others are measured, and the measurements are kept next to
+the artefacts, in hidden files `.<layout>.teammates.json`, and not repeated there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from generation.learners.resume import software_versions
+from generation.populations.headroom import LearnedHeadroom, learned_headroom
+from generation.teammates.distances import nearest_test
+from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, read_draws
+from generation.teammates.references import REFERENCE_EPISODES, reference_returns
+from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LEAST_HEADROOM, TESTED_ON
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.info import LeftOutTask
+from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+
+_DIGITS = 4
+
+
+class TeammateFacts(NamedTuple):
+    """What is known of a task's teammate.
+
+    Attributes:
+        references: returns of the reference egos with it.
+        nearest: the test teammate that acts most like it; None where it is unknown.
+        matters: whether the ego matters: some ego, or the partner that it was trained with, earns another return.
+    """
+
+    references: ReferenceEgos
+    nearest: NearestTest | None
+    matters: bool
+
+
+def teammate_facts(
+    tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, LearnedHeadroom] | None = None
+) -> dict[str, TeammateFacts]:
+    """Look up or measure the teammates of tasks, each once.
+
+    Args:
+        tasks: the tasks.
+        artefacts: folder of their artefacts, where measurements are kept.
+        suite: folder of the learned teammates.
+        headroom: task id -> measurements of learned teammates that were made before.
+
+    Returns:
+        task id -> facts.
+    """
+    headroom = headroom or {}
+    groups: dict[tuple[str, str], list[Task]] = {}
+    for task in tasks:
+        groups.setdefault((task.layout.name, json.dumps(task.teammate, sort_keys=True)), []).append(task)
+    draws = {key: find_draw(key[0], members[0].teammate) for key, members in groups.items()}
+    found = {key: _facts_of_draw(draw) for key, draw in draws.items() if draw is not None}
+    for layout in dict.fromkeys(layout for (layout, _), draw in draws.items() if draw is None):
+        keys = [key for key, draw in draws.items() if draw is None and key[0] == layout]
+        chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
+        kept, settings = artefacts / f".{layout}.teammates.json", _settings(layout, chosen)
+        measured = _read(kept, settings)
+        if measured is None:
+            by_task = _measure(get_layout(layout), chosen, suite, headroom)
+            measured = [by_task[task.task_id] for task in chosen]
+            with atomic_write(kept) as partial:
+                partial.write_bytes(msgspec.json.encode({"settings": settings, "facts": measured}))
+        found |= dict(zip(keys, measured, strict=True))
+    return {task.task_id: found[key] for key, members in groups.items() for task in members}
+
+
+def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
+    """What measurements depend on."""
+    known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": REFERENCE_EPISODES}
+    return software_versions() | {"version": version("icrl4aht-data")} | known
+
+
+def _read(path: Path, settings: dict[str, Any]) -> list[TeammateFacts] | None:
+    """The measurements in a file; None if there are none, or others than these."""
+    try:
+        content = parse_json(read_text(path))
+        if content["settings"] != json.loads(json.dumps(settings)):
+            return None
+        return msgspec.convert(content["facts"], list[TeammateFacts])
+    except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
+        return None
+
+
+def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
+    """Returns the draw of the table that a teammate entry is, or None."""
+    family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
+    if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
+        return None
+    draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
+    same = draws and _sampled(str(family), draws[0].theta_id, seed)["theta"] == teammate["theta"]
+    return draws[0] if same else None
+
+
+@cache
+def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
+    return sample_teammate(family, theta_id, "train", base_seed)
+
+
+def _facts_of_draw(draw: Draw) -> TeammateFacts:
+    nearest = NearestTest(draw.nearest, draw.distance, draw.behaviour)
+    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), nearest, draw.headroom)
+
+
+def _measure(
+    layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, LearnedHeadroom]
+) -> dict[str, TeammateFacts]:
+    """Measure teammates of one layout; how unlike the test they act, only of learned ones.
+
+    For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
+    distances would take longer than a small rebuild.
+    """
+    learned = [task for task in tasks if task.teammate_family == "rl"]
+    heuristics = [task for task in tasks if task.teammate_family != "rl"]
+    missing = [task for task in learned if task.task_id not in headroom]
+    known = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
+    returns: dict[str, Sequence[float]] = {**known}
+    returns |= learned_headroom(missing, suite) if missing else {}
+    if heuristics:
+        egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
+        for k, task in enumerate(heuristics):
+            returns[task.task_id] = [float(egos[ego][k]) for ego in ("stay", "random", "oracle")]
+    nearest = _nearest(layout, learned, suite)
+    return {
+        task_id: TeammateFacts(
+            ReferenceEgos(*(round(value, _DIGITS) for value in earned[:3]), REFERENCE_EPISODES),
+            nearest.get(task_id),
+            max(earned) - min(earned) >= LEAST_HEADROOM,
+        )
+        for task_id, earned in returns.items()
+    }
+
+
+def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:
+    """task id -> nearest test teammate; nothing on layouts without training tasks."""
+    if not tasks or layout.name not in TESTED_ON:
+        return {}
+    near = nearest_test(layout, [_build(task, suite) for task in tasks])
+    return {
+        task.task_id: NearestTest(found.teammate, round(found.distance, _DIGITS), found.behaviour)
+        for task, found in zip(tasks, near, strict=True)
+    }
+
+
+def _build(task: Task, suite: Path) -> Any:
+    return build_teammate(task.layout, task.teammate, TEAMMATE, suite=suite)
+
+
+def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
+    """Returns the heuristic families of which no draw may be a training teammate, by layout, with the reasons."""
+    found = []
+    for layout in (layout for layout in layouts if layout in TESTED_ON):
+        hosted = hosted_families(layout)
+        for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
+            draws = read_draws(layout, family)
+            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, _why_unhosted(draws)))
+    return found
+
+
+def _why_unhosted(draws: Sequence[Draw]) -> str:
+    if not draws:
+        return "no draws were measured"
+    admissible = [draw for draw in draws if draw.admissible]
+    if not admissible:
+        farthest = max(draw.distance for draw in draws)
+        return f"all {len(draws)} draws act like a test teammate (distance {farthest:.3f} at most)"
+    widest = max(float(np.ptp([draw.stay, draw.random, draw.oracle])) for draw in admissible)
+    return (
+        f"with none of the {len(admissible)} draws unlike the test does the ego matter (returns differ by {widest:.1f} "
+        f"at most)"
+    )

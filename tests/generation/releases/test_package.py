@@ -1,0 +1,230 @@
+"""Packing: what is kept of learners and of noise histories, how it is labelled, and what is left out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from generation.collection.curate import oracle_labels
+from generation.collection.record import HistoryArrays
+from generation.collection.task_folder import LABELLER_RETURNS, METADATA
+from generation.profiles import Profile, load_profile
+from generation.profiles.work import Work
+from generation.releases import measures
+from generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
+from generation.releases.package import package_release
+from generation.teammates.draws import Draw
+from generation.teammates.registry import heuristic_teammate, sample_teammate
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.facts import LABEL_EPISODES
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.info import read_info
+from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos, read_provenance
+from icrl4aht_data.overcooked.layouts import LAYOUTS
+from tests.helpers.tiny import artefact
+
+MATTERS = TeammateFacts(ReferenceEgos(0.0, 1.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3), True)
+DOES_NOT = TeammateFacts(ReferenceEgos(40.0, 39.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3), False)
+
+
+@pytest.fixture
+def profile(built) -> Profile:
+    return replace(load_profile(str(built / "tiny.toml")), learners=2, keep=4)
+
+
+def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequence[float], label: float) -> None:
+    """Write the artefact of a learner, whose first streams rise by this, in rewards only, over ten episodes.
+
+    Its last checkpoint earns `label` as a labeller.
+    """
+    folder = artefacts / work.name
+    shutil.copytree(artefact(built / "a"), folder)
+    arrays = {name: np.load(folder / f"{name}.npy") for name in HistoryArrays._fields}
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", np.concatenate([array, array], axis=1))
+    rewards = np.zeros((8, 10, 100), np.int8)
+    rewards[: len(improvements), 5:, 0] = np.array(improvements)[:, None]
+    np.save(folder / "rewards.npy", rewards.reshape(8, -1))
+    measured = json.loads((folder / LABELLER_RETURNS).read_text())
+    measured["greedy"] = [[label] * LABEL_EPISODES] * 5
+    (folder / LABELLER_RETURNS).write_text(json.dumps(measured))
+
+
+def make_noise(built: Path, work: Work, artefacts: Path) -> None:
+    """Write an artefact of two noise histories."""
+    source, folder = artefact(built / "a"), artefacts / work.name
+    folder.mkdir(parents=True)
+    for name in HistoryArrays._fields:
+        np.save(folder / f"{name}.npy", np.load(source / f"{name}.npy")[:2])
+    np.save(folder / "oracle_actions.npy", np.arange(1000).reshape(2, 500).astype(np.int8) % 6)
+    metadata = json.loads((source / METADATA).read_text())
+    for name in ("ego", "ego_hash", "checkpoint_updates"):
+        del metadata[name]
+    noise = {"histories": 2, "episodes": 5, "start": [1.0, 1.0], "end": [0.0, 0.0]}
+    (folder / METADATA).write_text(json.dumps(metadata | {"noise": noise}))
+
+
+def make_tasks(profile: Profile, count: int) -> list[Task]:
+    (first,) = {work.task.task_id: work.task for work in profile.works()}.values()
+    presets = ("default", "high_inertia")
+    entries = [heuristic_teammate("utility_greedy", preset, number) for number, preset in enumerate(presets[:count])]
+    return [first, *(make_task("teammate", "train", "demo_wide", entry, 7) for entry in entries[1:])]
+
+
+def pack(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[str, TeammateFacts]) -> Path:
+    target = tmp_path / "release"
+    return package_release(tmp_path / "artefacts", target, works, profile, tmp_path, "lite", facts=facts)
+
+
+@pytest.fixture
+def two_learners(built, profile, tmp_path) -> list[Work]:
+    """Two learners of one task: one with three streams that rise, one with one."""
+    (task,) = make_tasks(profile, 1)
+    works = [Work(task, "ppo", learner) for learner in range(2)]
+    make_learner(built, works[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
+    make_learner(built, works[1], tmp_path / "artefacts", [3, 25], 7.0)
+    return works
+
+
+def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_path):
+    task_id = two_learners[0].task.task_id
+    strict = replace(profile, least_improvement=5.0, oracle_actions=True)
+    root = pack(tmp_path, strict, two_learners, {task_id: MATTERS})
+    dataset = load_icrl4aht(root)
+    kept = [(entry.learner, entry.env_idx, entry.return_end - entry.return_start) for entry in dataset.entries]
+    assert kept == [(0, 2, 20), (0, 3, 15), (0, 0, 10), (1, 1, 25)]
+    made = read_provenance(root / "meta/provenance.json")[task_id]
+    assert (made.source, made.learners, made.streams_recorded, made.streams_kept) == ("ppo", 2, 16, 4)
+    assert (made.references, made.nearest_test) == (MATTERS.references, MATTERS.nearest)
+    assert made.filter is not None
+    assert made.filter.least_improvement == 5.0
+    assert made.filter.before.return_end == pytest.approx((10 + 4 + 20 + 15 + 3 + 25) / 16, abs=1e-3)
+    assert made.expert is not None
+    assert made.expert.return_greedy == 7.0  # of the learner whose labeller earns more
+    states = [history.state[:] for history in dataset]
+    actions = [history.actions[:] for history in dataset]
+    labels = oracle_labels(LAYOUTS["demo_wide"], states, [taken.astype(np.int8) for taken in actions])
+    for history, wanted in zip(dataset, labels, strict=True):
+        assert history.entry.has_oracle_actions
+        np.testing.assert_array_equal(history.read("oracle_actions"), wanted)
+    card = (root / "README.md").read_text()
+    assert "2 independent learners a task" in card
+    assert "Of a task's 16 streams the best 4 are kept" in card
+    assert "![Learning curves](figures/learning_curves.png)" in card
+    assert "figures/learning_curves.png" in read_manifest(root)
+    assert (root / "figures/learning_curves.png").stat().st_size < 100_000
+    assert verify_release(root).findings == []
+
+
+def test_streams_are_kept_as_before_where_no_teammate_leaves_headroom(two_learners, profile, tmp_path):
+    task_id = two_learners[0].task.task_id
+    root = pack(tmp_path, replace(profile, least_improvement=50.0), two_learners, {task_id: DOES_NOT})
+    kept = [(entry.learner, entry.env_idx) for entry in load_icrl4aht(root).entries]
+    assert kept == [(0, 2), (0, 3), (1, 1), (1, 0)]
+    assert not any(entry.has_oracle_actions for entry in load_icrl4aht(root).entries)
+    assert "No headroom: on demo_wide" in (root / "README.md").read_text()
+
+
+def test_tasks_that_teach_nothing_are_left_out_with_their_numbers(built, two_learners, profile, tmp_path):
+    flat = make_tasks(profile, 2)[1]
+    works = [*two_learners, *(Work(flat, "ppo", learner) for learner in range(2))]
+    for work in works[2:]:
+        make_learner(built, work, tmp_path / "artefacts", [4, 4], 0.0)
+    strict = replace(profile, least_improvement=5.0)
+    facts = {two_learners[0].task.task_id: MATTERS, flat.task_id: MATTERS}
+    root = pack(tmp_path, strict, works, facts)
+    (left_out,) = read_info(root).left_out
+    assert (left_out.task_id, left_out.teammate, left_out.source) == (flat.task_id, "H4/t1", "ppo")
+    assert (left_out.learners, left_out.streams, left_out.return_start, left_out.return_end) == (2, 16, 0, 1)
+    assert "no stream's end exceeds its start by 5" in left_out.reason
+    assert {entry.task_id for entry in load_icrl4aht(root).entries} == {two_learners[0].task.task_id}
+    assert verify_release(root).findings == []
+    (left_out,) = read_info(pack(tmp_path, strict, works, facts | {flat.task_id: DOES_NOT})).left_out
+    assert "the ego does not matter" in left_out.reason
+    with pytest.raises(OptionError, match="no task has histories to keep: the learners did not learn"):
+        pack(tmp_path, strict, works[2:], facts)
+
+
+def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
+    (task,) = make_tasks(profile, 1)
+    work = Work(task, "noise")
+    make_noise(built, work, tmp_path / "artefacts")
+    both = replace(profile, sources=("noise",), oracle_actions=True, least_improvement=5.0)
+    root = pack(tmp_path, both, [work], {task.task_id: MATTERS})
+    dataset = load_icrl4aht(root)
+    assert [(entry.source, entry.learner, entry.env_idx) for entry in dataset.entries] == [
+        ("noise", 0, 0),
+        ("noise", 0, 1),
+    ]
+    for number, history in enumerate(dataset):
+        wanted = np.arange(500 * number, 500 * (number + 1)).astype(np.int8) % 6
+        np.testing.assert_array_equal(history.expert_actions[:], wanted)
+        np.testing.assert_array_equal(history.read("oracle_actions"), wanted)
+        assert (history.entry.expert_return, history.entry.expert_step) == (40.0, None)
+    made = read_provenance(root / "meta/provenance.json")[task.task_id]
+    assert (made.source, made.learners, made.ego, made.filter) == ("noise", None, None, None)
+    assert made.noise is not None
+    assert made.noise["histories"] == 2
+    assert made.expert is not None
+    assert made.expert.policy_sha256 is None
+    assert verify_release(root).findings == []
+    without = pack(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
+    assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
+
+
+# Facts about teammates.
+
+
+def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
+    distance = 0.01 if family == "utility_greedy" else 0.3
+    return [Draw(layout, family, base_seed, k, "H3/t1", distance, k, 0.0, 1.0, 30.0) for k in range(2)]
+
+
+def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(measures, "read_draws", fake_draws)
+    entry = sample_teammate("assembly_line", 1, "train")
+    drawn = make_task("teammate", "train", "demo_wide", entry, 0)
+    other = make_task("teammate", "train", "demo_wide", entry | {"theta": dict(entry["theta"], x=1)}, 1)
+    assert find_draw("demo_wide", entry) == fake_draws("demo_wide", "assembly_line")[1]
+    assert find_draw("demo_wide", other.teammate) is None
+    calls = []
+
+    def measure(layout, tasks, *arguments):
+        calls.append([task.task_id for task in tasks])
+        return {task.task_id: DOES_NOT for task in tasks}
+
+    monkeypatch.setattr(measures, "_measure", measure)
+    for _ in range(2):  # the second time from the file
+        facts = teammate_facts([drawn, other], tmp_path, tmp_path)
+        assert facts[drawn.task_id] == TeammateFacts(
+            ReferenceEgos(0.0, 1.0, 30.0, 20), NearestTest("H3/t1", 0.3, 1), True
+        )
+        assert facts[other.task_id] == DOES_NOT
+    assert calls == [[other.task_id]]
+
+
+def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
+    monkeypatch.setattr(measures, "read_draws", fake_draws)
+    monkeypatch.setattr(
+        measures, "hosted_families", lambda layout: ["recipe_aware_button", "territory", "assembly_line"]
+    )
+    (found,) = unhosted_families(["demo_wide", "cramped_down"])
+    assert (found.layout, found.teammate, found.source) == ("demo_wide", "H4", "")
+    assert found.reason == "all 2 draws act like a test teammate (distance 0.010 at most)"
+
+
+@pytest.mark.slow
+def test_a_preset_is_measured(tmp_path):
+    task = make_task("teammate", "train", "demo_wide", heuristic_teammate("utility_greedy", "default", 0), 0)
+    facts = teammate_facts([task], tmp_path, tmp_path)[task.task_id]
+    assert facts.matters
+    assert facts.references.stay == 0 < facts.references.oracle
+    assert facts.nearest is None

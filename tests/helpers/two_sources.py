@@ -1,0 +1,111 @@
+"""A release with both sources, the splits train and validation, two learners a task and both kinds of labels."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, track_of
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
+from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.random_releases import random_history
+
+EPISODES, LENGTH = 6, 20
+"""Episodes of every history, and their steps."""
+
+NOISE: dict[str, Any] = {
+    "histories": 3,
+    "episodes": EPISODES,
+    "start": [1.0, 1.0],
+    "end": [0.0, 0.0],
+    "begin": [0.0, 0.0],
+    "finish": [1.0, 1.0],
+    "power": [1.0, 1.0],
+}
+"""The schedule of all noise histories: linear, from 1 to 0."""
+
+PARTS = (("train", "ppo"), ("train", "noise"), ("validation", "noise"))
+"""Split and source of each layout's tasks, in the order of the index."""
+
+
+def two_source_release(
+    root: Path,
+    kind: Kind = "lite",
+    layouts: tuple[str, ...] = ("demo_wide", "coord_simple"),
+    *,
+    tasks: int = 2,
+    ppo_episodes: int = EPISODES,
+    oracle: bool = True,
+    seed: int = 0,
+    **options: Any,
+) -> dict[int, dict[str, np.ndarray]]:
+    """Write a release with `tasks` tasks of each of `PARTS` on each layout; returns the written arrays by history id.
+
+    A task of source ppo has two learners with two histories each, of `ppo_episodes` episodes, a task of source noise
+    three histories. States and rewards are those of random play by the rules: nobody learns. `oracle=False` leaves out
+    the oracle actions; other options are those of `write_release`.
+    """
+    rng = np.random.default_rng(seed)
+    written: dict[int, dict[str, np.ndarray]] = {}
+    new = []
+    for task, source in _tasks(layouts, tasks):
+        names = itertools.product(range(2), range(2)) if source == "ppo" else ((0, number) for number in range(3))
+        histories = []
+        for learner, stream in names:
+            episodes = ppo_episodes if source == "ppo" else EPISODES
+            arrays = random_history(get_layout(task.layout_name), episodes, LENGTH, rng)
+            arrays["oracle_actions"] = _oracle_actions(arrays["actions"], rng)
+            if source == "noise":
+                arrays["expert_actions"] = arrays["oracle_actions"]
+            if not oracle:
+                del arrays["oracle_actions"]
+            written[len(written)] = arrays
+            histories.append(NewHistory(stream, arrays, learner))
+        new.append(
+            NewTask(task, _provenance(task, source, len(histories)), len(histories), lambda kept=histories: kept)
+        )
+    write_release(root, kind, new, **{"data_version": "0.0.1", "card": "# test\n", "kept_steps": LENGTH} | options)
+    return written
+
+
+def _tasks(layouts: tuple[str, ...], tasks: int) -> Iterator[tuple[Task, str]]:
+    """Tasks with teammates of all heuristic families in turn, each with its source; validation has other teammates."""
+    for number, (layout, (split, source), _) in enumerate(itertools.product(layouts, PARTS, range(tasks))):
+        teammate = {
+            "kind": "heuristic",
+            "family": list(HEURISTIC_KINDS)[number % 4],
+            "theta_id": number,
+            "base_seed": int(split == "validation"),
+            "theta": {"idle_prob": number / 64},
+        }
+        yield make_task(track_of(layout), split, layout, teammate, seed=number), source
+
+
+def _oracle_actions(actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Actions of which the chance to be those that were taken rises from 0 to 1 over the episodes."""
+    chance = np.repeat(np.linspace(1.0, 0.0, len(actions) // LENGTH), LENGTH)
+    return np.where(rng.random(len(actions)) < chance, rng.integers(0, 6, len(actions)), actions)
+
+
+def _provenance(task: Task, source: str, histories: int) -> Provenance:
+    script = source == "noise"
+    labels = ExpertLabels(None, "greedy", return_greedy=5.0, return_sampled=5.0, episodes=200)
+    family = HEURISTIC_KINDS[task.teammate["family"]]
+    return Provenance(
+        seed=task.seed,
+        source=source,
+        learners=None if script else 2,
+        noise=NOISE if script else None,
+        references=ReferenceEgos(stay=0.0, random=0.5, oracle=5.0, episodes=20),
+        nearest_test=NearestTest(f"{family}/t1", 0.25, behaviour=task.teammate["theta_id"]),
+        streams_recorded=histories,
+        streams_kept=histories,
+        expert=labels if script else None,
+    )

@@ -1,0 +1,327 @@
+"""What format version 4 adds: oracle actions, independent learners, sources in provenance, tasks that were left out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, OptionError, RemoteError
+from icrl4aht_data.format.info import LeftOutTask, read_info
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, read_provenance
+from icrl4aht_data.format.schema import FIELDS, HISTORIES, INFO, KINDS, PROVENANCE
+from icrl4aht_data.reading.shard import Shards
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.parquet import to_parquet
+from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
+
+SCRIPT = ExpertLabels(None, "the oracle's", return_greedy=40.0, episodes=200)
+SOURCES = ("noise", "ppo", "ppo", "noise")
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def mixed(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
+    """A release of each kind with both sources, two learners a task of source ppo, and oracle actions. Read only."""
+    root = tmp_path_factory.mktemp("mixed") / request.param
+    options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES}
+    experts = [SCRIPT if source == "noise" else None for source in SOURCES]
+    return root, random_release(root, request.param, experts=experts, **options)
+
+
+@pytest.fixture(scope="module")
+def lite_mixed(tmp_path_factory) -> Path:
+    """A small lite release of a noise task and a task with two learners, with everything that provenance can say."""
+    root = tmp_path_factory.mktemp("mixed") / "lite"
+    options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES[:2]}
+    random_release(root, "lite", ("coord_simple",), experts=[SCRIPT, None], **options)
+
+    def tell(content: dict[str, Any]) -> None:
+        noise, ppo = content.values()
+        noise["noise"] = {"histories": 2, "episodes": 5, "start": [0.9, 1.0], "end": [0, 0.1], "power": [0.5, 2.0]}
+        ppo["ego"] = {"total_steps": 100, "environments": 2}
+        for one in (noise, ppo):
+            one["references"] = {"stay": 0.0, "random": -1.5, "oracle": 45.0, "episodes": 20}
+            one["nearest_test"] = {"teammate": "H3/t1", "distance": 0.25}
+        noise["nearest_test"]["behaviour"] = 3
+
+    return spoiled(root, root.with_name("told"), PROVENANCE, tell)
+
+
+def spoiled(source: Path, target: Path, name: str, change: Callable[[Any], object]) -> Path:
+    """Copy a release with one file of meta/ changed and a manifest that agrees."""
+    shutil.copytree(source, target)
+    path, text = target / name, (source / name).read_text()
+    content = [json.loads(line) for line in text.splitlines()] if name.endswith("jsonl") else json.loads(text)
+    change(content)
+    lines = content if isinstance(content, list) else [content]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(target)
+    return target
+
+
+def problems(root: Path) -> str:
+    return "\n".join(f"{finding.file}: {finding.problem}" for finding in verify_release(root, level="deep").findings)
+
+
+def test_the_arrays_are_those_that_were_written(mixed):
+    root, written = mixed
+    dataset = load_icrl4aht(root)
+    for history in dataset:
+        found = history.read("oracle_actions")
+        assert found.dtype == np.int32
+        np.testing.assert_array_equal(found, written[history.entry.history_id]["oracle_actions"])
+        np.testing.assert_array_equal(history.read("oracle_actions", 33, 71), found[33:71])
+    shard = Shards(dataset.origin, dataset.index).open(SHARD)
+    with h5py.File(shard.path) as file:
+        entry = dataset.entries[0]
+        stored: Any = file[f"{entry.h5_group}/oracle_actions"]
+        assert stored.dtype == (np.int8 if dataset.info.kind == "lite" else np.int32)
+    assert dataset.column("learner").tolist() == [0, 0, 0, 0, 1, 1, 0, 0, 1, 1, 0, 0]
+    assert dataset.column("source").tolist() == ["noise"] * 2 + ["ppo"] * 8 + ["noise"] * 2
+    assert dataset.column("has_oracle_actions").all()
+    assert dataset.filter(source="noise").ids.tolist() == [0, 1, 10, 11]
+
+
+def test_verification_says_what_it_believes(mixed, lite_mixed):
+    report = verify_release(mixed[0], level="deep")
+    assert report.ok, report.findings
+    (note,) = report.notes
+    assert note.startswith("oracle actions of 12 histories: only their range was checked")
+    assert verify_release(mixed[0]).notes == []
+    told = verify_release(lite_mixed, level="deep")
+    assert told.ok, told.findings
+    assert [note.split(":")[0] for note in told.notes] == [
+        "oracle actions of 6 histories",
+        "returns of reference egos, of 2 tasks",
+        "nearest test teammates, of 2 tasks",
+        "noise schedules, of 1 tasks",
+    ]
+
+
+def test_a_remote_is_read_chunk_by_chunk(lite_mixed, tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
+    monkeypatch.setattr(MemoryFileSystem, "store", {})
+    memory = MemoryFileSystem()
+    memory.put(str(lite_mixed), "/mixed", recursive=True)
+    local, remote = load_icrl4aht(lite_mixed), load_icrl4aht("memory://mixed", source="ppo")
+    assert [history.entry for history in remote] == list(local.entries[2:])
+    np.testing.assert_array_equal(remote[3].read("oracle_actions", 7, 60), local[5].read("oracle_actions", 7, 60))
+    assert not list((remote.root / "data").rglob("*.h5")), "no shard was downloaded"
+    data = bytearray((lite_mixed / SHARD).read_bytes())
+    shard = Shards(local.origin, local.index).open(SHARD)
+    row = next(row for row, history, field in shard.chunks() if (history, field.name) == (2, "oracle_actions"))
+    data[shard.table["offset"][row]] ^= 1
+    memory.pipe(f"/mixed/{SHARD}", bytes(data))
+    with pytest.raises(RemoteError, match=r"bytes \d+\.\.\d+: expected crc32"):
+        load_icrl4aht("memory://mixed")[2].read("oracle_actions")
+
+
+def test_a_bit_flip_in_the_oracle_actions_is_found(mixed, tmp_path):
+    root = shutil.copytree(mixed[0], tmp_path / "release")
+    dataset = load_icrl4aht(mixed[0])
+    shard = Shards(dataset.origin, dataset.index).open(SHARD)
+    row = next(row for row, history, field in shard.chunks() if (history, field.name) == (3, "oracle_actions"))
+    data = bytearray((root / SHARD).read_bytes())
+    data[shard.table["offset"][row] + shard.table["size"][row] // 2] ^= 4
+    (root / SHARD).write_bytes(data)
+    assert "chunk 0 of oracle_actions in history 3" in problems(root)
+    with pytest.raises(Exception, match="chunk 0 of oracle_actions in history 3"):
+        load_icrl4aht(root).history(3).read("oracle_actions")
+    load_icrl4aht(root).history(3).read("expert_actions")
+
+
+def test_conversions_between_kinds_keep_everything(mixed, tmp_path):
+    root, written = mixed
+    dataset = load_icrl4aht(root)
+    to_release(dataset, tmp_path / "other", "full" if dataset.info.kind == "lite" else "lite")
+    to_release(load_icrl4aht(tmp_path / "other"), tmp_path / "back", dataset.info.kind)
+    for name in (HISTORIES, PROVENANCE, INFO, SHARD):
+        assert (tmp_path / "back" / name).read_bytes() == (root / name).read_bytes(), name
+    to_release(dataset, tmp_path / "seen", "observations")
+    assert verify_release(tmp_path / "seen", level="deep").ok
+    for number, history in enumerate(load_icrl4aht(tmp_path / "seen")):
+        np.testing.assert_array_equal(history.read("oracle_actions"), written[number]["oracle_actions"])
+
+
+def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
+    """They lose oracle actions, and number the streams of several learners consecutively."""
+    before = load_icrl4aht(lite_mixed)
+    to_published(before, tmp_path / "files")
+    with h5py.File(tmp_path / "files" / "histories.h5") as file:
+        assert all("oracle_actions" not in group and "expert_actions" in group for group in file.values())
+    lines = [json.loads(line) for line in (tmp_path / "files" / "histories_index.jsonl").read_text().splitlines()]
+    assert [line["env_idx"] for line in lines] == [0, 1, 0, 1, 2, 3]
+    from_published(tmp_path / "files", tmp_path / "back", data_version="0.0.1", kept_steps=20)
+    assert verify_release(tmp_path / "back", level="deep").ok
+    after = load_icrl4aht(tmp_path / "back")
+    expected = [entry.to_json() | {"has_oracle_actions": False} for entry in before.entries]
+    assert [entry.to_json() for entry in after.entries] == expected
+    assert read_provenance(tmp_path / "back" / PROVENANCE) == read_provenance(lite_mixed / PROVENANCE)
+    with pytest.raises(LabelsMissingError, match=r"has no oracle actions: .* has_oracle_actions = false"):
+        after[0].read("oracle_actions")
+
+
+def test_the_index_as_a_parquet_file(lite_mixed, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(to_parquet(load_icrl4aht(lite_mixed), tmp_path / "index.parquet"))
+    assert table.column("learner").to_pylist() == [0, 0, 0, 0, 1, 1]
+    assert table.column("has_oracle_actions").to_pylist() == [True] * 6
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (HISTORIES, lambda c: c[5].update(learner=2), "history 5: learner 2, but learners are 2"),
+        (HISTORIES, lambda c: c[4].update(learner=0), "history 4: stream 0 of its task appears twice"),
+        (HISTORIES, lambda c: c[5].update(env_idx=0), "history 5: stream 0 of learner 1 of its task appears twice"),
+        (HISTORIES, lambda c: c[5].update(env_idx=2), "history 5: env_idx 2, but a learner has 2 environments"),
+        (HISTORIES, lambda c: c[0].update(learner=-1), "Expected `int` >= 0"),
+        (HISTORIES, lambda c: c[1].update(source="ppo"), "histories 0 and 1, of one task: unlike ['source']"),
+        (
+            HISTORIES,
+            lambda c: [line.update(source="ppo") for line in c],
+            "source: expected 'ppo' as in the index",
+        ),
+        (HISTORIES, lambda c: c[0].update(has_oracle_actions=False), "the index implies"),
+        (PROVENANCE, lambda c: last(c).update(learners=0), "Expected `int` >= 1"),
+        (PROVENANCE, lambda c: last(c).update(streams_recorded=2), "expected 2 of each of 2 learners' environments"),
+        (PROVENANCE, lambda c: first(c)["noise"].update(histories=1), "noise.histories: expected at least the 2"),
+        (PROVENANCE, lambda c: first(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
+        (PROVENANCE, lambda c: first(c)["noise"].update(start=[0.9, 1.1]), "Expected `float` <= 1"),
+        (PROVENANCE, lambda c: first(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least, most]"),
+        (PROVENANCE, lambda c: first(c)["noise"].update(power=2), "Expected `array"),
+        (PROVENANCE, lambda c: first(c)["references"].pop("stay"), "missing required field `stay`"),
+        (PROVENANCE, lambda c: first(c)["references"].update(oracle="much"), "Expected `float`, got `str`"),
+        (PROVENANCE, lambda c: first(c)["nearest_test"].update(distance=1.5), "Expected `float` <= 1"),
+        (PROVENANCE, lambda c: first(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
+        (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="no"), "matching regex"),
+    ],
+)
+def test_lies(lite_mixed, tmp_path, name, change, message):
+    found = problems(spoiled(lite_mixed, tmp_path / "release", name, change))
+    assert message in found
+
+
+def first(content: dict[str, Any]) -> dict[str, Any]:
+    return next(iter(content.values()))
+
+
+def last(content: dict[str, Any]) -> dict[str, Any]:
+    return list(content.values())[-1]
+
+
+def test_labels_of_a_script_are_told_from_those_of_a_policy(lite_mixed):
+    found = json.loads((lite_mixed / PROVENANCE).read_text())
+    assert first(found)["expert"] == {
+        "policy_sha256": None,
+        "action": "the oracle's",
+        "return_greedy": 40.0,
+        "episodes": 200,
+    }
+    for content in found.values():
+        assert Provenance.from_json(content).to_json() == content
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: a.update(oracle_actions=a["oracle_actions"] + 3), "oracle_actions: expected 0..5, found 3.."),
+        (lambda a: a.update(expert_actions=(a["oracle_actions"] + 1) % 6), "differ from the script's, oracle_actions"),
+    ],
+)
+def test_arrays_that_lie(tmp_path, change, message):
+    (task,) = make_tasks(["demo_simple"])
+    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
+    arrays["oracle_actions"] = arrays["expert_actions"]
+    change(arrays)
+    new = NewTask(task, Provenance(source="noise"), 1, lambda: [NewHistory(0, arrays)])
+    root = write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+    assert message in "\n".join(finding.problem for finding in verify_release(root).findings)
+
+
+def test_a_learner_that_provenance_does_not_have_is_not_written(tmp_path):
+    (task,) = make_tasks(["demo_simple"])
+    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
+    new = NewTask(task, Provenance(learners=2), 1, lambda: [NewHistory(0, arrays, learner=2)])
+    with pytest.raises(OptionError, match="learner: expected 0 to 1, since provenance has 2 learners, found 2"):
+        write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_source_that_the_release_does_not_have(lite):
+    with pytest.raises(EmptySelectionError, match=r"no history has source='noise'.*; sources: ppo"):
+        load_icrl4aht(lite[0], source="noise")
+
+
+LEFT_OUT = LeftOutTask("task_x", "demo_wide", "H3/t12", "ppo", 2, 32, 0.1, 0.4, "the learners did not learn")
+
+
+def left_out(root: Path, *tasks: LeftOutTask) -> Path:
+    info = replace(read_info(root), left_out=list(tasks))
+    (root / INFO).write_text(json.dumps(info.to_json()))
+    write_manifest(root)
+    return root
+
+
+def test_tasks_that_were_left_out_are_kept_by_conversions(lite_mixed, tmp_path):
+    other = replace(LEFT_OUT, layout="coord_simple", learners=0, streams=0, return_start=None, return_end=None)
+    root = left_out(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
+    assert verify_release(root, level="deep").ok
+    assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
+    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # of coord_simple, as its selection
+    assert read_info(tmp_path / "out").left_out == [other]
+    random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
+    made = load_icrl4aht(tmp_path / "b").entries[0].task_id
+    left_out(tmp_path / "b", other)
+    left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
+    combine_releases(tmp_path / "both", [root, tmp_path / "b"])
+    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # each once, without the task that b has
+    assert verify_release(tmp_path / "both").ok
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "nowhere"}, "unknown layout 'nowhere'"),
+        ({"reason": "\x1b[2J"}, "printable characters"),
+        ({"learners": -1}, "Expected `int` >= 0"),
+        ({"streams": None}, "Expected `int`, got `null`"),
+    ],
+)
+def test_left_out_tasks_are_checked(lite_mixed, tmp_path, change, message):
+    task = replace(LEFT_OUT, **change)
+    root = shutil.copytree(lite_mixed, tmp_path / "r")
+    with pytest.raises(IndexFormatError, match=message):
+        read_info(left_out(root, task))
+
+
+def test_a_left_out_task_has_no_histories(lite_mixed, tmp_path):
+    task_id = load_icrl4aht(lite_mixed).entries[0].task_id
+    root = left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
+    assert f"left_out: task '{task_id}' has histories in the index" in problems(root)
+
+
+def test_a_task_of_another_source_is_not_combined(tmp_path):
+    for name in SOURCES[:2]:
+        random_release(tmp_path / name, layouts=("demo_wide",), teammates=1, streams=1, sources=(name,))
+    with pytest.raises(OptionError, match=r"task .* is of source 'ppo', but in .*noise of 'noise': .*another seed"):
+        combine_releases(tmp_path / "out", [tmp_path / "noise", tmp_path / "ppo"])
+
+
+def test_the_field_is_optional_everywhere():
+    field = FIELDS["oracle_actions"]
+    assert (field.dtype, field.compact, field.axis, field.chunk) == ("int32", "int8", "T", 2000)
+    assert set(field.optional) == {"full", "lite", "observations"}

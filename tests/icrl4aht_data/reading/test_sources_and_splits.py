@@ -1,0 +1,62 @@
+"""Histories by source, split and learner: filters, counts, representations."""
+
+from __future__ import annotations
+
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError
+
+
+def test_filters(two_sources):
+    root = two_sources[0]
+    assert len(load_icrl4aht(root)) == 2 * (8 + 6 + 6)
+    assert set(load_icrl4aht(root, source="ppo").column("split")) == {"train"}
+    validation = load_icrl4aht(root, split="validation", layout="demo_wide")
+    assert (len(validation), set(validation.column("source"))) == (6, {"noise"})
+    training = {str(task) for task in load_icrl4aht(root, split="train").column("task_id")}
+    assert not training & set(validation.column("task_id"))
+    both = load_icrl4aht(root, source=["ppo", "noise"], split=["train", "validation"])
+    assert len(both) == len(load_icrl4aht(root))
+
+
+def test_learners(two_sources):
+    dataset = load_icrl4aht(two_sources[0], source="ppo", learner=1)
+    assert (len(dataset), set(dataset.column("learner"))) == (8, {1})
+    assert len(load_icrl4aht(two_sources[0], learner=[0, 1])) == 40
+    assert dataset.filter(layout="demo_wide", learner=1).ids.tolist() == dataset.ids[:4].tolist()
+    with pytest.raises(EmptySelectionError, match=r"has learner = 7; its learners: 0, 1; it is Dataset"):
+        load_icrl4aht(two_sources[0], learner=7)
+    with pytest.raises(OptionError, match=r"learner = 'first': expected the number of a task's learner"):
+        load_icrl4aht(two_sources[0], learner="first")  # type: ignore[arg-type]
+
+
+def test_a_source_that_a_release_does_not_have(lite, two_sources):
+    with pytest.raises(EmptySelectionError, match=r"no history has source='noise'\..*; sources: ppo$"):
+        load_icrl4aht(lite[0], source="noise")
+    with pytest.raises(EmptySelectionError, match=r"split='validation', source='ppo'\..*; sources: ppo, noise$"):
+        load_icrl4aht(two_sources[0], split="validation", source="ppo")
+    with pytest.raises(UnknownNameError, match=r"unknown source 'nois'; valid: ppo, noise\. Did you mean 'noise'"):
+        load_icrl4aht(lite[0], source="nois")
+
+
+def test_representations_say_sources_and_splits(two_sources):
+    dataset = load_icrl4aht(two_sources[0])
+    assert "; splits train (28), validation (12); sources ppo (16), noise (24); 4,800 transitions" in repr(dataset)
+    one = dataset.filter(split="validation")
+    assert "; split validation; source noise; " in repr(one)
+    assert "source noise" in repr(one[0])
+    assert repr(dataset.filter(learner=1)[0]).endswith("source ppo, learner 1)")
+
+
+def test_counts_and_describe(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
+    assert dataset.counts("source") == {"ppo": 8, "noise": 12}
+    assert dataset.counts("labels") == {"expert": 20, "oracle": 20}
+    assert dataset.counts("algorithm")["utility_greedy"] > 0
+    assert dataset.filter(source="noise").counts("source") == {"noise": 12}
+    text = dataset.describe()
+    assert text.splitlines()[:3] == [repr(dataset), "split: train (14), validation (6)", "source: ppo (8), noise (12)"]
+    assert "labels: expert (20), oracle (20)" in text
+    with pytest.raises(UnknownNameError, match="unknown field of names 'score'; valid: labels, task_id"):
+        dataset.counts("score")

@@ -1,0 +1,167 @@
+"""DPT's labels, the expert's or the oracle's actions: in every storage, loader and device, and where there are none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import LabelsMissingError, OptionError, UnknownNameError, WeakLabelsWarning
+from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows, torch_loader
+from icrl4aht_data.reading.history import LABELS
+from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.random_releases import random_release
+from tests.helpers.two_sources import two_source_release
+from tests.servers.common import http_server
+
+OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
+
+
+@pytest.fixture
+def sampler(two_sources):
+    return load_icrl4aht(two_sources[0], layout="demo_wide").dpt(labels="oracle", **OPTIONS)
+
+
+def expected_targets(written, sampler, i: int) -> np.ndarray:
+    """The labels at the query steps of batch i."""
+    query, step, *_ = sampler._draw(i)
+    ids = sampler.dataset.ids[query].tolist()
+    return np.array([written[k][f"{sampler.labels}_actions"][t] for k, t in zip(ids, step, strict=True)])
+
+
+@pytest.mark.parametrize("order", ["contiguous", "random"])
+@pytest.mark.parametrize("labels", LABELS)
+@pytest.mark.parametrize("cache", CACHES)
+def test_targets_are_the_labels_of_the_query_step(two_sources, cache, labels, order):
+    """On two layouts, whose histories the caches hold in separate arrays."""
+    root, written = two_sources
+    dataset = load_icrl4aht(root, cache=cache, channels="canonical", obs="uint8")
+    sampler = dataset.dpt(labels=labels, order=order, **OPTIONS)
+    for i in range(3):
+        np.testing.assert_array_equal(sampler[i].query_target, expected_targets(written, sampler, i))
+
+
+def test_labels_change_nothing_but_the_targets(sampler):
+    expert, oracle = sampler.dataset.dpt(**OPTIONS)[0], sampler[0]
+    assert (expert.query_target != oracle.query_target).any()
+    assert_equal(expert._replace(query_target=oracle.query_target), oracle)
+
+
+def test_full_releases_have_the_same_labels(two_sources, tmp_path):
+    two_source_release(tmp_path / "full", "full")
+    lite, full = (load_icrl4aht(root, layout="demo_wide") for root in (two_sources[0], tmp_path / "full"))
+    assert_equal(lite.dpt(labels="oracle", **OPTIONS)[1], full.dpt(labels="oracle", **OPTIONS)[1])
+    assert full[0].oracle_actions.dtype == lite[0].oracle_actions.dtype == np.int32
+
+
+@pytest.mark.parametrize("cache", ["auto", "ram"])
+def test_a_remote_release_has_the_same_labels(two_sources, sampler, cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
+    with http_server(two_sources[0]) as server:
+        remote = load_icrl4aht(server.url, layout="demo_wide", cache=cache)
+        assert remote.cache.cache == ("stream" if cache == "auto" else "ram")
+        assert_equal(remote.dpt(labels="oracle", **OPTIONS)[0], sampler[0])
+        np.testing.assert_array_equal(remote[0].oracle_actions, two_sources[1][int(remote.ids[0])]["oracle_actions"])
+
+
+def test_on_a_device(sampler):
+    with sampler.batches(stop=2, device=jax.devices()[0]) as batches:
+        for i, batch in enumerate(batches):
+            assert isinstance(batch.query_target, jax.Array)
+            assert_equal(jax.device_get(batch), sampler[i])
+
+
+def test_in_loaders_of_other_libraries(sampler):
+    import grain
+
+    target = sampler[0].query_target
+    assert_equal(grain.MapDataset.source(sampler)[0], sampler[0])
+    (batch,) = torch_loader(sampler, stop=1)
+    np.testing.assert_array_equal(batch.query_target, target)
+    rows = list(hf_windows(sampler, stop=1))
+    np.testing.assert_array_equal([row["query_target"] for row in rows], target)
+
+
+def test_hugging_face_has_both_labels(two_sources, tmp_path, monkeypatch):
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
+    root, written = two_sources
+    dataset = load_icrl4aht(root).select([3, 4])
+    rows: Any = list(hf_episodes(dataset))
+    for name in ("expert_actions", "oracle_actions"):
+        found = np.concatenate([row[name] for row in rows if row["history_id"] == 3])
+        np.testing.assert_array_equal(found, written[3][name])
+    assert hf_index(dataset)["has_oracle_actions"] == [True, True]
+
+
+def test_arrays_by_name(two_sources):
+    root, written = two_sources
+    history = load_icrl4aht(root, source="noise", split="train")[0]
+    actions = written[history.entry.history_id]["oracle_actions"]
+    np.testing.assert_array_equal(history.oracle_actions, actions)
+    np.testing.assert_array_equal(history.read("oracle_actions", 5, 9), actions[5:9])
+    np.testing.assert_array_equal(history.oracle_actions, history.expert_actions)  # the oracle was the expert
+    assert (history.actions[-20:] == history.oracle_actions[-20:]).all()
+
+
+def test_resuming_needs_the_same_labels(sampler):
+    with sampler.batches(prefetch=0) as batches:
+        next(batches)
+        state = batches.state_dict()
+        batches.load_state_dict(state)
+        assert_equal(next(batches), sampler[1])
+    expert = sampler.dataset.dpt(**OPTIONS).batches(prefetch=0)
+    with pytest.raises(OptionError, match="labels = 'oracle', not 'expert'"):
+        expert.load_state_dict(state)
+    expert.load_state_dict({name: value for name, value in state.items() if name != "labels"})  # as once written
+    assert expert.next == 1
+
+
+class TestMissingLabels:
+    def test_of_all_histories(self, lite):
+        dataset = load_icrl4aht(lite[0], layout="demo_wide")
+        with pytest.raises(
+            LabelsMissingError,
+            match=r"^labels = oracle: 6 of 6 histories have no oracle actions \(first: history 6\), 6 have expert "
+            r"actions: take expert as labels, which all have$",
+        ):
+            dataset.dpt(labels="oracle", **OPTIONS)
+        with pytest.raises(LabelsMissingError, match=r"history 6 .* has no oracle actions"):
+            _ = dataset[0].oracle_actions
+
+    def test_of_some_histories(self, two_sources, monkeypatch):
+        dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
+        column = type(dataset).column
+
+        def only_noise(self, name):
+            return column(self, "source") == "noise" if name == "has_oracle_actions" else column(self, name)
+
+        monkeypatch.setattr(type(dataset), "column", only_noise)
+        with pytest.raises(LabelsMissingError, match=r"8 of 20 .*, or choose the 12 with oracle .* \(source noise\)$"):
+            dataset.dpt(labels="oracle", **OPTIONS)
+
+    def test_of_a_release_without_any(self, tmp_path):
+        random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
+        with pytest.raises(
+            LabelsMissingError, match=r"no expert actions .*, 0 have oracle actions: choose histories or a release with"
+        ):
+            load_icrl4aht(tmp_path / "r").dpt(**OPTIONS)
+
+    def test_of_an_unknown_name(self, two_sources):
+        with pytest.raises(UnknownNameError, match=r"unknown labels 'orcale'; valid: expert, oracle\. Did you mean"):
+            load_icrl4aht(two_sources[0], layout="demo_wide").dpt(labels="orcale", **OPTIONS)  # type: ignore[arg-type]
+
+
+def test_an_oracle_that_earns_little_is_warned_of(two_sources, monkeypatch):
+    """The oracle earns 5 in all tasks."""
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", source="ppo")
+    column = type(dataset).column
+
+    def earned(self, name):
+        return np.full(len(self), 11.0) if name == "return_end" else column(self, name)
+
+    monkeypatch.setattr(type(dataset), "column", earned)
+    with pytest.warns(WeakLabelsWarning, match=r"of 2 of 2 tasks come from the oracle, .*labels 5\.0, histories 11"):
+        dataset.dpt(labels="oracle", **OPTIONS)
