@@ -291,7 +291,7 @@ def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
     Layouts that the table has are kept, so that a stopped command resumes.
     """
     from generation.teammates.draws import DRAWS_TABLE
-    from generation.teammates.measuring import fill_table
+    from generation.teammates.measuring import fill_draws_table
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
     for name in names:
@@ -300,7 +300,7 @@ def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
     path = out or DRAWS_TABLE
     with progress_bars(console) as bars:
         bar = bars.add_task("draws", total=len(names), note="", unit="layouts")
-        fill_table(path, names, lambda done, name: bars.update(bar, completed=done, note=name), overwrite)
+        fill_draws_table(path, names, lambda done, name: bars.update(bar, completed=done, note=name), overwrite)
     console.print(f"wrote {path}")
 
 

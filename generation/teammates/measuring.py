@@ -27,7 +27,9 @@ DRAW_NUMBERS = [
 """Family, base_seed and theta_id of each draw of a layout."""
 
 
-def fill_table(path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool) -> None:
+def fill_draws_table(
+    path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool
+) -> None:
     """Measure the layouts whose draws a table does not have yet, and write it after each of them.
 
     Args:

@@ -26,6 +26,7 @@ from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, TRACKS
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 
 H1, H2, H3, H4 = HEURISTIC_FAMILIES
+UNCACHED = draws._bundled_draws.__wrapped__
 
 
 def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distance=0.5, oracle=30.0) -> Draw:
@@ -38,7 +39,7 @@ def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distanc
 def with_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *found: Draw) -> None:
     write_draws_table(tmp_path / "draws.jsonl", found)
     monkeypatch.setattr(draws, "DRAWS_TABLE", tmp_path / "draws.jsonl")
-    monkeypatch.setattr(draws, "_bundled_draws", draws._bundled_draws.__wrapped__)
+    monkeypatch.setattr(draws, "_bundled_draws", UNCACHED)
 
 
 def chosen(*arguments, **options) -> list[tuple[str, int]]:
