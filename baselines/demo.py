@@ -70,7 +70,7 @@ class DemoSettings:
     sources: tuple[str, ...] = ("noise",)
     tasks: tuple[Task, ...] | None = None
     protocol: Protocol = _PROTOCOL
-    seeds: Sequence[int] = range(5)
+    seeds: Sequence[int] = range(10)
 
 
 def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
@@ -203,16 +203,16 @@ def _draw_families(compared: _Compared, path: Path) -> None:
 
 
 def _conclusion(compared: _Compared) -> str:
-    """Returns what was measured, in few lines, with the limits of that."""
+    """Returns what was measured and its limits, in a few lines; the last one is the verdict."""
     run, families = compared.runs[-1], compared.families
     episodes = families[0].returns[compared.agent].shape[1]
     pairs = ", ".join(f"{of_family.family} {len(of_family.returns[compared.agent])}" for of_family in families)
     lines = [
-        f"{lead_verdict(families, compared.agent)}.",
-        f"Within a task, {describe_rise(families, compared.agent)}.",
+        *overlap_legend(run.overlaps(run.cells)),
         f"Measured on {episodes} episodes of each task and seed ({pairs}). It is one training run: the intervals leave "
         f"out how much trainings differ. Validation tasks are for choosing models, so this is no test result.",
-        *overlap_legend(run.overlaps(run.cells)),
+        f"Within a task, {describe_rise(families, compared.agent)}.",
+        f"{lead_verdict(families, compared.agent)}.",
     ]
     return "\n".join(lines)
 

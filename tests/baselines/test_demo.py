@@ -70,7 +70,7 @@ def test_every_step_is_taken(release, tmp_path, monkeypatch):
     text, page = run(tmp_path, replace(SETTINGS, root=release))
     for expected in ("1/6", "target_actions", "context_next_obs", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in text, expected
-    assert "AD earns more than stay and random with 1 of 2 families: H4; no more with H2." in text
+    assert text.endswith("AD earns more than stay and random with 1 of 2 families: H4; no more with H2.\n")
     assert "H4          0.0      2.0     50.0     12.0   +10.0 (95 % interval +10.0 to +10.0)" in text
     assert "† the agent was trained with other teammates of this family" in text
     for name in ("learning_curves.png", "adaptation.png"):
