@@ -132,6 +132,15 @@ def test_families_take_turns_and_behaviours_come_first(monkeypatch, tmp_path):
     assert chosen([], 0) == chosen([H1], 0) == []
 
 
+def test_draws_with_which_the_ego_matters_more_come_first(monkeypatch, tmp_path):
+    """Among the first draws of the behaviours, and then among the others; the first is the one of least number."""
+    first = [draw(H1, 0, oracle=20.0), draw(H1, 1, behaviour=1, oracle=50.0), draw(H1, 2, behaviour=2, oracle=-30.0)]
+    others = [draw(H1, 3, oracle=25.0), draw(H1, 4, oracle=45.0), draw(H1, 5, behaviour=1, oracle=25.0)]
+    with_table(monkeypatch, tmp_path, *first, *others)
+    assert [found.spread for found in first] == [19.0, 49.0, 32.0]
+    assert [theta_id for _, theta_id in chosen([H1], 6)] == [1, 2, 0, 4, 3, 5]
+
+
 def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):
     with_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
     assert hosted_families("demo_wide") == [H1]
