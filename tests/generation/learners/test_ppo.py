@@ -359,21 +359,6 @@ def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
     assert not joint.shaped[..., TEAMMATE].any()
 
 
-def test_a_wrong_delivery_is_forgiven_as_long_as_rewards_are_shaped(frozen, played):
-    """Also one together with presses of a button, which alone are not forgiven."""
-    rewards = jnp.float32([-20, -25, -30, -10, -5, 0, 20, 15])
-    assert len(rewards) == CONFIG.rollout
-    rollout = played.rollouts[0]._replace(reward=jnp.tile(rewards[:, None], (1, CONFIG.environments)))
-    view, slots, hidden = CompactView("paper", (CLOSET,)), np.arange(CONFIG.environments), frozen.carry.memories[EGO]
-    own = rollout.shaped[..., EGO]
-    for weight, forgiven in ((1.0, 20), (0.25, 5), (0.0, 0)):
-        found = sequences(
-            view, rollout, EGO, slots, hidden, jnp.zeros(slots.size), jnp.float32(weight), forgiveness=20.0
-        )
-        expected = np.float32([-20, -25, -30, -10, -5, 0, 20, 15]) + np.float32([forgiven] * 3 + [0] * 5)
-        np.testing.assert_allclose(found.reward, expected[:, None] + weight * own, atol=1e-5)
-
-
 def expected_teammate_actions(learner: Learner, state: LearnerState, joint: Rollout) -> np.ndarray:
     step = np.arange(len(joint.done))
     seen = np.asarray(observe(CLOSET, joint.record, TEAMMATE)).sum(axis=(2, 3, 4))

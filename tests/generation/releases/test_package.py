@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from generation.cli import cli
 from generation.collection.curate import oracle_labels
 from generation.collection.record import HistoryArrays
 from generation.collection.task_folder import LABELLER_RETURNS, METADATA
@@ -18,7 +20,7 @@ from generation.profiles import Profile, load_profile
 from generation.profiles.work import Work
 from generation.releases import measures
 from generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
-from generation.releases.package import package_release
+from generation.releases.package import package_release, recorded_sources
 from generation.teammates.draws import Draw
 from generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
@@ -154,19 +156,19 @@ def test_tasks_that_teach_nothing_are_left_out_with_their_numbers(built, two_lea
 
 
 def test_tasks_whose_histories_hardly_rise_are_left_out(built, two_learners, profile, tmp_path):
-    """The kept streams of the learners rise by 17.5 on average, those of the other task by 4.5."""
+    """The kept streams of the learners rise by 17.5 on average, those of the other task by 5.5."""
     flat = make_tasks(profile, 2)[1]
     make_learner(built, work := Work(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
     works, task_id = [*two_learners, work], two_learners[0].task.task_id
-    rising = replace(profile, least_rise=17.0)
+    rising = replace(profile, least_improvement=5.0, least_rise=17.0)
     root = pack(tmp_path, rising, works, {task_id: MATTERS, flat.task_id: MATTERS})
     (left_out,) = read_info(root).left_out
     assert (left_out.task_id, left_out.streams) == (flat.task_id, 8)
-    assert left_out.reason == "its histories rise by 4.5 on average, expected 17"
+    assert left_out.reason == "its histories rise by 5.5 on average, expected 17"
     assert {entry.task_id for entry in load_icrl4aht(root).entries} == {task_id}
     with pytest.raises(OptionError, match=r"rise by 17\.5 on average, expected 17\.6"):
-        pack(tmp_path, replace(profile, least_rise=17.6), two_learners, {task_id: MATTERS})
-    exempt = pack(tmp_path, replace(profile, least_rise=50.0), two_learners, {task_id: DOES_NOT})
+        pack(tmp_path, replace(rising, least_rise=17.6), two_learners, {task_id: MATTERS})
+    exempt = pack(tmp_path, replace(rising, least_rise=50.0), two_learners, {task_id: DOES_NOT})
     assert read_info(exempt).left_out == []
 
 
@@ -201,6 +203,11 @@ def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     assert made.expert is not None
     assert made.expert.policy_sha256 is None
     assert verify_release(root).findings == []
+    assert recorded_sources(root) == {task.task_id: "noise"}
+    assert recorded_sources(tmp_path) == {}
+    arguments = ["--profile", built / "tiny.toml", "--tasks", root / "meta/tasks.jsonl", "--out", tmp_path / "out"]
+    result = CliRunner().invoke(cli, ["generate", *map(str, arguments)])
+    assert f"task {task.task_id}: its source is noise, those of profile tiny are ppo" in str(result.exception)
     without = pack(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
 
