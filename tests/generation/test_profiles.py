@@ -343,12 +343,12 @@ LEARNED_ENTRY = {
         (
             "presets =",
             'sampled = { families = ["assembly_line"], per_layout = 999 }\npresets =',
-            r"coord_simple: 999 drawn teammates requested of assembly_line, which have only \d+ distinct draws",
+            r"coord_simple: 999 drawn training teammates requested of assembly_line, with only \d+ distinct draws",
         ),
         (
             "presets =",
             'sampled = { families = ["utility_greedy"], per_layout = 1 }\npresets =',
-            r"coord_simple cannot host drawn teammates of utility_greedy: ",
+            r"coord_simple cannot host drawn training teammates of utility_greedy: ",
         ),
         (
             "presets =",
