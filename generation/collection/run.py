@@ -130,7 +130,6 @@ def _run_all(
 def _executor(options: CollectOptions) -> Executor:
     if options.executor == "local":
         return run_in_process
-
     return run_on_ray
 
 

@@ -83,8 +83,8 @@ class RebuildCost:
         lite_bytes, full_bytes: sizes of a lite and of a full release.
         device: description of the measured device.
         teammate_steps_per_second: measured speed of training populations; None without populations.
-        steps_per_second: measured speed of training egos; None without egos.
-        compile_seconds: time to compile an ego's task; None without egos.
+        steps_per_second: measured speed of training egos, the mean of all; None without egos.
+        compile_seconds: time to compile an ego's task, the longest; None without egos.
         noise_steps_per_second: measured speed of playing noise histories; None without any.
         noise_programs: number of programs to compile for them, one for each layout and teammate family.
         noise_compile_seconds: time to compile one of them; None without any.
@@ -237,16 +237,21 @@ def estimate_cost(
 
 
 def ppo_cost(profile: Profile, devices: int) -> SourceCost:
-    """Estimate the cost of a profile's egos, measuring the speed of one of them."""
-    speed = calibrate(profile.ego, partial(task_learner, profile))
+    """Estimate the cost of a profile's egos, measuring the speed of one with each of their hyper-parameters."""
     counts = {layout: profile.tasks_on(layout, "ppo") for layout in profile.layouts}
     egos = [profile.ego_on(layout) for layout, count in counts.items() for _ in range(count * profile.learners)]
+    if not egos:
+        return SourceCost()
     histories = {layout: profile.ego_on(layout).episodes * KEPT_STEPS for layout in counts}
-    seconds = [speed.seconds(ego.updates * ego.steps_per_update) for ego in egos]
+    speeds = {ego: calibrate(ego, partial(task_learner, profile)) for ego in dict.fromkeys(egos)}
+    steps = [ego.updates * ego.steps_per_update for ego in egos]
+    playing = sum(count / speeds[ego].steps_per_second for ego, count in zip(egos, steps, strict=True))
+    seconds = [speeds[ego].seconds(count) for ego, count in zip(egos, steps, strict=True)]
+    speed = LearnerSpeed(sum(steps) / playing, max(found.compile_seconds for found in speeds.values()))
     return SourceCost(
         tasks=sum(counts.values()),
         units=len(egos),
-        steps=sum(ego.updates * ego.steps_per_update for ego in egos),
+        steps=sum(steps),
         recorded=sum(ego.environments * ego.episodes * KEPT_STEPS for ego in egos),
         kept=sum(count * profile.keep * histories[layout] for layout, count in counts.items()),
         artefact_bytes=sum(
@@ -263,6 +268,8 @@ def noise_cost(profile: Profile, devices: int) -> SourceCost:
     """Estimate the cost of a profile's noise histories, measuring the speed of one batch of episodes."""
     counts = {layout: profile.tasks_on(layout, "noise") for layout in profile.layouts}
     tasks, config = sum(counts.values()), profile.noise
+    if not tasks:
+        return SourceCost()
     speed = noise_speed(profile)
     of_task = config.histories * config.episodes * KEPT_STEPS
     families = {(work.task.layout.name, work.task.teammate["family"]) for work in _noise_works(profile)}

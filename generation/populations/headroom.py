@@ -15,10 +15,9 @@ from generation.env import Environment
 from generation.learners.rollout import init_rollout, policy_player, roll_out
 from generation.policy import Policy
 from generation.populations.train import RESPONSES
-from generation.teammates.draws import LEAST_HEADROOM
 from generation.teammates.learned import build_learned
 from generation.teammates.references import REFERENCE_EPISODES, reference_returns
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.checkpoints import checkpoint_folder
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE

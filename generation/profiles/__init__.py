@@ -89,7 +89,7 @@ def _profile(name: str, content: dict[str, Any]) -> Profile:
         sources=sources,
         learners=_typed("tasks.learners", tasks.get("learners", 1), int),
         presets=_names("tasks.presets", tasks.get("presets", [])),
-        sampled=_sampled(tasks["sampled"], layouts) if "sampled" in tasks else None,
+        sampled=_sampled(tasks["sampled"], layouts, sources) if "sampled" in tasks else None,
         algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
         policies=_switch("release.policies", release.get("policies", False)),
         oracle_actions=_switch("release.oracle_actions", release.get("oracle_actions", False)),
@@ -98,9 +98,13 @@ def _profile(name: str, content: dict[str, Any]) -> Profile:
     )
 
 
-def _sampled(values: dict[str, Any], layouts: tuple[str, ...]) -> SampledConfig:
+def _sampled(values: dict[str, Any], layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
     """[tasks.sampled], where every value holds for all layouts or is a table of them."""
+    _typed("tasks.sampled", values, dict)
     _check_keys(values, "tasks.sampled.", {"families", "per_layout", "ppo", "validation"})
+    for key in ("families", "per_layout"):
+        if key not in values:
+            raise OptionError(f"missing key 'tasks.sampled.{key}'")
 
     def names(key: str, value: Any) -> tuple[str, ...]:
         families = _names(key, value)
@@ -125,6 +129,8 @@ def _sampled(values: dict[str, Any], layouts: tuple[str, ...]) -> SampledConfig:
             raise OptionError(
                 f"tasks.sampled.ppo = {ppo[name]} on {name}: expected at most per_layout = {per_layout[name]}"
             )
+    if any(validation.values()) and "noise" not in sources:
+        raise OptionError("tasks.sampled.validation: validation teammates need 'noise' among tasks.sources")
     return SampledConfig(families, per_layout, ppo, validation)
 
 

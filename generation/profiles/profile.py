@@ -64,9 +64,9 @@ class SampledConfig:
 
     Attributes:
         families: layout -> families, which take turns.
-        per_layout: layout -> number of training teammates.
+        per_layout: layout -> number of training teammates, which the source "noise" has all of.
         ppo: layout -> how many of these, the first ones, learners of the source "ppo" play with.
-        validation: layout -> number of validation teammates, which no training history has.
+        validation: layout -> number of validation teammates, which only the source "noise" has.
     """
 
     families: dict[str, tuple[str, ...]]
@@ -106,7 +106,7 @@ class Profile:
         layouts: names of the layouts.
         sources: how histories are made: "ppo", "noise" or both.
         learners: independent learners of each task of the source "ppo".
-        presets: teammates by the heuristic H4 `utility_greedy`, on every layout.
+        presets: teammates by the heuristic H4 `utility_greedy`, on every layout and of every source.
         sampled: teammates by heuristics with sampled parameters.
         algorithms: layout -> algorithms of its learned teammates.
         ego_layouts: layout -> hyper-parameters of its egos, where they differ from `ego`.
@@ -227,13 +227,12 @@ class Profile:
         return len(self._heuristic_tasks(layout, source)) + learned
 
     def _heuristic_tasks(self, layout: str, source: str) -> list[Task]:
-        track, tasks = track_of(layout), []
-        if source == "ppo":
-            first = self.layouts.index(layout) * len(self.presets)
-            tasks += [
-                make_task(track, "train", layout, heuristic_teammate("utility_greedy", preset, number), first + number)
-                for number, preset in enumerate(self.presets)
-            ]
+        track, first = track_of(layout), self.layouts.index(layout) * len(self.presets)
+        tasks = [
+            make_task(track, "train", layout, heuristic_teammate("utility_greedy", preset, number), first + number)
+            for number, preset in enumerate(self.presets)
+        ]
+        tasks = [_of_source(task, source) for task in tasks]
         if self.sampled is None:
             return tasks
         entries = [("train", entry) for entry in self.sampled.training(layout, source)]
@@ -257,7 +256,7 @@ def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
 
 
 def _of_source(task: Task, source: str) -> Task:
-    """A learned teammate's task as one of a source: those of "ppo" have the seeds of the suite's manifest."""
+    """A task with a preset or a learned teammate as one of a source: those of "ppo" keep their seed."""
     if source == "ppo":
         return task
     return make_task(task.track, task.split, task.layout.name, task.teammate, _first_seed(source) + task.seed)

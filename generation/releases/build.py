@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 
@@ -71,34 +72,28 @@ def build_releases(
     else:
         works, headroom, left_out = profile.works_of(tasks, sources or {}), {}, []
     collect_tasks(works, profile, out, console, options or CollectOptions(), suite)
-    members = {work.task.task_id: work.task for work in works}
-    releases = []
+    tasks = list({work.task.task_id: work.task for work in works}.values())
+    artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
     with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
-        facts = teammate_facts(members.values(), out / "artefacts", suite, headroom)
-        for kind in kinds:
-            with progress_bars(console) as bars:
-                steps = [f"choosing labellers for {kind}", f"packing {kind}"]
-                rows = [bars.add_task(step, total=len(members), note="", unit="tasks") for step in steps]
-
-                def advance(step: int, bars=bars, rows=rows) -> None:
-                    bars.advance(rows[step])
-
+        facts = teammate_facts(tasks, artefacts, suite, headroom)
+        for kind, release in zip(kinds, releases, strict=True):
+            with _packing_bars(kind, len(tasks), console) as advance:
                 package_release(
-                    out / "artefacts",
-                    out / kind,
-                    works,
-                    profile,
-                    suite,
-                    kind,
-                    advance,
-                    facts=facts,
-                    left_out=left_out,
+                    artefacts, release, works, profile, suite, kind, advance, facts=facts, left_out=left_out
                 )
-            releases.append(out / kind)
         for release in releases:
             print_statistics(read_info(release), console)
             print_learning(read_content(release), console)
     return releases
+
+
+@contextmanager
+def _packing_bars(kind: Kind, tasks: int, console: Console) -> Iterator[Callable[[int], None]]:
+    """Show the two steps of packing; yields a function that is called with the number of a task's finished step."""
+    with progress_bars(console) as bars:
+        steps = [f"choosing labellers for {kind}", f"packing {kind}"]
+        rows = [bars.add_task(step, total=tasks, note="", unit="tasks") for step in steps]
+        yield lambda step: bars.advance(rows[step])
 
 
 def train_teammates(

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
 from generation.learners.resume import software_versions
 from generation.populations.headroom import LearnedHeadroom, learned_headroom
@@ -39,7 +38,7 @@ class TeammateFacts(NamedTuple):
 
     Attributes:
         references: returns of the reference egos with it.
-        nearest: the test teammate that acts most like it; None where it is unknown.
+        nearest: the test teammate, of any family, that acts most like it; None where it is unknown.
         matters: whether the ego matters: some ego, or the partner that it was trained with, earns another return.
     """
 
@@ -115,8 +114,10 @@ def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
 
 
 def _facts_of_draw(draw: Draw) -> TeammateFacts:
-    nearest = NearestTest(draw.nearest, draw.distance, draw.behaviour)
-    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), nearest, draw.headroom)
+    near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
+    if draw.other_distance < draw.distance:
+        near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
+    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), near, draw.headroom)
 
 
 def _measure(
@@ -178,9 +179,9 @@ def _why_unhosted(draws: Sequence[Draw]) -> str:
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
         farthest = max(draw.distance for draw in draws)
-        return f"all {len(draws)} draws act like a test teammate (distance {farthest:.3f} at most)"
-    widest = max(float(np.ptp([draw.stay, draw.random, draw.oracle])) for draw in admissible)
+        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
+    widest = max(draw.spread for draw in admissible)
     return (
-        f"with none of the {len(admissible)} draws unlike the test does the ego matter (returns differ by {widest:.1f} "
-        f"at most)"
+        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
+        f"differ by {widest:.1f} at most)"
     )

@@ -71,9 +71,7 @@ def package_release(
         OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
     """
     check_release_folder(target, profile)
-    tasks: dict[str, list[Work]] = {}
-    for work in works:
-        tasks.setdefault(work.task.task_id, []).append(work)
+    tasks = _by_task(works)
     if facts is None:
         facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
     headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
@@ -94,18 +92,20 @@ def package_release(
     if profile.sampled is not None:
         omitted += unhosted_families(profile.layouts)
     with TemporaryDirectory() as folder:
-        picture = Path(folder) / "curves.png"
-        plot_source_curves(curves, picture)
+        files = {CURVES_FIGURE: Path(folder) / "curves.png"}
+        plot_source_curves(curves, files[CURVES_FIGURE])
+        version, done = profile.data_version, lambda task: advance(1)
         return write_release(
-            target,
-            kind,
-            new,
-            data_version=profile.data_version,
-            left_out=omitted,
-            files={CURVES_FIGURE: picture},
-            overwrite=True,
-            done=lambda task: advance(1),
+            target, kind, new, data_version=version, left_out=omitted, files=files, overwrite=True, done=done
         )
+
+
+def _by_task(works: Sequence[Work]) -> dict[str, list[Work]]:
+    """task id -> its units of work."""
+    tasks: dict[str, list[Work]] = {}
+    for work in works:
+        tasks.setdefault(work.task.task_id, []).append(work)
+    return tasks
 
 
 def check_release_folder(target: Path, profile: Profile) -> None:

@@ -21,11 +21,10 @@ from jaxtyping import Array, Key, UInt8
 from generation.env import Environment
 from generation.learners.rollout import init_rollout, roll_out
 from generation.policy import Policy
-from generation.teammates.draws import SAME_BEHAVIOUR
 from generation.teammates.instances import INSTANCES, published_thetas
 from generation.teammates.references import player_in_some, reference_egos, stacked_families
 from generation.teammates.registry import build_teammate
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, TESTED_ON
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, SAME_BEHAVIOUR, TESTED_ON
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE

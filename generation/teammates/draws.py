@@ -28,6 +28,7 @@ DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
 DRAWS_PER_SEED = {0: 32, 1: 8}
 """base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""
 
+_OF_SEED = {0: "drawn training", 1: "drawn validation"}
 
 _VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
 
@@ -127,8 +128,8 @@ def drawn_teammates(
     available = sum(map(len, queues))
     if count > available:
         raise OptionError(
-            f"{name}: {count} drawn teammates requested of {', '.join(families) or 'no family'}, which have only "
-            f"{available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
+            f"{name}: {count} {_OF_SEED[base_seed]} teammates requested of {', '.join(families) or 'no family'}, with "
+            f"only {available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     return [(sample_teammate(draw.family, draw.theta_id, "train", base_seed), draw) for draw in turns[:count]]
@@ -158,7 +159,7 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
     draws = _usable(layout, family, base_seed)
     if not draws:
         raise OptionError(
-            f"{layout} cannot host drawn teammates of {family}: {_reason(layout, family, base_seed)}; "
+            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {_reason(layout, family, base_seed)}; "
             f"name other families ({_hosted_text(layout, base_seed)})"
         )
     first = {draw.behaviour: draw for draw in reversed(draws)}

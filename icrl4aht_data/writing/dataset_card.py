@@ -206,16 +206,26 @@ def _limits(release: CardContent) -> list[str]:
 
 def _heuristics_in_training(release: CardContent) -> Iterable[str]:
     """Yield limits about heuristics among the teammates of histories that models are trained on."""
-    families: dict[bool, set[str]] = {True: set(), False: set()}
+    tested, drawn, alike = set(), set(), set()
     for members in release.histories.values():
         first, of_task = members[0], release.provenance.get(members[0].task_id, Provenance())
-        if first.split != "test" and first.teammate_family != "rl":
-            near = of_task.nearest_test
-            families[near is not None and near.distance >= SAME_BEHAVIOUR].add(first.teammate_family)
-    if families[True]:
-        yield sentence("drawn_in_training", families=", ".join(sorted(families[True])), least=f"{SAME_BEHAVIOUR:g}")
-    if families[False]:
-        yield sentence("heuristics_in_training", families=", ".join(sorted(families[False])))
+        if first.split == "test" or first.teammate_family == "rl":
+            continue
+        family, near = first.teammate_family, of_task.nearest_test
+        same = near is not None and near.distance < SAME_BEHAVIOUR
+        if near is None or (same and near.teammate.split("/")[0] == family):
+            tested.add(family)
+            continue
+        drawn.add(family)
+        if same:
+            alike.add(f"{family} on {first.layout} like {near.teammate}")
+    least = f"{SAME_BEHAVIOUR:g}"
+    if drawn:
+        yield sentence("drawn_in_training", families=", ".join(sorted(drawn)), least=least)
+    if alike:
+        yield sentence("drawn_like_others", names=", ".join(sorted(alike)), least=least)
+    if tested:
+        yield sentence("heuristics_in_training", families=", ".join(sorted(tested)))
 
 
 def _flat_tasks(release: CardContent) -> Iterable[str]:

@@ -200,6 +200,33 @@ def test_sampled_teammates_of_both_sources(changed):
     ]
 
 
+def test_presets_of_both_sources(changed):
+    works = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\npresets =')).works()
+    assert [(work.source, work.task.seed) for work in works] == [
+        *(("ppo", seed) for seed in range(4)),
+        *(("noise", 2_000_000 + seed) for seed in range(4)),
+    ]
+    assert [work.task.teammate for work in works[:4]] == [work.task.teammate for work in works[4:]]
+
+
+def test_given_tasks_have_the_sources_that_they_had(changed):
+    """As those of a release, which say in their provenance how their histories were made."""
+    profile = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\nlearners = 2\npresets ='))
+    tasks = [work.task for work in profile.works() if work.learner == 0][:3]
+    first, second, third = (task.task_id for task in tasks)
+    found = profile.works_of(tasks, {second: "noise", third: "ppo"})
+    assert [(work.task.task_id, work.source, work.learner) for work in found] == [
+        (first, "ppo", 0),
+        (first, "ppo", 1),
+        (second, "noise", 0),
+        (third, "ppo", 0),
+        (third, "ppo", 1),
+    ]
+    of_ppo = load_profile(changed("keep = 8", "keep = 7"))
+    with pytest.raises(OptionError, match=rf"task {second}: its source is noise, those of profile mine are ppo: "):
+        of_ppo.works_of(tasks, {second: "noise"})
+
+
 LEARNED_ENTRY = {
     "kind": "rl",
     "family": "fcp",
@@ -316,12 +343,23 @@ LEARNED_ENTRY = {
         (
             "presets =",
             'sampled = { families = ["assembly_line"], per_layout = 999 }\npresets =',
-            r"coord_simple: 999 drawn teammates requested of assembly_line, which have only \d+ distinct draws",
+            r"coord_simple: 999 drawn training teammates requested of assembly_line, with only \d+ distinct draws",
         ),
         (
             "presets =",
             'sampled = { families = ["utility_greedy"], per_layout = 1 }\npresets =',
-            r"coord_simple cannot host drawn teammates of utility_greedy: ",
+            r"coord_simple cannot host drawn training teammates of utility_greedy: ",
+        ),
+        (
+            "presets =",
+            'sampled = { families = ["assembly_line"] }\npresets =',
+            r"missing key 'tasks\.sampled\.per_layout'",
+        ),
+        ("presets =", "sampled = 3\npresets =", r"tasks\.sampled = 3: expected dict"),
+        (
+            "presets =",
+            'sampled = { families = ["assembly_line"], per_layout = 1, validation = 1 }\npresets =',
+            r"tasks\.sampled\.validation: validation teammates need 'noise' among tasks\.sources",
         ),
         ("total_steps = 32000", "total_steps = 13500", r"ego\.total_steps gives 4 episodes .*expected at least 5"),
         ("keep = 8", "keep 8", r"not TOML: "),

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -23,11 +24,14 @@ from generation.profiles import Profile, load_profile
 from generation.profiles.noise_config import NoiseConfig
 from generation.profiles.work import Work
 from generation.releases.check import compare_rebuilds
+from generation.teammates.distances import act_along
+from generation.teammates.learned import build_learned
 from generation.teammates.registry import build_teammate, heuristic_teammate
-from icrl4aht_data.benchmark.tasks import make_task, write_tasks
+from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import DiskFullError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.rules import step
+from tests.generation.teammates.test_learned import entry, save
 from tests.helpers.tiny import NOISE, start
 
 PIECE = 16
@@ -254,6 +258,26 @@ def test_a_learned_teammate_needs_its_suite(profile, tmp_path):
 
 
 @pytest.mark.slow
+def test_histories_with_a_learned_teammate(profile, tmp_path):
+    """It acts greedily on its own observations, and a resumed task has the bits of an uninterrupted one."""
+    save(tmp_path / "suite/member", LAYOUT)
+    mate = entry(tmp_path / "suite", "member")
+    work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
+    folder, suite = tmp_path / work.name, tmp_path / "suite"
+    with pytest.raises(KeyboardInterrupt):
+        run_noise(work, profile, folder, stop_after(1), suite=suite, save_seconds=0)
+    assert run_noise(work, profile, folder, suite=suite)
+    run_noise(work, profile, tmp_path / "again", suite=suite)
+    assert not compare_rebuilds(folder, tmp_path / "again").differences
+    states = np.load(folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)
+    policy = build_learned(LAYOUT, suite / "member")
+    expected = act_along(LAYOUT, [policy], jnp.asarray(states))[0].T
+    played = np.load(folder / "teammate_actions.npy").reshape(40, 100)[[0, 25]]
+    np.testing.assert_array_equal(played, expected)
+    assert len(np.unique(played)) > 1
+
+
+@pytest.mark.slow
 def test_killed_at_two_moments(made, tmp_path):
     (tmp_path / "noise.toml").write_text(NOISE)
     folder = tmp_path / WORK.name
@@ -274,12 +298,12 @@ def test_killed_at_two_moments(made, tmp_path):
 
 @pytest.mark.slow
 def test_the_commands(tmp_path):
-    """Tasks of a file, generated in one process and on Ray, with the same bits; the release is valid."""
+    """A release generated in one process, then its tasks on Ray, with the same bits; the release is valid."""
     (tmp_path / "noise.toml").write_text(NOISE)
-    write_tasks(tmp_path / "tasks.jsonl", [WORK.task])
-    options = ["--profile", str(tmp_path / "noise.toml"), "--tasks", str(tmp_path / "tasks.jsonl")]
-    for name, executor in (("a", ()), ("b", ("--executor", "ray", "--workers", "1"))):
-        process = start("-m", "generation", "generate", *options, *executor, "--out", str(tmp_path / name))
+    command = ("-m", "generation", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
+    again = ("--tasks", str(tmp_path / "a/lite/meta/tasks.jsonl"), "--executor", "ray", "--workers", "1")
+    for name, options in (("a", ()), ("b", again)):
+        process = start(*command, str(tmp_path / name), *options)
         output, errors = process.communicate()
         assert process.returncode == 0, output + errors
         assert "demo_wide with utility_greedy, noise: finished at " in output

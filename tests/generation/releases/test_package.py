@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from generation.cli import cli
 from generation.collection.curate import oracle_labels
 from generation.collection.record import HistoryArrays
 from generation.collection.task_folder import LABELLER_RETURNS, METADATA
@@ -18,7 +20,7 @@ from generation.profiles import Profile, load_profile
 from generation.profiles.work import Work
 from generation.releases import measures
 from generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
-from generation.releases.package import package_release
+from generation.releases.package import package_release, recorded_sources
 from generation.teammates.draws import Draw
 from generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
@@ -153,6 +155,31 @@ def test_tasks_that_teach_nothing_are_left_out_with_their_numbers(built, two_lea
         pack(tmp_path, strict, works[2:], facts)
 
 
+def test_tasks_whose_histories_hardly_rise_are_left_out(built, two_learners, profile, tmp_path):
+    """The kept streams of the learners rise by 17.5 on average, those of the other task by 5.5."""
+    flat = make_tasks(profile, 2)[1]
+    make_learner(built, work := Work(flat, "ppo"), tmp_path / "artefacts", [4, 6, 3, 5], 5.0)
+    works, task_id = [*two_learners, work], two_learners[0].task.task_id
+    rising = replace(profile, least_improvement=5.0, least_rise=17.0)
+    root = pack(tmp_path, rising, works, {task_id: MATTERS, flat.task_id: MATTERS})
+    (left_out,) = read_info(root).left_out
+    assert (left_out.task_id, left_out.streams) == (flat.task_id, 8)
+    assert left_out.reason == "its histories rise by 5.5 on average, expected 17"
+    assert {entry.task_id for entry in load_icrl4aht(root).entries} == {task_id}
+    with pytest.raises(OptionError, match=r"rise by 17\.5 on average, expected 17\.6"):
+        pack(tmp_path, replace(rising, least_rise=17.6), two_learners, {task_id: MATTERS})
+    exempt = pack(tmp_path, replace(rising, least_rise=50.0), two_learners, {task_id: DOES_NOT})
+    assert read_info(exempt).left_out == []
+
+
+def test_noise_histories_that_hardly_rise_are_left_out_too(built, profile, tmp_path):
+    (task,) = make_tasks(profile, 1)
+    make_noise(built, Work(task, "noise"), tmp_path / "artefacts")
+    rising = replace(profile, sources=("noise",), least_rise=10.0)
+    with pytest.raises(OptionError, match="no task has histories to keep: its histories rise by "):
+        pack(tmp_path, rising, [Work(task, "noise")], {task.task_id: MATTERS})
+
+
 def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     (task,) = make_tasks(profile, 1)
     work = Work(task, "noise")
@@ -176,6 +203,11 @@ def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     assert made.expert is not None
     assert made.expert.policy_sha256 is None
     assert verify_release(root).findings == []
+    assert recorded_sources(root) == {task.task_id: "noise"}
+    assert recorded_sources(tmp_path) == {}
+    arguments = ["--profile", built / "tiny.toml", "--tasks", root / "meta/tasks.jsonl", "--out", tmp_path / "out"]
+    result = CliRunner().invoke(cli, ["generate", *map(str, arguments)])
+    assert f"task {task.task_id}: its source is noise, those of profile tiny are ppo" in str(result.exception)
     without = pack(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
 
@@ -211,6 +243,19 @@ def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkey
     assert calls == [[other.task_id]]
 
 
+def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatch):
+    def draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
+        (first, *_) = fake_draws(layout, family, base_seed)
+        return [first._replace(other="H1/t0", other_distance=0.006), first._replace(theta_id=1, other_distance=0.4)]
+
+    monkeypatch.setattr(measures, "read_draws", draws)
+    entries = [sample_teammate("assembly_line", theta_id, "train") for theta_id in range(2)]
+    tasks = [make_task("teammate", "train", "demo_wide", entry, 0) for entry in entries]
+    facts = teammate_facts(tasks, Path("no artefacts"), Path("no suite"))
+    nearest = [facts[task.task_id].nearest for task in tasks]
+    assert nearest == [NearestTest("H1/t0", 0.006, 0), NearestTest("H3/t1", 0.3, 0)]
+
+
 def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
     monkeypatch.setattr(measures, "read_draws", fake_draws)
     monkeypatch.setattr(
@@ -218,7 +263,7 @@ def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
     )
     (found,) = unhosted_families(["demo_wide", "cramped_down"])
     assert (found.layout, found.teammate, found.source) == ("demo_wide", "H4", "")
-    assert found.reason == "all 2 draws act like a test teammate (distance 0.010 at most)"
+    assert found.reason == "all 2 draws act like a test teammate of the family (distance 0.010 at most)"
 
 
 @pytest.mark.slow

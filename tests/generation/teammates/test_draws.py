@@ -87,7 +87,7 @@ def test_no_chosen_teammate_acts_like_a_test_instance(layout):
         with pytest.raises(OptionError, match="distinct draws"):
             drawn_teammates(layout, families, len(teammates) + 1, seed)
         for family in {*HEURISTIC_FAMILIES} - {*families}:
-            with pytest.raises(OptionError, match=f"{layout} cannot host drawn teammates of {family}: "):
+            with pytest.raises(OptionError, match=rf"{layout} cannot host drawn \w+ teammates of {family}: "):
                 drawn_teammates(layout, [family], 1, seed)
 
 
@@ -130,6 +130,15 @@ def test_families_take_turns_and_behaviours_come_first(monkeypatch, tmp_path):
     assert chosen([H3, H1], 6) == [(H3, 5), (H1, 0), (H3, 6), (H1, 2), (H1, 4), (H1, 1)]
     assert chosen([H3, H1, H3], 2) == [(H3, 5), (H1, 0)]
     assert chosen([], 0) == chosen([H1], 0) == []
+
+
+def test_draws_with_which_the_ego_matters_more_come_first(monkeypatch, tmp_path):
+    """Among the first draws of the behaviours, and then among the others; the first is the one of least number."""
+    first = [draw(H1, 0, oracle=20.0), draw(H1, 1, behaviour=1, oracle=50.0), draw(H1, 2, behaviour=2, oracle=-30.0)]
+    others = [draw(H1, 3, oracle=25.0), draw(H1, 4, oracle=45.0), draw(H1, 5, behaviour=1, oracle=25.0)]
+    with_table(monkeypatch, tmp_path, *first, *others)
+    assert [found.spread for found in first] == [19.0, 49.0, 32.0]
+    assert [theta_id for _, theta_id in chosen([H1], 6)] == [1, 2, 0, 4, 3, 5]
 
 
 def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):

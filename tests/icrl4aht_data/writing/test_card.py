@@ -103,6 +103,17 @@ def test_teammates_with_references_distance_and_behaviour(content):
     assert "Of the behaviours of validation (1), 0 also occur in training" in table
 
 
+def test_drawn_teammates_that_act_like_another_family_of_the_test_are_named(content):
+    """Only the own family of a drawn teammate excludes it, so the card says which act like another one."""
+    first, own = content.tasks[0], "None acts like a test teammate of its own family"
+    assert own in render_card(content)
+    assert "another family (distance below" not in render_card(content)
+    near = {first.task_id: made("ppo", distance=0.006, nearest="H1/t0")}
+    card = render_card(replace(content, provenance=dict(content.provenance) | near))
+    assert own in card
+    assert "(distance below 0.02): H3 on demo_wide like H1/t0." in card
+
+
 def test_long_tables_are_summarized(content, monkeypatch):
     monkeypatch.setattr(card_tables, "LONGEST_TABLE", 2)
     other = drawn("demo_wide", "H3", 13, seed=2)
@@ -139,7 +150,7 @@ def test_the_card_says_what_is_left_out_and_what_sources_are_not(content):
 
 def test_teammates_that_act_like_the_test_are_named(content):
     near = [task.task_id for task in content.tasks if task.layout.name == "coord_simple"]
-    content = replace(content, provenance=dict(content.provenance) | {near[0]: made("ppo", 1.5, 0.01)})
+    content = replace(content, provenance=dict(content.provenance) | {near[0]: made("ppo", 1.5, 0.01, 0, "H1/t3")})
     card = render_card(content)
     assert "Training and validation teammates of H3 are heuristics whose parameters were drawn" in card
     assert "Its training teammates H1 are heuristics, in place of the learned teammates" in card
