@@ -43,8 +43,10 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
     """Return a table of what `summarize_tasks` returned, with a row for each task."""
-    names = ("layout", "track", "split", "teammate", "source", "histories", "learners")
-    table = Table(*names, "transitions", "return", "labels", "task")
+    names = ("layout", "split", "teammate", "source", "histories", "learners")
+    table = Table(box=None, pad_edge=False)
+    for name in (*names, "transitions", "return", "labels", "task"):
+        table.add_column(name, no_wrap=True)
     for task in tasks:
         returns = f"{task['return_start']:.1f} -> {task['return_end']:.1f}"
         earned = "" if task["expert_return"] is None else f" {task['expert_return']:.1f}"
