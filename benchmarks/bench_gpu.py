@@ -226,7 +226,7 @@ def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) 
 def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
     sizes, model = bench.sizes, architecture(bench.sizes, size, encoder, dtype)
     length = context_length(sizes, size)
-    dataset = load_icrl4aht(layout=_LAYOUT, obs="state")
+    dataset = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
     trainer = Trainer(ad_method(model, dataset.layouts), options)
     state = trainer.init()
@@ -267,7 +267,7 @@ def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, p
 def measure_loader(bench: Bench, size: str) -> dict[str, Any]:
     """Seconds for a batch of state records, from the bundled release to the device, with no work between."""
     sizes, device = bench.sizes, jax.devices()[0]
-    sampler = load_icrl4aht(layout=_LAYOUT, obs="state").ad(
+    sampler = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state").ad(
         batch_size=sizes.batch, length=context_length(sizes, size), seed=0
     )
     with sampler.batches(device=device) as batches:

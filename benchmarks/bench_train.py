@@ -266,7 +266,7 @@ def main(
     """Compare ways of training, and cached with exact acting, and time all 160 tasks."""
     layout = get_layout(layout_name)
     if "train" in parts:
-        dataset = load_icrl4aht(layout=layout.name, obs="state")
+        dataset = load_icrl4aht(split="train", source="ppo", layout=layout.name, obs="state")
         dataset = dataset.select(dataset.ids[: numbers["histories"]])
         options = TrainOptions(batch_size=numbers["batch"], context=numbers["length"])
         for size, dtype in product(sizes, dtypes):

@@ -17,8 +17,8 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 
 def write_many(folder: Path, layouts: Sequence[str], histories: int) -> Path:
-    """Write a lite release with a number of histories of each layout: bundled ones, rotated by complete episodes."""
-    source = load_icrl4aht()
+    """Write a lite release with a number of histories of each layout: the bundled learners', rotated by episodes."""
+    source = load_icrl4aht(split="train", source="ppo")
     first = {task.layout.name: task for task in reversed(read_tasks(source.root / TASKS))}
     tasks = [
         NewTask(first[name], Provenance(), histories, partial(_rotated, source.filter(layout=name), histories))

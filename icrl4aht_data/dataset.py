@@ -22,7 +22,7 @@ from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
 from icrl4aht_data.sampling.ad import ADSampler
-from icrl4aht_data.sampling.base import SamplerOptions
+from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.threads import usable_cores
@@ -56,7 +56,7 @@ def load_icrl4aht(
             other that fsspec opens; the bundled mini release by default. Opening a remote release downloads its index,
             everything else is downloaded when it is read.
         split: "train", "validation", "test" or "heldout". This and each of the following filters is one value, a
-            sequence of values, or None for any.
+            sequence of values, or None for any: train models on "train" only, as samplers warn of a mixture.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
         track: what the test tasks vary: "teammate" or "layout".
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
@@ -166,7 +166,12 @@ class Dataset(Selection):
         return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
-        """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options."""
+        """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options.
+
+        Warns:
+            MixedSplitsWarning: if histories of split "train" and of others are selected.
+        """
+        warn_of_mixed_splits(self)
         return ADSampler(self, batch_size=batch_size, length=length, **options)
 
     def dpt(
@@ -181,5 +186,10 @@ class Dataset(Selection):
         """Return a sampler of queries with contexts of `context` transitions for Decision-Pretrained Transformers.
 
         See `DPTSampler` for the options.
+
+        Warns:
+            MixedSplitsWarning: if histories of split "train" and of others are selected.
+            WeakLabelsWarning: see `DPTSampler`.
         """
+        warn_of_mixed_splits(self)
         return DPTSampler(self, batch_size=batch_size, context=context, order=order, labels=labels, **options)

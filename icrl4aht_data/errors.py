@@ -122,6 +122,10 @@ class WeakLabelsWarning(UserWarning):
     """The expert actions of some tasks come from a policy that earns far less than the histories do at their end."""
 
 
+class MixedSplitsWarning(UserWarning):
+    """A sampler draws from histories of split `train` together with those of splits that judge a model."""
+
+
 _LISTED, _COMPARED = 50, 1000  # names that an error lists, and names compared to find the nearest
 
 

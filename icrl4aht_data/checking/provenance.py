@@ -75,7 +75,10 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
 
 
 def _noise_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
-    """Compare the number and the episodes of noise histories with the index."""
+    """Compare the number and the episodes of noise histories with the index; their labeller is the script."""
+    labeller = found.expert and found.expert.policy_sha256
+    if entries[0].source == "noise" and labeller:
+        yield f"expert.policy_sha256: expected null, as the script labels noise histories, found {labeller}"
     histories, episodes = ((found.noise or {}).get(name) for name in ("histories", "episodes"))
     if histories is not None and histories < len(entries):
         yield f"noise.histories: expected at least the {len(entries)} of the index, found {histories}"

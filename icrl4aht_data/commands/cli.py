@@ -114,7 +114,8 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
     if as_json:
         click.echo(json.dumps(tasks, indent=2))
         return
-    Console(width=None if sys.stdout.isatty() else 230, markup=False).print(task_table(tasks))
+    # As wide as the table, also on a narrower terminal: a task is one line, and its id can be copied.
+    Console(width=1000, markup=False).print(task_table(tasks))
 
 
 @cli.command()

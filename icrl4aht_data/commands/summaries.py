@@ -11,7 +11,7 @@ from rich.table import Table
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.info import describe
-from icrl4aht_data.format.schema import Entry
+from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
 
 
@@ -33,7 +33,7 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
             "return_start": fmean(entry.return_start for entry in some),
             "return_end": fmean(entry.return_end for entry in some),
             "source": some[0].source,
-            "labels": [kind for kind in LABELS if all(getattr(entry, f"has_{kind}_actions") for entry in some)],
+            "labels": [kind for kind in LABELS if all(entry.has(FIELDS[f"{kind}_actions"]) for entry in some)],
             "expert_return": some[0].expert_return,
             "expert_return_sampled": some[0].expert_return_sampled,
         }
@@ -43,8 +43,10 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
     """Return a table of what `summarize_tasks` returned, with a row for each task."""
-    names = ("layout", "track", "split", "teammate", "source", "histories", "learners")
-    table = Table(*names, "transitions", "return", "labels", "task")
+    names = ("layout", "split", "teammate", "source", "histories", "learners")
+    table = Table(box=None, pad_edge=False)
+    for name in (*names, "transitions", "return", "labels", "task"):
+        table.add_column(name, no_wrap=True)
     for task in tasks:
         returns = f"{task['return_start']:.1f} -> {task['return_end']:.1f}"
         earned = "" if task["expert_return"] is None else f" {task['expert_return']:.1f}"

@@ -184,7 +184,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         expert_return_sampled: the mean return with sampled actions.
         expert_step: environment steps that the policy was trained for; None where it is unknown, or for a script.
         learner: which of the task's independent learners made the history, from 0.
-        has_oracle_actions: whether the history has `oracle_actions`.
+        has_oracle_actions: whether the release stores `oracle_actions` of the history; see `stored_field`.
     """
 
     history_id: _Int
@@ -218,10 +218,21 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """The fields that this history's shard stores."""
-        return tuple(field for field in FIELDS.values() if kind not in field.absent and self.has(field))
+        return tuple(field for field in FIELDS.values() if kind not in field.absent and self._stores(field))
 
     def has(self, field: Field) -> bool:
         """Whether the history has a field that its kind of release may have, see `Field.optional`."""
+        return self._stores(self.stored_field(field))
+
+    def stored_field(self, field: Field) -> Field:
+        """The field that stores a field's values: itself, or `expert_actions` for `oracle_actions`.
+
+        The expert of a noise history is the oracle, so its release may leave out the second copy of its actions.
+        """
+        same = field.name == "oracle_actions" and self.source == "noise" and not self.has_oracle_actions
+        return FIELDS["expert_actions"] if same else field
+
+    def _stores(self, field: Field) -> bool:
         return getattr(self, f"has_{field.name}", True)
 
     def rows(self, field: Field) -> int:

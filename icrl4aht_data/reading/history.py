@@ -182,7 +182,8 @@ class History:
     def oracle_actions(self) -> LazyArray:
         """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
 
-        In a history of source "noise" these are what the ego meant to do: its actions without the noise.
+        In a history of source "noise" these are what the ego meant to do, its actions without the noise, and they equal
+        `expert_actions`, where they are read from if the release does not store them twice.
         """
         return self._lazy("oracle_actions")
 

@@ -16,7 +16,7 @@ from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.reading.history import LABELS, OBS, History, Obs
+from icrl4aht_data.reading.history import LABELS, OBS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import (
     CACHE_MODES,
@@ -221,13 +221,22 @@ class Selection:
             UnknownNameError: if there is no such field of names.
         """
         if name == "labels":
-            found = {kind: int(self.column(f"has_{kind}_actions").sum()) for kind in LABELS}
+            found = {kind: int(self.has_labels(kind).sum()) for kind in LABELS}
             return {kind: number for kind, number in found.items() if number}
         field = ALIASES.get(name, name)
         if ENTRY_HINTS.get(field) is not str:
             raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of is str)))
         numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
         return {value: number for value, number in zip(self.index.values(field), numbers, strict=False) if number}
+
+    def has_labels(self, labels: Labels) -> np.ndarray:
+        """Return for each history whether it has labels of a kind, bool (H,); see `history.LABELS`.
+
+        Differs from the index field `has_oracle_actions`, which says what is stored, for noise histories: their expert
+        actions are the oracle's, see `Entry.stored_field`.
+        """
+        has = self.column(f"has_{labels}_actions")
+        return has if labels == "expert" else has | ((self.column("source") == "noise") & self.has_labels("expert"))
 
     def describe(self) -> str:
         """Return the selection as text, one fact per line: numbers of histories by split, source, layout and others."""

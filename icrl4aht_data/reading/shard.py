@@ -162,7 +162,7 @@ class Shard:
 
     def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray) -> None:
         """Read the rows from `start` that fill `out`, cast to its dtype; see `read`."""
-        first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
         stop = start + len(out)
         for number in range(start // length, -(-stop // length)):
             key = self.name, first + number
@@ -181,7 +181,7 @@ class Shard:
             ShardCorruptError: names the chunk whose hash or size is wrong.
             ShardMismatchError: if the dtype of `out` cannot represent a value.
         """
-        first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+        first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
         for number in range(-(-len(out) // length)):
             part = out[number * length : (number + 1) * length]
             rows = self.decode(first + number, history_id, field)[: len(part)]
@@ -240,6 +240,10 @@ class Shard:
         except OSError as error:
             raise self._unreadable(error) from error
 
+    def _first_chunk(self, history_id: int, field: Field) -> int:
+        """Row in the chunk table of the first chunk with a field's values."""
+        return self._first[history_id, self.entries[history_id].stored_field(field).name]
+
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self.entries[history_id].rows(field))
 
@@ -252,7 +256,7 @@ class Shard:
             return []
         wanted = set()
         for _, history_id, field, start, stop in ranges:
-            first, length = self._first[history_id, field.name], self._chunk_rows(history_id, field)
+            first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
             wanted.update(range(first + start // length, first + -(-stop // length)))
         rows = [row for row in sorted(wanted) if self._cache.get((self.name, row)) is None]
         return [(self._remote.part(self.name), self.table[rows])] if rows else []

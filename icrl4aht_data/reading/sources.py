@@ -28,7 +28,7 @@ CacheMode = Literal["auto", "ram", "mmap", "stream"]
 CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")
 """Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
 
-_VERSION = 1  # of the memory-mapped arrays
+_VERSION = 2  # of the memory-mapped arrays
 _COPIED = 2**20  # bytes copied at a time, so that NumPy's intermediate copy fits into the processor's cache
 _STEPS = 8192  # for fewer steps another thread costs more than it saves
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Iterator
 from typing import Any, Generic, TypedDict, TypeVar
 
 import numpy as np
 
-from icrl4aht_data.errors import LabelsMissingError, OptionError
+from icrl4aht_data.errors import LabelsMissingError, MixedSplitsWarning, OptionError
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, Episodes, HistoryDraws, Weights, random_uint32
@@ -196,6 +197,19 @@ class Sampler(Generic[B]):
             wrong = {name: (self.specs.get(name), found.get(name)) for name in names}
             raise OptionError(f"out: expected and found (dtype, shape): {wrong}; take a batch from sampler.empty()")
         return out
+
+
+def warn_of_mixed_splits(dataset: Selection) -> None:
+    """Warn if training histories are sampled together with those of other splits, by which a model is judged."""
+    counts = dataset.counts("split")
+    if "train" in counts and len(counts) > 1:
+        found = ", ".join(f"{split} ({number})" for split, number in counts.items())
+        warnings.warn(
+            f"the histories are of several splits, {found}: a model trained on them all has seen the teammates that it "
+            f'is judged with. Choose the training histories: load_icrl4aht(split="train"), or ds.filter(split="train")',
+            MixedSplitsWarning,
+            stacklevel=3,  # the call of Dataset.ad or Dataset.dpt
+        )
 
 
 def describe_batch(batch: Any) -> str:

@@ -229,7 +229,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     """
     if labels not in LABELS:
         raise unknown("labels", labels, LABELS)
-    has = {name: dataset.column(f"has_{name}_actions") for name in LABELS}
+    has = {name: dataset.has_labels(name) for name in LABELS}
     if has[labels].all():
         return labels
     total, missing = len(dataset), np.flatnonzero(~has[labels])

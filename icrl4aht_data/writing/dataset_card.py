@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.facts import (
     TRACKS,
 )
 from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
-from icrl4aht_data.format.provenance import Provenance, TeammateSuite
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import FIELDS, KINDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
@@ -86,8 +86,7 @@ def render_card(release: CardContent) -> str:
         configs=_viewer_configs(release) if parquet else "",
         version=f"data version {info.data_version}",
         facts=_bullets(_facts(release)),
-        layout=next(iter(info.layouts)),
-        length=str(min(500, *(entry.T for entry in release.entries))),
+        **_example(release),
         viewer=" The dataset viewer shows the index, one row per history." if parquet else "",
         limits=_bullets(_limits(release)),
         statistics=markdown_table(["property", *statistics], statistics_rows(statistics), right=len(statistics)),
@@ -140,6 +139,13 @@ def _viewer_configs(release: CardContent) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _example(release: CardContent) -> dict[str, str]:
+    """Return split, layout and length of windows of the example of loading: the training split if there is one."""
+    first = min(release.entries, key=lambda entry: (entry.split != "train", entry.history_id))
+    chosen = release.groups("split", "layout")[first.split, first.layout]
+    return {"split": first.split, "layout": first.layout, "length": str(min(500, *(entry.T for entry in chosen)))}
+
+
 def _facts(release: CardContent) -> list[str]:
     info, entries = release.info, release.entries
     shortest, longest = min(entry.T for entry in entries), max(entry.T for entry in entries)
@@ -165,7 +171,7 @@ def _facts(release: CardContent) -> list[str]:
         sentence(
             "labels_found",
             expert=_share_in_words(sum(entry.has_expert_actions for entry in entries), len(entries)),
-            oracle=_share_in_words(sum(entry.has_oracle_actions for entry in entries), len(entries)),
+            oracle=_share_in_words(sum(entry.has(FIELDS["oracle_actions"]) for entry in entries), len(entries)),
         ),
         sentence("kind", kind=info.kind, stored=card_texts("kinds")[info.kind], format_version=info.format_version),
     ]
@@ -290,14 +296,23 @@ def _figure(release: CardContent, path: str, caption: str) -> str:
 
 def _labels(release: CardContent) -> str:
     text = labels_table(release)
-    has_oracle = any(entry.has_oracle_actions for entry in release.entries)
+    has_oracle = any(entry.has(FIELDS["oracle_actions"]) for entry in release.entries)
     return f"{text}\n\n{sentence('oracle_labels')}" if has_oracle else text
+
+
+def _policy_labellers(release: CardContent) -> list[ExpertLabels]:
+    """Return for each task whose expert actions come from a policy, not from a script, what is known of it."""
+    experts = [of_task.expert for of_task in release.provenance.values() if of_task.expert is not None]
+    return [expert for expert in experts if expert.policy_sha256 is not None]
 
 
 def _labellers(release: CardContent) -> str:
     """Return a sentence on which checkpoints label; empty if they were not measured."""
-    experts = [of_task.expert for of_task in release.provenance.values() if of_task.expert is not None]
-    measured = [expert for expert in experts if expert.return_greedy is not None]
+    measured = [
+        expert
+        for expert in _policy_labellers(release)
+        if expert.return_greedy is not None and expert.last_return_greedy is not None
+    ]
     earlier = sum(expert.return_greedy != expert.last_return_greedy for expert in measured)
     if earlier:
         return sentence("earlier_labels", earlier=earlier, tasks=len(measured))
@@ -352,7 +367,7 @@ def _provenance(release: CardContent) -> list[str]:
             )
             for names, members in layouts.items()
         ]
-    if release.distinct("expert"):
+    if _policy_labellers(release):
         lines.append(sentence("expert_source", labellers=_labellers(release)).rstrip())
     labels = {
         "profile": "profile",

@@ -66,7 +66,8 @@ def stored_task(
 
     def load() -> Iterator[NewHistory]:
         for history in dataset:
-            names = [field.name for field in held_fields(kind) if history.entry.has(field)]
+            stored = history.entry.stored_fields(kind)
+            names = [field.name for field in held_fields(kind) if field in stored]
             yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read), history.entry.learner)
             done()
 

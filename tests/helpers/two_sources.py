@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, track_of
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, SOURCES, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import Kind
@@ -42,15 +42,15 @@ def two_source_release(
     *,
     tasks: int = 2,
     ppo_episodes: int = EPISODES,
-    oracle: bool = True,
+    oracle: tuple[str, ...] = SOURCES,
     seed: int = 0,
     **options: Any,
 ) -> dict[int, dict[str, np.ndarray]]:
     """Write a release with `tasks` tasks of each of `PARTS` on each layout; returns the written arrays by history id.
 
     A task of source ppo has two learners with two histories each, of `ppo_episodes` episodes, a task of source noise
-    three histories. States and rewards are those of random play by the rules: nobody learns. `oracle=False` leaves out
-    the oracle actions; other options are those of `write_release`.
+    three histories. States and rewards are those of random play by the rules: nobody learns. Histories of the sources
+    `oracle` are stored with oracle actions; other options are those of `write_release`.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
@@ -64,7 +64,7 @@ def two_source_release(
             arrays["oracle_actions"] = _oracle_actions(arrays["actions"], rng)
             if source == "noise":
                 arrays["expert_actions"] = arrays["oracle_actions"]
-            if not oracle:
+            if source not in oracle:
                 del arrays["oracle_actions"]
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays, learner))

@@ -229,7 +229,7 @@ def foreign(lines):
         (lambda lines: lines[1].update(seed=77), "history 1: index and task"),
         (lambda lines: lines[2].update(task_id="unknown"), "history 2: its task 'unknown' is missing"),
         (lambda lines: lines[0].update(split="test"), "line 1: shard"),
-        (lambda lines: lines[0].update(split="validation"), "unknown split 'validation'"),
+        (lambda lines: lines[0].update(split="valid"), "unknown split 'valid'"),
         (lambda lines: lines[0].update(action_dim=99), "expected action_dim 6"),
         (lambda lines: lines[0].update(teammate_family="H9"), "unknown teammate_family 'H9'"),
     ],

@@ -157,7 +157,7 @@ def test_conversions_between_kinds_keep_everything(mixed, tmp_path):
 
 
 def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
-    """They lose oracle actions, and number the streams of several learners consecutively."""
+    """They lose oracle actions but those of noise, and number the streams of several learners consecutively."""
     before = load_icrl4aht(lite_mixed)
     to_published(before, tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5") as file:
@@ -171,7 +171,8 @@ def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
     assert [entry.to_json() for entry in after.entries] == expected
     assert read_provenance(tmp_path / "back" / PROVENANCE) == read_provenance(lite_mixed / PROVENANCE)
     with pytest.raises(LabelsMissingError, match=r"has no oracle actions: .* has_oracle_actions = false"):
-        after[0].read("oracle_actions")
+        after[2].read("oracle_actions")
+    np.testing.assert_array_equal(after[0].read("oracle_actions"), before[0].read("oracle_actions"))
 
 
 def test_the_index_as_a_parquet_file(lite_mixed, tmp_path):
@@ -208,6 +209,7 @@ def test_the_index_as_a_parquet_file(lite_mixed, tmp_path):
         (PROVENANCE, lambda c: first(c)["nearest_test"].update(distance=1.5), "Expected `float` <= 1"),
         (PROVENANCE, lambda c: first(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
         (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="no"), "matching regex"),
+        (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
     ],
 )
 def test_lies(lite_mixed, tmp_path, name, change, message):

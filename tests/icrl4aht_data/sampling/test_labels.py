@@ -8,10 +8,12 @@ import jax
 import numpy as np
 import pytest
 
-from icrl4aht_data import load_icrl4aht
+from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import LabelsMissingError, OptionError, UnknownNameError, WeakLabelsWarning
+from icrl4aht_data.format.schema import HISTORIES, PROVENANCE
 from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows, torch_loader
 from icrl4aht_data.reading.history import LABELS
+from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal
 from tests.helpers.random_releases import random_release
 from tests.helpers.two_sources import two_source_release
@@ -117,6 +119,56 @@ def test_resuming_needs_the_same_labels(sampler):
         expert.load_state_dict(state)
     expert.load_state_dict({name: value for name, value in state.items() if name != "labels"})  # as once written
     assert expert.next == 1
+
+
+@pytest.fixture(scope="module")
+def smaller(tmp_path_factory):
+    """A release with the histories of `two_sources`, those of noise stored without oracle actions. Read only."""
+    root = tmp_path_factory.mktemp("releases") / "smaller"
+    two_source_release(root, oracle=("ppo",))
+    return root
+
+
+class TestNoiseWithoutOracleActions:
+    """The expert of a noise history is the oracle, so its oracle actions may be left out."""
+
+    @pytest.mark.parametrize("cache", CACHES)
+    @pytest.mark.parametrize("filters", [{}, {"source": "noise"}])
+    def test_batches_are_those_of_a_release_with_them(self, two_sources, smaller, cache, filters):
+        options: dict[str, Any] = {"layout": "demo_wide", "cache": cache} | filters
+        one, other = (load_icrl4aht(root, **options) for root in (two_sources[0], smaller))
+        assert_equal(one.dpt(labels="oracle", **OPTIONS)[0], other.dpt(labels="oracle", **OPTIONS)[0])
+
+    def test_histories_and_counts(self, two_sources, smaller):
+        dataset = load_icrl4aht(smaller, source="noise")
+        assert not dataset.column("has_oracle_actions").any()
+        assert dataset.counts("labels") == {"expert": 24, "oracle": 24}
+        assert dataset.has_labels("oracle").all()
+        history, actions = dataset[0], two_sources[1][int(dataset.ids[0])]["oracle_actions"]
+        np.testing.assert_array_equal(history.oracle_actions, actions)
+        np.testing.assert_array_equal(history.read("oracle_actions", 5, 9), actions[5:9])
+        rows: Any = hf_episodes(dataset[:1])
+        np.testing.assert_array_equal(np.concatenate([row["oracle_actions"] for row in rows]), actions)
+
+    def test_a_remote_fetches_the_expert_actions(self, two_sources, smaller, tmp_path, monkeypatch):
+        monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
+        with http_server(smaller) as server:
+            remote = load_icrl4aht(server.url, source="noise")
+            np.testing.assert_array_equal(
+                remote[0].oracle_actions, two_sources[1][int(remote.ids[0])]["expert_actions"]
+            )
+
+    def test_verification_and_conversion_leave_them_out(self, smaller, tmp_path):
+        to_release(load_icrl4aht(smaller), tmp_path / "full", "full")
+        assert verify_release(tmp_path / "full", level="deep").ok
+        to_release(load_icrl4aht(tmp_path / "full"), tmp_path / "lite", "lite")
+        for name in (HISTORIES, PROVENANCE):
+            assert (tmp_path / "lite" / name).read_bytes() == (smaller / name).read_bytes()
+
+    def test_without_expert_actions_there_are_none(self, tmp_path):
+        random_release(tmp_path / "r", layouts=("demo_wide",), teammates=1, labels=False, sources=("noise",))
+        with pytest.raises(LabelsMissingError, match=r"labels = oracle: .* 0 have expert actions"):
+            load_icrl4aht(tmp_path / "r").dpt(labels="oracle", **OPTIONS)
 
 
 class TestMissingLabels:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.errors import MixedSplitsWarning, OptionError, UnknownNameError
 from tests.helpers.batches import digest
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
@@ -270,3 +271,20 @@ def _sampler(dataset, kind, *, batch_size, steps, order="contiguous"):
     if kind == "ad":
         return dataset.ad(batch_size=batch_size, length=steps)
     return dataset.dpt(batch_size=batch_size, context=steps, order=order)
+
+
+def test_mixed_splits_are_warned_of(two_sources):
+    """Without a filter, a selection has the validation histories, too."""
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
+    with pytest.warns(
+        MixedSplitsWarning, match=r"several splits, train \(14\), validation \(6\): .*split=\"train\""
+    ) as seen:
+        dataset.ad(batch_size=2, length=5)
+    assert seen[0].filename == __file__
+    with pytest.warns(MixedSplitsWarning) as seen:
+        dataset.dpt(batch_size=2, context=5)
+    assert seen[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MixedSplitsWarning)
+        for split in ("train", "validation"):
+            dataset.filter(split=split).ad(batch_size=2, length=5)

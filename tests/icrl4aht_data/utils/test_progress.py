@@ -125,7 +125,9 @@ def test_work_that_stops_says_where():
 
 def test_the_board_has_one_line_for_all_tasks():
     clock, output = Clock(), io.StringIO()
-    with ProgressBoard(Console(file=output), updates=dict.fromkeys(("one", "two", "three"), 100), clock=clock, interval=None) as board:
+    with ProgressBoard(
+        Console(file=output), updates=dict.fromkeys(("one", "two", "three"), 100), clock=clock, interval=None
+    ) as board:
         for number in range(1, 51):
             clock.wait(2)
             board.show_running("one", number, 1_000.0)

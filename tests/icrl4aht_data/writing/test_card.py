@@ -143,7 +143,8 @@ def test_the_card_says_what_is_left_out_and_what_sources_are_not(content):
     assert "Sources: `ppo` (3 histories), `noise` (3 histories)." in card
     assert "the script knows the whole state" in card
     assert "must infer what the script knew" in card
-    assert "Oracle actions: on 3 histories." in card
+    assert "Labels: expert actions in every history, oracle actions in 3 histories." in card
+    assert "It is the last checkpoint" not in card, "no greedy return of the last checkpoint is known"
     assert "No headroom: on coord_simple the ego hardly matters." in card
     assert 'labels="oracle"' in card
 
