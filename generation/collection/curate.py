@@ -90,7 +90,8 @@ def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: floa
 
 def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -> None:
     """Draw the learning curves of all streams, returns (N, E), and of the selected ones, (n, E), into a PNG."""
-    plot_curves(path, [(title, {f"before: {len(before)} streams": before, f"after: {len(after)} streams": after})])
+    sides = {f"before: {len(before)} streams": before, f"after: {len(after)} streams": after}
+    plot_curves(path, [(title, {label: returns for label, returns in sides.items() if len(returns)})])
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
