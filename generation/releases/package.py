@@ -53,7 +53,7 @@ def package_release(
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
-    What is kept, `select_histories` says. The histories of learners are labelled by the checkpoint of their egos that
+    `select_histories` chooses what is kept. The histories of learners are labelled by the checkpoint of their egos that
     `choose_labeller` returns, those of the source "noise" by their script.
 
     Args:
