@@ -316,7 +316,7 @@ def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> li
         split = plan.split or "test"
         if split not in EVALUATION_SPLITS:
             raise unknown("split to evaluate on", split, EVALUATION_SPLITS)
-        played_on = TESTED_ON[layout] if split == "test" else layout
+        played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
         tasks = read_tasks(manifest_path(track_of(played_on), split))
         tasks = [task for task in tasks if task.layout.name == played_on]
         if not tasks:

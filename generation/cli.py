@@ -49,7 +49,7 @@ _profile_option = click.option(
     "profile_name",
     default="smoke",
     metavar="PROFILE",
-    help="smoke, noise, small, mini or paper, or a TOML file.",
+    help="smoke, noise, small, mini, cpu or paper, or a TOML file.",
 )
 
 _ego_options = dataclass_options(
@@ -117,8 +117,8 @@ def cli() -> None:
     "task_file",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, and train no teammates: --suite is a "
-    "suite that has them, or the release's folder teammates.",
+    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, each of the source that the release "
+    "names, and train no teammates: --suite is a suite that has them, or the release's folder teammates.",
     show_default="the profile's tasks",
 )
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
@@ -139,10 +139,11 @@ def generate(
 ) -> None:
     """Rebuild a release, or resume a rebuild.
 
-    Trains the teammates of a profile and an ego for each of its tasks, records how they learn (OUT/artefacts), and
-    packs the release OUT/lite or OUT/full. Unfinished work resumes from its last saved update. This process trains the
-    teammates, the executor collects the tasks. Tasks that fail are listed in OUT/failed.jsonl; the others are finished,
-    nothing is packed, and the exit code is 1. Hyper-parameters of the egos replace those of the profile.
+    Trains the teammates of a profile and the egos of its tasks, records how they learn (OUT/artefacts), or plays noise
+    histories, which need no training, and packs the release OUT/lite or OUT/full. Unfinished work resumes from its last
+    save. This process trains the teammates, the executor collects the tasks. Tasks that fail are listed in
+    OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1. Hyper-parameters of the egos
+    replace those of the profile.
     """
     from generation.releases.build import build_releases
     from generation.releases.package import bundle_release, recorded_sources

@@ -45,7 +45,9 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
         profile = _profile(path.stem, tomllib.loads(path.read_text(encoding="utf-8")))
     prepare(profile)
     with _named_errors(path):
-        profile.works()  # raises for unknown presets, and for more sampled teammates than there are
+        works = profile.works()  # raises for unknown presets, and for more sampled teammates than there are
+        if not works and not profile.algorithms:
+            raise OptionError("no tasks: expected teammates in tasks.presets, tasks.sampled or tasks.algorithms")
     return profile
 
 

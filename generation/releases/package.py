@@ -53,7 +53,7 @@ def package_release(
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
-    What is kept, `select_histories` says. The histories of learners are labelled by the checkpoint of their egos that
+    `select_histories` chooses what is kept. The histories of learners are labelled by the checkpoint of their egos that
     `choose_labeller` returns, those of the source "noise" by their script.
 
     Args:
@@ -88,7 +88,8 @@ def package_release(
                 add_curve(curves, task.layout.name, found.source, task.split, returns)
         advance(0)
     if not new:
-        raise OptionError(f"{target}: no task has histories to keep: {'; '.join(one.reason for one in omitted)}")
+        reasons = "; ".join(one.reason for one in omitted) or "there is no task"
+        raise OptionError(f"{target}: no task has histories to keep: {reasons}")
     if profile.sampled is not None:
         omitted += unhosted_families(profile.layouts)
     with TemporaryDirectory() as folder:

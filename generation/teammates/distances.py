@@ -21,7 +21,7 @@ from jaxtyping import Array, Key, UInt8
 from generation.env import Environment
 from generation.learners.rollout import init_rollout, roll_out
 from generation.policy import Policy
-from generation.teammates.instances import INSTANCES, published_thetas
+from generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
 from generation.teammates.references import player_in_some, reference_egos, stacked_families
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, SAME_BEHAVIOUR, TESTED_ON
@@ -87,7 +87,7 @@ def common_states(layout: Layout) -> CommonStates:
     tested = TESTED_ON[layout.name]
     tests = [
         [build_teammate(layout, {"family": family, "theta": theta}) for theta in published_thetas(tested, family)]
-        for family in HEURISTIC_KINDS
+        for family in TESTED_FAMILIES
     ]
     each = INSTANCES * 2 * _EPISODES
     total = len(tests) * each
@@ -112,7 +112,7 @@ def common_states(layout: Layout) -> CommonStates:
     actions = np.concatenate(
         [act_along(layout, own, records)[:, :, k * each : (k + 1) * each] for k, own in enumerate(tests)]
     )
-    names = tuple(f"{short}/t{t}" for short in HEURISTIC_KINDS.values() for t in range(INSTANCES))
+    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
     return CommonStates(records, names, actions)
 
 

@@ -141,7 +141,7 @@ def validation_tasks(track: str) -> list[Task]:
     Layouts on which every draw of that seed acts like a test instance have none.
     """
     tasks = []
-    for layout in TRACKS[track]["validation"]:
+    for layout in (layout for layout in TRACKS[track]["validation"] if layout in TESTED_ON):
         families = hosted_families(layout, _VALIDATION_SEED)
         count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
         chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)

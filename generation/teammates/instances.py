@@ -95,6 +95,9 @@ _H4: ParameterSets = {
 _FAMILIES = {"recipe_aware_button": _H1, "territory": _H2, "assembly_line": _H3, "utility_greedy": _H4}
 _CRAMPED = _FAMILIES | {"recipe_aware_button": _H1_CRAMPED, "territory": _H2_CRAMPED}
 
+TESTED_FAMILIES = tuple(_FAMILIES)
+"""Families with test instances: those of the paper."""
+
 INSTANCES = 5
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
 from generation.teammates.draws import DRAWS_PER_SEED, Draw, read_draws_table, write_draws_table
-from generation.teammates.instances import INSTANCES
+from generation.teammates.instances import INSTANCES, TESTED_FAMILIES
 from generation.teammates.references import reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -63,7 +63,7 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
     actions = act_along(layout, policies, common.records)
     distances = distances_to_tests(common, actions)
     families = np.array([family for family, _, _ in numbers])
-    own = families[:, None] == np.repeat(list(HEURISTIC_FAMILIES), INSTANCES)
+    own = families[:, None] == np.repeat(TESTED_FAMILIES, INSTANCES)
     nearest, others = (np.where(mask, distances, np.inf).argmin(axis=1) for mask in (own, ~own))
     behaviours = np.zeros(len(numbers), int)
     for family in np.unique(families):

@@ -355,6 +355,11 @@ LEARNED_ENTRY = {
             'sampled = { families = ["assembly_line"] }\npresets =',
             r"missing key 'tasks\.sampled\.per_layout'",
         ),
+        (
+            'presets = ["default", "high_inertia"]',
+            'sampled = { families = ["assembly_line"], per_layout = 0 }',
+            r"no tasks: expected teammates in tasks\.presets",
+        ),
         ("presets =", "sampled = 3\npresets =", r"tasks\.sampled = 3: expected dict"),
         (
             "presets =",
@@ -466,6 +471,6 @@ def test_policies_of_labellers_are_a_switch_of_the_profile(changed):
 def test_threads_are_chosen_before_teammates_are_drawn(monkeypatch):
     """Drawing starts JAX, whose number of threads can then no longer change."""
     calls: list[str] = []
-    monkeypatch.setattr(Profile, "works", lambda profile: calls.append("works"))
+    monkeypatch.setattr(Profile, "works", lambda profile: [calls.append("works")])
     load_profile("noise", lambda profile: calls.append(f"threads {profile.xla_threads}"))
     assert calls == ["threads 1", "works"]

@@ -329,7 +329,7 @@ class TestScale:
     def test_the_plan_of_the_paper_is_the_printed_one(self, monkeypatch):
         """All lines are equal, except for numbers that depend on measurements."""
         monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.LearnerSpeed(1000.0, 1.0))
-        monkeypatch.setattr(plan, "bytes_per_transition", lambda kind: 1.0)
+        monkeypatch.setattr(plan, "bytes_per_transition", lambda kind, source: 1.0)
         (arguments,) = (a for a in commands("python -m generation", PAGES["scale"]) if a[0] == "plan")
         result = CliRunner().invoke(generation_cli, arguments)
         assert result.exit_code == 0, result.output

@@ -9,7 +9,7 @@ from generation.learners.ppo import sequences
 from generation.learners.rollout import Choice, Rollout
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
-REWARDS = np.float32([-20, -25, -30, -10, -5, 0, 20, 15])
+REWARDS = np.array([-20, -25, -30, -10, -5, 0, 20, 15], np.float32)
 """A wrong delivery, one with one press of a button and with two, presses alone, nothing, a delivery without and with a
 press."""
 
@@ -45,7 +45,7 @@ def test_a_wrong_delivery_is_forgiven_as_long_as_rewards_are_shaped():
             jnp.float32(weight),
             forgiveness=20.0,
         )
-        expected = REWARDS + np.float32([forgiven] * 3 + [0] * 5)
+        expected = REWARDS + np.array([forgiven] * 3 + [0] * 5, np.float32)
         np.testing.assert_allclose(found.reward, expected[:, None] + weight * (agents + 1), atol=1e-5)
 
 
