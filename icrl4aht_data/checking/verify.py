@@ -151,8 +151,10 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
 def _note_what_is_believed(index: Index, provenance: Mapping[str, Provenance], report: Report) -> None:
     """Add a note on every kind of value that was not computed again."""
     for name, note in _NOT_RECOMPUTED.items():
-        told = sum(getattr(of_task, name, None) is not None for of_task in provenance.values())
-        count = np.count_nonzero(index.entries.column("has_oracle_actions")) if name == "oracle_actions" else told
+        if name == "oracle_actions":
+            count = np.count_nonzero(index.entries.column("has_oracle_actions"))
+        else:
+            count = sum(getattr(of_task, name, None) is not None for of_task in provenance.values())
         if count:
             report.notes.append(note.format(count=count))
 

@@ -141,7 +141,7 @@ def test_the_card_says_what_is_left_out_and_what_sources_are_not(content):
     assert "| demo_wide | H1/t3 | ppo | 2 | 128 | 1.2 | 2.5 | the learners did not learn |" in card
     assert "| demo_wide | H4 |  |  |  |  |  | all 32 draws act like a test teammate |" in card
     assert "Sources: `ppo` (3 histories), `noise` (3 histories)." in card
-    assert "the script knows the whole state" in card
+    assert "the script knows the full state" in card
     assert "must infer what the script knew" in card
     assert "Labels: expert actions in every history, oracle actions in 3 histories." in card
     assert "It is the last checkpoint" not in card, "no greedy return of the last checkpoint is known"
