@@ -51,11 +51,11 @@ reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simpl
 reader: list --split tran | unknown split 'tran'; valid: train, validation, test, heldout. Did you mean 'train'?
 reader: list --source nois | unknown source 'nois'; valid: ppo, noise. Did you mean 'noise'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
-reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: utility_greedy, brdiv, lbrdiv, fcp
+reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: 
 reader: verify --deeep | No such option
 reader: verify --from x | --from is the source of a repair: give --repair with it
 reader: show --history -1 | -1 is not in the range x>=0
-reader: show --history 160 | this selection has no history [160], ids are within 0..159
+reader: show --history 9999 | this selection has no history [9999], ids are within 0..
 reader: show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 reader: show --plot none/curves.png | no folder none: make it first, or give another path
 reader: show --plot empty | 'empty' is a directory
@@ -69,7 +69,7 @@ reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist
 reader: combine {MINI} --out file | 'file' is a file
 reader: release build a b --out c | unexpected extra argument
 reader: upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
-generation: generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, paper, smoke. Did you mean
+generation: generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke. Did you mean
 generation: generate --out file | 'file' is a file
 generation: generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generation: generate --out g --workers 2 | --address and --workers need --executor ray
@@ -105,7 +105,7 @@ reader: list none | none: no release here, expected meta/info.json in it; there 
 reader: list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
 reader: list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
 reader: list file | file: no release here
-reader: list --split test | no history has split=['test']. This release has train/coord_simple
+reader: list --split test | no history has split=['test']. This release has train/
 reader: verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 reader: verify --split test | no history has split=['test']
 reader: list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
@@ -120,7 +120,7 @@ generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 baselines: train ad --layout demo_wide --labels oracle | labels = oracle: ad learns from the histories' own actions;
-baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,
+baselines: train ad --layout all --channels own | channels = own: the layouts 
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here
 baselines: report empty | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
