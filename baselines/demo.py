@@ -67,7 +67,7 @@ class DemoSettings:
     root: Path = MINI
     model: ModelOptions = _MODEL
     training: TrainOptions = _TRAINING
-    sources: tuple[str, ...] = ("noise",)
+    sources: tuple[str, ...] = ()
     tasks: tuple[Task, ...] | None = None
     protocol: Protocol = _PROTOCOL
     seeds: Sequence[int] = range(10)

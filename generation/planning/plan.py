@@ -381,4 +381,5 @@ def bytes_per_transition(kind: Kind, source: str = "ppo") -> float:
 
 
 def _first_history(task: Task) -> list[NewHistory]:
-    return [NewHistory.from_history(load_icrl4aht(task_id=task.task_id)[0])]
+    history = NewHistory.from_history(load_icrl4aht(task_id=task.task_id)[0])
+    return [replace(history, learner=0)]  # whose learner it is, the provenance would have to say

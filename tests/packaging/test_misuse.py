@@ -62,7 +62,6 @@ reader: show --plot empty | 'empty' is a directory
 reader: download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 reader: download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 reader: download s3://a/b --to file | 'file' is a file
-reader: convert {MINI} --out out | give the form to convert to: --to full, lite, observations, published, parquet
 reader: convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
 reader: convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist

@@ -44,7 +44,7 @@ def read_all(root):
     ("options", "message"),
     [
         ({"layout": "demo_wied"}, r"unknown layout 'demo_wied'; valid: coord_simple, .*Did you mean 'demo_wide'\?"),
-        ({"split": "validation"}, r"unknown split 'validation'; valid: train, test"),
+        ({"split": "valid"}, r"unknown split 'valid'; valid: train, validation, test"),
         ({"teammate_family": "H5"}, r"unknown teammate_family 'H5'; valid: rl, H1, H2, H3, H4"),
         ({"track": "teammates"}, r"unknown track 'teammates'; valid: teammate, layout\. Did you mean 'teammate'\?"),
         ({"teammate_kind": "greedy"}, r"unknown teammate_kind 'greedy'; valid: utility_greedy\. Did you mean"),

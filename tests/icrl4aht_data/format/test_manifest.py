@@ -102,7 +102,7 @@ def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged)
 
 def test_checkpoints_are_checked_before_they_are_copied_or_play(tmp_path):
     shutil.copytree(MINI, tmp_path / "release")
-    dataset = load_icrl4aht(tmp_path / "release", teammate_family="rl", layout="coord_ring")[:1]
+    dataset = load_icrl4aht(tmp_path / "release", teammate_family="rl")[:1]
     digest = dataset.recover_teammate(int(dataset.ids[0]))["theta"]["sha256"]
     for name in ("policy.json", "policy.safetensors"):
         path = tmp_path / "release" / TEAMMATES / digest / name
