@@ -51,7 +51,7 @@ reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simpl
 reader: list --split tran | unknown split 'tran'; valid: train, validation, test, heldout. Did you mean 'train'?
 reader: list --source nois | unknown source 'nois'; valid: ppo, noise. Did you mean 'noise'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
-reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid: 
+reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid:
 reader: verify --deeep | No such option
 reader: verify --from x | --from is the source of a repair: give --repair with it
 reader: show --history -1 | -1 is not in the range x>=0
@@ -68,7 +68,7 @@ reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist
 reader: combine {MINI} --out file | 'file' is a file
 reader: release build a b --out c | unexpected extra argument
 reader: upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
-generation: generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke. Did you mean
+generation: generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
 generation: generate --out file | 'file' is a file
 generation: generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generation: generate --out g --workers 2 | --address and --workers need --executor ray
@@ -119,7 +119,7 @@ generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 baselines: train ad --layout demo_wide --labels oracle | labels = oracle: ad learns from the histories' own actions;
-baselines: train ad --layout all --channels own | channels = own: the layouts 
+baselines: train ad --layout all --channels own | channels = own: the layouts
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here
 baselines: report empty | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
