@@ -27,6 +27,7 @@ TASKS = tuple(
     for seed, family in enumerate(("utility_greedy", "territory"))
 )
 SETTINGS = demo.DemoSettings(
+    sources=("noise",),
     model=ModelOptions(layers=1, width=16, heads=2),
     training=TrainOptions(steps=2, batch_size=2, context=10),
     tasks=TASKS,
