@@ -25,14 +25,18 @@ import jax
 import numpy as np
 
 from generation.collection.noise_rollout import EPISODES_AT_ONCE, NoisyEpisodes, noise_schedules, play_noisy_episodes
-from generation.collection.task import TASK_SAVE_SECONDS, TEAMMATE_NOISE, UpdateCallback, readable_disk_errors
+from generation.collection.task import (
+    TASK_SAVE_SECONDS,
+    TEAMMATE_NOISE,
+    UpdateCallback,
+    make_artefact,
+    readable_disk_errors,
+)
 from generation.collection.task_folder import (
     LEARNER,
     check_room,
     common_settings,
     is_artefact_finished,
-    partial_folder,
-    publish_artefact,
     write_metadata,
 )
 from generation.learners.resume import (
@@ -41,7 +45,6 @@ from generation.learners.resume import (
     RunLog,
     SaveInterval,
     StateFile,
-    run_lock,
     software_versions,
 )
 from generation.profiles import Profile
@@ -124,14 +127,12 @@ def run_noise(
         BusyError: if another process works on this task.
         DiskFullError: if the disk has no room.
     """
-    with run_lock(folder, wait=wait):
-        if is_noise_finished(folder, work, profile):
-            return False
-        partial = partial_folder(folder)
-        if not is_noise_finished(partial, work, profile):  # else it was killed just before it was renamed
-            _record(work, profile, partial, on_update, suite, save_seconds)
-        publish_artefact(partial, folder)
-        return True
+    return make_artefact(
+        folder,
+        wait,
+        lambda found: is_noise_finished(found, work, profile),
+        lambda partial: _record(work, profile, partial, on_update, suite, save_seconds),
+    )
 
 
 def _record(

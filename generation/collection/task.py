@@ -83,12 +83,35 @@ def run_task(
         BusyError: if another process works on this task.
         DiskFullError: if the disk has no room.
     """
+    return make_artefact(
+        folder,
+        wait,
+        lambda found: is_task_finished(found, work, profile),
+        lambda partial: _learn(work, profile, partial, on_update, suite, save_seconds),
+    )
+
+
+def make_artefact(folder: Path, wait: bool, is_finished: Callable[[Path], bool], make: Callable[[Path], None]) -> bool:
+    """Make an artefact in its partial folder and rename it, unless it is finished.
+
+    Args:
+        folder: the artefact.
+        wait: whether to wait for another process that works on it.
+        is_finished: whether a folder has the complete artefact.
+        make: makes it in a folder, or resumes it there.
+
+    Returns:
+        Whether there was anything to do.
+
+    Raises:
+        BusyError: if another process works on it.
+    """
     with run_lock(folder, wait=wait):
-        if is_task_finished(folder, work, profile):
+        if is_finished(folder):
             return False
         partial = partial_folder(folder)
-        if not is_task_finished(partial, work, profile):  # else it was killed just before it was renamed
-            _learn(work, profile, partial, on_update, suite, save_seconds)
+        if not is_finished(partial):  # else it was killed just before it was renamed
+            make(partial)
         publish_artefact(partial, folder)
         return True
 
