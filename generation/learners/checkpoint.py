@@ -22,6 +22,9 @@ from icrl4aht_data.utils.files import parse_json, plain_size, read_text
 
 POLICY_WEIGHTS, POLICY_CARD = "policy.safetensors", "policy.json"
 
+_ROWS = "@rows"
+"""Ending of the name of the array with the numbers of a matrix's stored rows."""
+
 POLICY_CHECKPOINTS = 5
 """Checkpoints of each policy, evenly spaced over its training (paper, App. B.1)."""
 
@@ -48,7 +51,8 @@ def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str,
 def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
     """Write policy.safetensors and policy.json into an existing folder, and sync them to the disk."""
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
-    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(weights))  # `save_file` has errors of its own for a full disk
+    stored = _without_zero_rows(weights)
+    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(stored))  # `save_file` has errors of its own for a full disk
     shapes = {name: list(w.shape) for name, w in weights.items()}
     content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
     (folder / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
@@ -81,9 +85,9 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     card = load_card(folder)
     try:
         plain_size(folder / POLICY_WEIGHTS, CHECKPOINT_BYTES)
-        weights = load_file(folder / POLICY_WEIGHTS)
         network = ActorCritic(Widths.from_json(card["widths"]), card["partners"])
         expected = card["shapes"]
+        weights = _with_zero_rows(load_file(folder / POLICY_WEIGHTS), expected)
         tree = unflatten_dict(weights, sep="/")
     except Exception as error:  # three libraries read what may be any bytes, and each has errors of its own
         raise _no_checkpoint(folder, repr(error)) from error
@@ -91,6 +95,40 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     if shapes != expected or "params" not in tree:
         raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {expected}")
     return network, tree, card
+
+
+def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Weights as they are stored: of a matrix that is mostly rows of zeros, the other rows and their numbers.
+
+    The kernel of encoder `mlp` is one: most entries of the flat window are always 0 on a layout.
+    """
+    stored = {}
+    for name, matrix in weights.items():
+        rows = np.flatnonzero(matrix.any(axis=1)) if matrix.ndim == 2 else ()
+        if matrix.ndim == 2 and 2 * len(rows) < len(matrix):
+            stored[name] = np.ascontiguousarray(matrix[rows])
+            stored[name + _ROWS] = np.asarray(rows, np.int32)
+        else:
+            stored[name] = matrix
+    return stored
+
+
+def _with_zero_rows(stored: dict[str, np.ndarray], shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
+    """The weights of a file, see `_without_zero_rows`; `shapes` are the complete ones.
+
+    Raises:
+        ValueError, IndexError, KeyError: if rows and shapes do not fit.
+    """
+    weights = {name: matrix for name, matrix in stored.items() if not name.endswith(_ROWS)}
+    for name in stored.keys() - weights.keys():
+        name = name.removesuffix(_ROWS)
+        length, width = shapes[name]
+        if length * width * weights[name].itemsize > CHECKPOINT_BYTES:
+            raise ValueError(f"{name}: shape {shapes[name]} is larger than any checkpoint")
+        complete = np.zeros((length, width), weights[name].dtype)
+        complete[stored[name + _ROWS]] = weights[name]
+        weights[name] = complete
+    return weights
 
 
 def _no_checkpoint(folder: Path, problem: str) -> OptionError:

@@ -1,0 +1,74 @@
+"""Policies on disk: what is written is read back to the bit, and rows of zeros take no space."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
+from generation.learners.config import Widths
+from generation.learners.encoder import CompactView
+from generation.learners.network import ActorCritic
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+
+
+@pytest.fixture(scope="module")
+def policy():
+    layout = get_layout("demo_wide")
+    network = ActorCritic(Widths(encoder="mlp", dense=16, gru=8, head=8), view=CompactView("mlp", (layout,)))
+    return network, network.untrained(jax.random.key(0), layout.channels)
+
+
+def equal(ours, theirs) -> bool:
+    return jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(np.asarray(a), np.asarray(b)), ours, theirs))
+
+
+def flat_kernel(folder) -> str:
+    """Name of the matrix whose rows are stored."""
+    (name,) = (name for name in load_file(folder / POLICY_WEIGHTS) if name.endswith("@rows"))
+    return name.removesuffix("@rows")
+
+
+def test_rows_of_zeros_take_no_space(policy, tmp_path):
+    network, params = policy
+    save_policy(tmp_path / "p", network, params, {"step": 3})
+    found, read, card = load_policy(tmp_path / "p")
+    assert equal(read, params)
+    assert (found.widths, card["step"]) == (network.widths, 3)
+    full = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(params))
+    assert (tmp_path / "p" / POLICY_WEIGHTS).stat().st_size < full / 3
+
+
+def test_complete_matrices_are_read_too(policy, tmp_path):
+    """Earlier versions wrote them."""
+    network, params = policy
+    save_policy(tmp_path / "p", network, params, {})
+    path = tmp_path / "p" / POLICY_WEIGHTS
+    name, stored = flat_kernel(tmp_path / "p"), load_file(path)
+    complete = np.zeros(json.loads((tmp_path / "p" / POLICY_CARD).read_text())["shapes"][name], np.float32)
+    complete[stored.pop(f"{name}@rows")] = stored[name]
+    save_file(stored | {name: complete}, path)
+    assert equal(load_policy(tmp_path / "p")[1], params)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda rows, shape: (rows[:-1], shape),
+        lambda rows, shape: (rows + shape[0], shape),
+        lambda rows, shape: (rows, [2**40, shape[1]]),
+        lambda rows, shape: (rows, [-5, shape[1]]),
+    ],
+)
+def test_rows_that_do_not_fit(policy, tmp_path, change):
+    save_policy(tmp_path / "p", *policy, {})
+    name, weights = flat_kernel(tmp_path / "p"), load_file(tmp_path / "p" / POLICY_WEIGHTS)
+    card = json.loads((tmp_path / "p" / POLICY_CARD).read_text())
+    weights[f"{name}@rows"], card["shapes"][name] = change(weights[f"{name}@rows"], card["shapes"][name])
+    save_file(weights, tmp_path / "p" / POLICY_WEIGHTS)
+    (tmp_path / "p" / POLICY_CARD).write_text(json.dumps(card))
+    with pytest.raises(OptionError, match="not a checkpoint"):
+        load_policy(tmp_path / "p")
