@@ -64,7 +64,8 @@ def test_complete_matrices_are_read_too(policy, tmp_path):
     ],
 )
 def test_rows_that_do_not_fit(policy, tmp_path, change):
-    save_policy(tmp_path / "p", *policy, {})
+    network, params = policy
+    save_policy(tmp_path / "p", network, params, {})
     name, weights = flat_kernel(tmp_path / "p"), load_file(tmp_path / "p" / POLICY_WEIGHTS)
     card = json.loads((tmp_path / "p" / POLICY_CARD).read_text())
     weights[f"{name}@rows"], card["shapes"][name] = change(weights[f"{name}@rows"], card["shapes"][name])
