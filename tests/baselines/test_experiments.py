@@ -334,7 +334,7 @@ def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path):
     assert "AD,seeded,cramped_up,rl,1,2," in (tmp_path / "report" / "report.csv").read_text()
     page = (tmp_path / "report" / "report.html").read_text()
     assert "cramped_up, learned (held out)" in page
-    assert "AD with rl/t0 on cramped_up: team return" in page
+    assert "AD with rl/t0 (held out) on cramped_up: team return" in page
     assert "| rl (held out) |" in (tmp_path / "report" / "report.md").read_text()
     about = json.loads((tmp_path / "ad-plain" / "cramped_up" / "results" / "run.json").read_text())
     assert about["config"]["histories"]["layouts"] == ["cramped_up"]
