@@ -34,14 +34,14 @@ class IsFinished(Protocol):
 
 
 class Collector(NamedTuple):
-    """What makes the histories of one source."""
+    """Functions of one source: to record the histories of a task, and to check whether they are complete."""
 
     run: Run
     is_finished: IsFinished
 
 
 def collector(source: str) -> Collector:
-    """Returns what makes the histories of a source."""
+    """Returns the functions that record the histories of a source."""
     return {"ppo": Collector(run_task, is_task_finished), "noise": Collector(run_noise, is_noise_finished)}[source]
 
 

@@ -25,6 +25,7 @@ import jax
 import numpy as np
 
 from generation.collection.noise_rollout import EPISODES_AT_ONCE, NoisyEpisodes, noise_schedules, play_noisy_episodes
+from generation.collection.record import array_shapes
 from generation.collection.task import (
     TASK_SAVE_SECONDS,
     TEAMMATE_NOISE,
@@ -55,7 +56,6 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.schema import curve_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.cached_arrays import new_mapped_array
 
 NOISE = "noise"
@@ -66,15 +66,9 @@ _LINE_BYTES = 200  # of a history, in the metrics and in the timing
 
 def noise_array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tuple[tuple[int, ...], str]]:
     """Shape and dtype of every array of an artefact: the fields of `NoisyEpisodes` by history, and `noise`."""
-    n, size, steps = histories, record_size(layout), (histories, episodes * KEPT_STEPS)
-    return {
-        "state": ((*steps, size), "uint8"),
-        "actions": (steps, "int8"),
-        "teammate_actions": (steps, "int8"),
-        "rewards": (steps, "int8"),
-        "episode_end_state": ((n, episodes, size), "uint8"),
-        "oracle_actions": (steps, "int8"),
-        NOISE: ((n, episodes), "float32"),
+    return array_shapes(layout, histories, episodes) | {
+        "oracle_actions": ((histories, episodes * KEPT_STEPS), "int8"),
+        NOISE: ((histories, episodes), "float32"),
     }
 
 
@@ -275,7 +269,7 @@ class NoiseWriter:
         return timing
 
     def _metrics(self, history: int) -> dict[str, float]:
-        """What is logged of a complete history: its mean returns at the start and at the end."""
+        """Returns the log line of a complete history: its mean returns at the start and at the end."""
         returns = self._arrays["rewards"][history].reshape(1, -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
         start, end = (round(float(values.mean()), 3) for values in curve_ends(returns))
         return {"update": history, "return_start": start, "return_end": end}

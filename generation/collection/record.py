@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from generation.learners.config import PPOConfig
 from generation.learners.rollout import Rollout
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -32,9 +31,9 @@ class HistoryArrays(NamedTuple):
     episode_end_state: np.ndarray
 
 
-def array_shapes(layout: Layout, config: PPOConfig) -> dict[str, tuple[tuple[int, ...], str]]:
+def array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tuple[tuple[int, ...], str]]:
     """Shape and dtype of every field of `HistoryArrays`."""
-    n, episodes, size = config.environments, config.episodes, record_size(layout)
+    n, size = histories, record_size(layout)
     steps = (n, episodes * KEPT_STEPS)
     return {
         "state": ((*steps, size), "uint8"),

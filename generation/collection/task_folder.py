@@ -118,7 +118,8 @@ def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
         state: the learner's state.
     """
     histories = sum(
-        math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in array_shapes(task.layout, config).values()
+        math.prod(shape) * np.dtype(dtype).itemsize
+        for shape, dtype in array_shapes(task.layout, config.environments, config.episodes).values()
     )
     saved, params = (sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) for tree in (state, state.params))
     return histories + 2 * saved + len(checkpoint_updates(config)) * params + config.updates * _LINE_BYTES
@@ -197,7 +198,7 @@ class ArtefactWriter:
         self._started = time.perf_counter()
         self._recording = 0.0
         if not first:
-            for name, (shape, dtype) in array_shapes(task.layout, config).items():
+            for name, (shape, dtype) in array_shapes(task.layout, config.environments, config.episodes).items():
                 new_mapped_array(self._array(name), shape, np.dtype(dtype))
         self._log = RunLog(partial, keep=lambda line: line["update"] < first)
         self._histories = self._mapped()

@@ -355,7 +355,7 @@ def _measure(learner: Learner | Population) -> tuple[LearnerSpeed, int]:
 
 def artefact_bytes(layouts: Sequence[str], ego: PPOConfig) -> int:
     """Uncompressed size of the histories of one task on each of these layouts."""
-    arrays = (array_shapes(get_layout(layout), ego).values() for layout in layouts)
+    arrays = (array_shapes(get_layout(layout), ego.environments, ego.episodes).values() for layout in layouts)
     return sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for task in arrays for shape, dtype in task)
 
 

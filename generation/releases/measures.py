@@ -34,7 +34,7 @@ _DIGITS = 4
 
 
 class TeammateFacts(NamedTuple):
-    """What is known of a task's teammate.
+    """Facts about the teammate of a task.
 
     Attributes:
         references: returns of the reference egos with it.

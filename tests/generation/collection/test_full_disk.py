@@ -59,9 +59,10 @@ def test_free_space_is_checked_before_the_work(task: Given, tmp_path, monkeypatc
 
 
 def test_arrays_are_allocated_not_sparse(task: Given, tmp_path):
-    writer = ArtefactWriter(tmp_path, task[0].task, task[1].ego, 0)
+    ego = task[1].ego
+    writer = ArtefactWriter(tmp_path, task[0].task, ego, 0)
     writer.close()
-    for name, (shape, dtype) in array_shapes(task[0].task.layout, task[1].ego).items():
+    for name, (shape, dtype) in array_shapes(task[0].task.layout, ego.environments, ego.episodes).items():
         path = tmp_path / f"{name}.npy"
         assert path.stat().st_blocks * 512 >= path.stat().st_size
         found = np.load(path)

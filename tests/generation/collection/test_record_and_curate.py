@@ -35,7 +35,7 @@ def make_config(length: int, updates: int) -> PPOConfig:
 
 
 def empty_histories(config: PPOConfig) -> record.HistoryArrays:
-    shapes = record.array_shapes(LAYOUT, config)
+    shapes = record.array_shapes(LAYOUT, config.environments, config.episodes)
     return record.HistoryArrays(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
 
 
@@ -106,7 +106,7 @@ def test_keeping_twice_changes_nothing_and_order_does_not_matter():
 def test_shapes():
     config = PPOConfig(total_steps=64 * 100 * 25, environments=64, rollout=100, minibatches=1)
     size = record_size(LAYOUT)
-    assert record.array_shapes(LAYOUT, config) == {
+    assert record.array_shapes(LAYOUT, config.environments, config.episodes) == {
         "state": ((64, 600, size), "uint8"),
         "actions": ((64, 600), "int8"),
         "teammate_actions": ((64, 600), "int8"),
@@ -277,7 +277,8 @@ def test_oracle_labels_are_what_the_oracle_does():
 
 
 def test_oracle_labels_follow_the_actions_that_the_ego_took():
-    """Two egos that stand still: the oracle waits a step after one that tried to move, and not after one that stays."""
+    """The state does not change in both cases. The oracle waits a step after an ego that tried to move, but not after
+    one that stayed."""
     cells = LAYOUT.agent_cells
     free = next(action for action in range(4) if LAYOUT.moves[cells[EGO], action] not in cells)
     (record,) = start(LAYOUT, np.array([cells], np.uint8), np.zeros((1, 2), np.uint8), LAYOUT.recipe_items[:1])

@@ -48,7 +48,7 @@ def lite_mixed(tmp_path_factory) -> Path:
     options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES[:2]}
     random_release(root, "lite", ("coord_simple",), experts=[SCRIPT, None], **options)
 
-    def tell(content: dict[str, Any]) -> None:
+    def complete(content: dict[str, Any]) -> None:
         noise, ppo = content.values()
         noise["noise"] = {"histories": 2, "episodes": 5, "start": [0.9, 1.0], "end": [0, 0.1], "power": [0.5, 2.0]}
         ppo["ego"] = {"total_steps": 100, "environments": 2}
@@ -57,7 +57,7 @@ def lite_mixed(tmp_path_factory) -> Path:
             one["nearest_test"] = {"teammate": "H3/t1", "distance": 0.25}
         noise["nearest_test"]["behaviour"] = 3
 
-    return spoiled(root, root.with_name("told"), PROVENANCE, tell)
+    return spoiled(root, root.with_name("complete"), PROVENANCE, complete)
 
 
 def spoiled(source: Path, target: Path, name: str, change: Callable[[Any], object]) -> Path:
@@ -101,9 +101,9 @@ def test_verification_says_what_it_believes(mixed, lite_mixed):
     (note,) = report.notes
     assert note.startswith("oracle actions of 12 histories: only their range was checked")
     assert verify_release(mixed[0]).notes == []
-    told = verify_release(lite_mixed, level="deep")
-    assert told.ok, told.findings
-    assert [note.split(":")[0] for note in told.notes] == [
+    report = verify_release(lite_mixed, level="deep")
+    assert report.ok, report.findings
+    assert [note.split(":")[0] for note in report.notes] == [
         "oracle actions of 6 histories",
         "returns of reference egos, of 2 tasks",
         "nearest test teammates, of 2 tasks",

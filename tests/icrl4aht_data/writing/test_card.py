@@ -43,7 +43,7 @@ def made(
 
 @pytest.fixture
 def content(lite) -> CardContent:
-    """Two learners and noise beside one teammate of demo_wide, a validation teammate, and one of coord_simple."""
+    """Four tasks: two learners with a teammate on demo_wide, noise with it, a validation teammate, and coord_simple."""
     base = read_content(lite[0])
     tasks = [
         (drawn("demo_wide", "H3", 12), made("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
