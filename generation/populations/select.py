@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,8 +49,8 @@ def select_teammates(
 ) -> TeammateSelection:
     """Draw teammates from the checkpoints whose return as teammates exceeds the threshold.
 
-    They are drawn from the sorted list with a fixed seed. If there are too few for both splits, at most a fifth are
-    held out.
+    They are drawn from the sorted list with a fixed seed, from the members in turn: checkpoints of one member resemble
+    each other. If there are too few for both splits, at most a fifth are held out.
 
     Args:
         suite: the suite's folder.
@@ -66,10 +67,20 @@ def select_teammates(
     good = [point for point in candidates if _return_as_teammate(suite, point) > THRESHOLD]
     order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
     held_out = min(heldout, max(len(good) - train, len(good) // 5))
-    chosen = [good[k] for k in order]
+    chosen = _members_in_turn([good[k] for k in order])
     return TeammateSelection(
         layout, algorithm, len(candidates), len(good), chosen[held_out : held_out + train], chosen[:held_out]
     )
+
+
+def _members_in_turn(points: Sequence[SuiteCheckpoint]) -> list[SuiteCheckpoint]:
+    """The first of each member in the given order, then the second of each, and so on."""
+    seen: Counter[int] = Counter()
+    turns = []
+    for point in points:
+        turns.append(seen[point.card["member"]])
+        seen[point.card["member"]] += 1
+    return [points[k] for k in np.argsort(turns, kind="stable")]
 
 
 def _return_as_teammate(suite: Path, point: SuiteCheckpoint) -> float:

@@ -454,6 +454,18 @@ def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates
     assert names[0] != sorted(names[0])
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_members_take_turns(tmp_path, seed):
+    """Member 0 has four good checkpoints, members 1 and 2 have two each."""
+    made_up(tmp_path, {(m, c): 30.0 for m, count in enumerate((4, 2, 2)) for c in range(count)})
+    chosen = select_teammates(tmp_path, LAYOUT.name, "fcp", 6, 1, seed=seed)
+    members = [point.card["member"] for point in chosen.heldout + chosen.train]
+    assert len(members) == 7
+    assert sorted(members[:3]) == sorted(members[3:6]) == [0, 1, 2]
+    assert members[6] == 0
+    assert len(set(paths(chosen.heldout + chosen.train))) == 7
+
+
 @pytest.mark.parametrize(
     ("good", "train", "heldout"),
     [(0, 0, 0), (1, 1, 0), (4, 4, 0), (5, 4, 1), (10, 8, 2), (22, 18, 4), (24, 20, 4), (25, 20, 5), (50, 20, 5)],
