@@ -211,8 +211,10 @@ def _typed(key: str, value: Any, kind: type) -> Any:
 
 
 def _number(key: str, value: Any) -> float | None:
-    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
-        return value
+    if value is None:
+        return None
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
     raise OptionError(f"{key} = {value!r}: expected a number")
 
 

@@ -7,12 +7,17 @@ import pytest
 from baselines.training.histories import hold_out, training_cells
 from baselines.training.seen import SeenInTraining, read_trained_on, teammate_id, teammate_ids
 from generation.teammates.instances import published_task
-from icrl4aht_data import load_icrl4aht
+from icrl4aht_data import Dataset, load_icrl4aht
 from icrl4aht_data.errors import NotStoredError, OptionError
 
 
-def test_held_out_teammates_are_not_among_those_in_training():
-    dataset = load_icrl4aht(split="train", layout="demo_simple")
+@pytest.fixture
+def dataset(two_sources) -> Dataset:
+    """Histories beside two teammates on demo_wide."""
+    return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
+
+
+def test_held_out_teammates_are_not_among_those_in_training(dataset):
     split = hold_out(dataset, 0.1)
     assert split.teammates is not None
     held = teammate_ids(dataset, split.teammates.ids.tolist())
@@ -23,15 +28,14 @@ def test_held_out_teammates_are_not_among_those_in_training():
     assert len(trained) == len({entry.task_id for entry in split.train.entries})
 
 
-def test_training_cells_name_their_teammates():
-    dataset = load_icrl4aht(split="train", layout="demo_simple")
+def test_training_cells_name_their_teammates(dataset):
     found = {}
     for cell in training_cells(dataset):
         of_cell = dataset.filter(teammate_kind=cell["algorithm"])
         assert cell["teammates"] == teammate_ids(dataset, of_cell.ids.tolist())
         assert len(cell["teammates"]) == cell["tasks"]
         found[cell["algorithm"]] = tuple(cell["teammates"])
-    assert read_trained_on(training_cells(dataset), "run.json") == SeenInTraining(("demo_simple",), found)
+    assert read_trained_on(training_cells(dataset), "run.json") == SeenInTraining(("demo_wide",), found)
 
 
 def test_teammates_of_one_policy_have_one_id():
@@ -44,9 +48,7 @@ def test_teammates_of_one_policy_have_one_id():
     assert teammate_id(policy) == "ab" * 8
 
 
-def test_releases_without_tasks_do_not_know_their_teammates(monkeypatch):
-    dataset = load_icrl4aht(split="train", layout="demo_simple")
-
+def test_releases_without_tasks_do_not_know_their_teammates(dataset, monkeypatch):
     def recover(history_id):
         raise NotStoredError("no tasks")
 
