@@ -165,14 +165,17 @@ class Dataset(Selection):
         provenance = self.provenance.get(entry.task_id, Provenance())
         return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
-    def ad(self, *, batch_size: int, length: int, **options: Unpack[SamplerOptions]) -> ADSampler:
+    def ad(
+        self, *, batch_size: int, length: int, labels: Labels | None = None, **options: Unpack[SamplerOptions]
+    ) -> ADSampler:
         """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options.
 
         Warns:
             MixedSplitsWarning: if histories of split "train" and of others are selected.
+            WeakLabelsWarning: see `ADSampler`.
         """
         warn_of_mixed_splits(self)
-        return ADSampler(self, batch_size=batch_size, length=length, **options)
+        return ADSampler(self, batch_size=batch_size, length=length, labels=labels, **options)
 
     def dpt(
         self,

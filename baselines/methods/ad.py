@@ -148,14 +148,19 @@ def next_obs_loss(predicted: Float[Array, "B L N"], obs: Num[Array, "B L ..."], 
 
 
 def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
-    """Returns AD's loss: cross-entropy of the actions taken, over valid positions (paper, App. E.2)."""
+    """Returns AD's loss: cross-entropy of the target actions, over valid positions (paper, App. E.2).
+
+    The targets are the actions taken, or labels.
+    """
 
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
-        actions = jnp.asarray(batch.target_actions)
-        output: StepOutput = run_model(model, options, params, key, steps, actions)
-        total = mean_of_rows(cross_entropy(output.head, actions, options.label_smoothing), mask)
-        log = {"action_loss": total, "accuracy": mean_of_rows(1.0 * (output.head.argmax(axis=-1) == actions), mask)}
+        targets = jnp.asarray(batch.target_actions)
+        # What was taken is the next step's previous action; after the last step `next_obs_loss` predicts nothing.
+        taken = jnp.roll(steps.prev_action, -1, axis=1)
+        output: StepOutput = run_model(model, options, params, key, steps, taken)
+        total = mean_of_rows(cross_entropy(output.head, targets, options.label_smoothing), mask)
+        log = {"action_loss": total, "accuracy": mean_of_rows(1.0 * (output.head.argmax(axis=-1) == targets), mask)}
         if output.next_obs is not None:
             log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
             total += log["next_obs_loss"]

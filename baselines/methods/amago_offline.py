@@ -116,4 +116,5 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
         loss=loss,
         logits=lambda output: output.logits[..., -1, :],
         slow=SLOW,
+        takes_labels=False,
     )

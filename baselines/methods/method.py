@@ -59,6 +59,7 @@ class Method:
         loss: see `Loss`.
         logits: the policy's logits (*B, A) in the model's output.
         slow: share of the parameters that enters the slow copy each step; 0 for a method without a slow copy.
+        takes_labels: whether it can learn labels, actions that others would have taken; DPT needs them.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Method:
     loss: Loss
     logits: Callable[[Any], Float[Array, "*B A"]]
     slow: float = 0.0
+    takes_labels: bool = True
 
     def init(self, key: Array) -> Any:
         """Returns initial parameters, float32."""

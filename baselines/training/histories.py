@@ -73,7 +73,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         EmptySelectionError: if no history has a value that the choice of histories filters by.
         OptionError: if a window or a context is longer than a history, if the layouts' own channels are asked for and
             differ in number, or if labels are asked for and the method uses none.
-        LabelsMissingError: for DPT on histories without the labels.
+        LabelsMissingError: for histories without the labels.
     """
     dataset, validation = _load(histories)
     split = hold_out(dataset, histories.held_out, validation=validation)
@@ -114,11 +114,12 @@ def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
     """Returns the labels that a method learns from, or None for one that learns from the histories' own actions."""
     if method.data == "dpt":
         return wanted or "expert"
-    if wanted is not None:
+    if wanted is not None and not method.takes_labels:
         raise OptionError(
-            f"labels = {wanted}: {method.name} learns from the histories' own actions; leave out --labels, or train dpt"
+            f"labels = {wanted}: {method.name} learns from the histories' own actions and rewards; leave out --labels, "
+            f"or train another method"
         )
-    return None
+    return wanted
 
 
 def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
@@ -232,7 +233,7 @@ def _sampler(
         "process_count": jax.process_count(),
     }
     if method.data == "ad":
-        return dataset.ad(length=options.context, **shared)
+        return dataset.ad(length=options.context, labels=labels, **shared)
     assert labels is not None
     return dataset.dpt(context=options.context, order=order, labels=labels, **shared)
 

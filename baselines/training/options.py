@@ -70,8 +70,8 @@ class HistoryOptions:
     order: ContextOrder = option_field("contiguous", "Order of the transitions in DPT's contexts.")
     labels: Labels | None = option_field(
         None,
-        "Labels to learn from: expert (greedy actions of a policy) or oracle (a script that knows the full state).",
-        default_text="expert for dpt; the others learn from the histories' own actions",
+        "Actions to learn: expert (greedy ones of a policy) or oracle (of a script that knows the full state).",
+        default_text="expert for dpt, the histories' own actions for the others",
     )
     held_out: float = option_field(
         0.1,

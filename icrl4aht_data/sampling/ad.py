@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 
+from icrl4aht_data.reading.history import Labels
+from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
-from icrl4aht_data.sampling.base import Sampler, describe_batch
+from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
+from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
 
@@ -24,7 +27,9 @@ class ADBatch(NamedTuple):
         obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
         prev_actions: int32 (B, L): the ego's actions in the previous steps, 0..5; 0 at a history's first step.
         prev_rewards: float32 (B, L): the team's rewards in the previous steps; 0 at a history's first step.
-        target_actions: int32 (B, L): the ego's actions, 0..5, which a model learns to predict.
+        target_actions: int32 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` what the
+            expert or the oracle would do instead. The actions taken are then those of the next column of
+            `prev_actions`.
         dones: bool (B, L): True at the last step of an episode.
         attention_mask: bool (B, L): False on padding.
         prev_teammate_actions: int32 (B, L): the teammate's actions in the previous steps, 0..5, and 0 at a history's
@@ -64,6 +69,8 @@ class ADSampler(Sampler[ADBatch]):
         dataset: a selection with observations of one shape: of layouts with as many channels, or channels="canonical".
         batch_size: B, over all processes.
         length: L, in steps.
+        labels: targets are labels of this kind, "expert" or "oracle", instead of the actions that were taken; see
+            `history.LABELS`.
         seed: any non-negative integer below 2**63.
         teammate_actions: whether batches have `prev_teammate_actions`.
         weights: probabilities of the histories: "uniform", "length" (proportional to the steps that windows may
@@ -73,12 +80,33 @@ class ADSampler(Sampler[ADBatch]):
         process_index, process_count: number of this process and of all processes; each gets batch_size / process_count
             rows of every batch.
 
+    Warns:
+        WeakLabelsWarning: with `labels`, as `DPTSampler`.
+
     Raises:
         OptionError: for impossible options, or a selection with observations of several shapes.
-        LabelsMissingError: with teammate_actions=True, if some history has none.
+        LabelsMissingError: with teammate_actions=True, if some history has none; with `labels`, if some history has not
+            these.
     """
 
     batch_type = ADBatch
+
+    def __init__(
+        self,
+        dataset: Selection,
+        *,
+        batch_size: int,
+        length: int,
+        labels: Labels | None = None,
+        **options: Unpack[SamplerOptions],
+    ) -> None:
+        super().__init__(dataset, batch_size=batch_size, length=length, **options)
+        self.labels = None if labels is None else check_labels(dataset, labels)
+        if labels is not None:
+            warn_of_weak_labels(dataset, labels)
+
+    def options(self) -> dict[str, Any]:
+        return super().options() | ({} if self.labels is None else {"labels": self.labels})
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
@@ -94,6 +122,11 @@ class ADSampler(Sampler[ADBatch]):
             **self._layout_specs(),
             "is_first": ArraySpec("bool", shape),
         }
+
+    @property
+    def _targets(self) -> str:
+        """Field of the targets."""
+        return "actions" if self.labels is None else f"{self.labels}_actions"
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the windows of batch i: history ids and first steps, int64 (B,) each.
@@ -125,7 +158,7 @@ class ADSampler(Sampler[ADBatch]):
         records = self._observer.records(batch.obs)
         reads = [
             ReadRequest(self._observer.field, position, starts, records),
-            ReadRequest("actions", position, starts, batch.target_actions),
+            ReadRequest(self._targets, position, starts, batch.target_actions),
             ReadRequest("dones", position, starts, batch.dones),
             # One step earlier; before a history's first step a source reads zeros.
             ReadRequest("actions", position, starts - 1, batch.prev_actions),

@@ -172,8 +172,8 @@ class Batches(Iterator[B], Generic[B]):
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         if "channels" in expected:
             given.setdefault("channels", "own")  # states of version 0.1 do not name them
-        if "labels" in expected:
-            given.setdefault("labels", "expert")  # nor did the others before there were two kinds
+        if "order" in expected:
+            given.setdefault("labels", "expert")  # nor those of DPT the labels before there were two kinds
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]
         if wrong or "next" not in state:
             found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))

@@ -118,7 +118,7 @@ reader: upload none hf://datasets/a/b --dry-run | none: no release here
 generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
-baselines: train ad --layout demo_wide --labels oracle | labels = oracle: ad learns from the histories' own actions;
+baselines: train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
 baselines: train ad --layout all --channels own | channels = own: the layouts
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here

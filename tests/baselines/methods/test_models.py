@@ -262,6 +262,15 @@ def test_next_observations_are_of_the_same_episode():
     assert loss(last) == loss(last._replace(obs=after_the_end)) != loss(last._replace(obs=within))
 
 
+def test_next_observations_follow_the_actions_taken_not_the_labels():
+    method, params = tiny("ad", layers=1)
+    batch = ad_batch()
+    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1])
+    taken, labelled = loss(batch), loss(batch._replace(target_actions=(batch.target_actions + 1) % 4))
+    assert taken["next_obs_loss"] == labelled["next_obs_loss"] != 0
+    assert taken["action_loss"] != labelled["action_loss"]
+
+
 def percepts(steps: int, episode: int, seed=0) -> Percept:
     """Input of an ego over some steps."""
     rng = np.random.default_rng(seed)

@@ -298,14 +298,20 @@ class TestHeldOut:
         def job(method: str, **choice: Any) -> Any:
             return prepare(method, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice))
 
-        for labels, given in (("oracle", {"labels": "oracle"}), ("expert", {})):
-            dpt = job("dpt", **given)
-            assert dpt.about["histories"]["labels"] == labels
-            assert {cell["labels"] for cell in dpt.about["trained_on"]} == {labels}
-            assert {sampler.labels for sampler in (dpt.data.train, *dpt.data.validation.values())} == {labels}
-        assert {cell["labels"] for cell in job("ad").about["trained_on"]} == {None}
-        with pytest.raises(OptionError, match="labels = expert: ad learns from the histories' own actions; leave out"):
-            job("ad", labels="expert")
+        for method, given, labels in (
+            ("dpt", {"labels": "oracle"}, "oracle"),
+            ("dpt", {}, "expert"),
+            ("ad", {"labels": "oracle"}, "oracle"),
+            ("hybrid_ad", {"labels": "expert"}, "expert"),
+            ("ad", {}, None),
+            ("amago_offline", {}, None),
+        ):
+            found = job(method, **given)
+            assert found.about["histories"]["labels"] == labels
+            assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
+            assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
+        with pytest.raises(OptionError, match="labels = expert: amago_offline learns from the histories' own actions"):
+            job("amago_offline", labels="expert")
 
     def test_one_teammate_cannot_be_held_out(self):
         dataset = load_icrl4aht(layout="coord_simple")

@@ -1,4 +1,4 @@
-"""DPT's labels, the expert's or the oracle's actions: in every storage, loader and device, and where there are none."""
+"""Labels, the expert's or the oracle's actions: in every storage, loader and device, and where there are none."""
 
 from __future__ import annotations
 
@@ -50,6 +50,36 @@ def test_labels_change_nothing_but_the_targets(sampler):
     expert, oracle = sampler.dataset.dpt(**OPTIONS)[0], sampler[0]
     assert (expert.query_target != oracle.query_target).any()
     assert_equal(expert._replace(query_target=oracle.query_target), oracle)
+
+
+@pytest.mark.parametrize("labels", LABELS)
+@pytest.mark.parametrize("cache", CACHES)
+def test_windows_with_labels_differ_in_their_targets_only(two_sources, cache, labels):
+    root, written = two_sources
+    dataset = load_icrl4aht(root, cache=cache, channels="canonical", obs="uint8")
+    options: dict[str, Any] = {"batch_size": 16, "length": 50, "seed": 4, "episodes": (-2, None)}
+    plain, labelled = dataset.ad(**options), dataset.ad(labels=labels, **options)
+    taken, batch = plain[1], labelled[1]
+    assert_equal(taken, batch._replace(target_actions=taken.target_actions))
+    ids, starts = labelled.windows(1)
+    assert not batch.attention_mask.all()
+    for row, (history, start) in enumerate(zip(ids.tolist(), starts.tolist(), strict=True)):
+        valid = int(batch.attention_mask[row].sum())
+        expected = written[history][f"{labels}_actions"][start : start + valid]
+        np.testing.assert_array_equal(batch.target_actions[row, :valid], expected)
+    assert not batch.target_actions[~batch.attention_mask].any()
+    assert (batch.target_actions != taken.target_actions).any()
+
+
+def test_windows_with_labels_are_resumed_with_the_same_ones(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
+    own, oracle, expert = (
+        dataset.ad(batch_size=2, length=9, labels=labels).batches(prefetch=0) for labels in (None, "oracle", "expert")
+    )
+    oracle.load_state_dict(oracle.state_dict())
+    for one, other in ((own, oracle), (oracle, own), (oracle, expert), (expert, own)):
+        with pytest.raises(OptionError, match="it has labels = "):
+            one.load_state_dict(other.state_dict())
 
 
 def test_full_releases_have_the_same_labels(two_sources, tmp_path):
@@ -205,6 +235,11 @@ class TestMissingLabels:
         with pytest.raises(UnknownNameError, match=r"unknown labels 'orcale'; valid: expert, oracle\. Did you mean"):
             load_icrl4aht(two_sources[0], layout="demo_wide").dpt(labels="orcale", **OPTIONS)  # type: ignore[arg-type]
 
+    def test_of_windows(self, tmp_path):
+        random_release(tmp_path / "r", layouts=("demo_wide",))
+        with pytest.raises(LabelsMissingError, match=r"labels = oracle: .*take expert as labels, which all have"):
+            load_icrl4aht(tmp_path / "r").ad(batch_size=2, length=9, labels="oracle")
+
 
 def test_an_oracle_that_earns_little_is_warned_of(two_sources, monkeypatch):
     """The oracle earns 5 in all tasks."""
@@ -217,3 +252,5 @@ def test_an_oracle_that_earns_little_is_warned_of(two_sources, monkeypatch):
     monkeypatch.setattr(type(dataset), "column", earned)
     with pytest.warns(WeakLabelsWarning, match=r"of 2 of 2 tasks come from the oracle, .*labels 5\.0, histories 11"):
         dataset.dpt(labels="oracle", **OPTIONS)
+    with pytest.warns(WeakLabelsWarning, match="of 2 of 2 tasks come from the oracle"):
+        dataset.ad(labels="oracle", batch_size=2, length=9)
