@@ -292,14 +292,13 @@ class HistorySplit(NamedTuple):
 
 
 def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
-    """Hold out a share of the tasks, and of every other task a share of its histories; at least one each.
+    """Hold out a share of the tasks, and a share of the other tasks' histories; at least one each.
 
-    The histories of tasks with one only are trained on. The choice depends on names and the seed alone: adding
-    histories does not move the others between parts.
+    Every task that is not held out keeps at least one history. The choice depends on names and the seed alone.
 
     Args:
         dataset: the histories to divide.
-        share: share of the tasks, and of the histories of a task.
+        share: share of the tasks, and of the histories of the others.
         seed: seed of the choice.
         validation: histories with other teammates, such as those of split validation: these are the part `teammates`
             then, and no task of `dataset` is held out.
@@ -312,16 +311,18 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
     tasks = sorted(np.unique(codes).tolist(), key=lambda code: _rank(seed, names[code]))
     held_tasks = tasks[: _count(share, len(tasks)) if len(tasks) > 1 and validation is None else 0]
-    streams, held = _stream_names(dataset), np.zeros(len(dataset), bool)
-    for code in tasks[len(held_tasks) :]:
-        rows = sorted(np.flatnonzero(codes == code), key=lambda row: _rank(seed, names[code], *streams[row]))
-        if len(rows) > 1:
-            held[rows[: _count(share, len(rows))]] = True
-    if not held.any():
+    streams, of_task = _stream_names(dataset), defaultdict(list)
+    for row, code in enumerate(codes.tolist()):
+        of_task[code].append((_rank(seed, names[code], *streams[row]), row))
+    others = [sorted(of_task[code]) for code in tasks[len(held_tasks) :]]
+    candidates = sorted(one for ranked in others for one in ranked[:-1])  # its last one stays with a task
+    if not candidates:
         raise OptionError(
             f"every task of {dataset!r} has one history: expected a task with two or more, one to train on and one to "
             f"hold out"
         )
+    held = np.zeros(len(dataset), bool)
+    held[[row for _, row in candidates[: _count(share, sum(map(len, others)))]]] = True
     in_held_task = np.isin(codes, held_tasks)
     return HistorySplit(
         train=dataset.select(~held & ~in_held_task),

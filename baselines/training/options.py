@@ -75,7 +75,7 @@ class HistoryOptions:
     )
     held_out: float = option_field(
         0.1,
-        "Share of each task's histories, and of the tasks if there are none of split validation, held out.",
+        "Share of the histories, and of the tasks if there are none of split validation, held out.",
         above=0,
         below=1,
     )

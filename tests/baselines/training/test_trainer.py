@@ -260,7 +260,8 @@ class TestHeldOut:
         assert [len(part) for part in parts] == [12, 4, 4]
         assert sorted(np.concatenate([part.ids for part in parts]).tolist()) == list(range(20))
         tasks = [set(part.column("task_id").tolist()) for part in parts]
-        assert tasks[0] == tasks[1]
+        assert len(tasks[0]) == 4
+        assert tasks[1] <= tasks[0]
         assert not tasks[0] & tasks[2]
         again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.25)
         assert set(again.train.ids) == set(split.train.ids)
@@ -270,7 +271,7 @@ class TestHeldOut:
             return prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice)).about
 
         about = job()
-        assert about["histories"]["sizes"] == {"train": 10, "histories": 4, "teammates": 6}
+        assert about["histories"]["sizes"] == {"train": 13, "histories": 1, "teammates": 6}
         assert about["histories"]["teammates_split"] == "validation"
         assert {cell["split"] for cell in about["trained_on"]} == {"train"}
         assert {cell["source"] for cell in about["trained_on"]} == {"ppo", "noise"}
@@ -287,6 +288,14 @@ class TestHeldOut:
         assert (len(split.train), len(split.histories)) == (4, 1)
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
             hold_out(dataset[3:5])
+
+    def test_every_task_keeps_a_history(self, two_sources):
+        """A large share takes all others; a small one takes a history of some tasks."""
+        dataset = load_icrl4aht(two_sources[0], source="noise", split="train", layout="demo_wide")
+        for share, held in ((0.9, 4), (0.5, 3), (0.01, 1)):
+            split = hold_out(dataset, share, validation=dataset[:1])
+            assert (len(split.train), len(split.histories)) == (6 - held, held)
+            assert len(set(split.train.column("task_id").tolist())) == 2
 
     def test_streams_of_two_learners_are_told_apart(self, two_sources):
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
