@@ -166,7 +166,13 @@ class Dataset(Selection):
         return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
 
     def ad(
-        self, *, batch_size: int, length: int, labels: Labels | None = None, **options: Unpack[SamplerOptions]
+        self,
+        *,
+        batch_size: int,
+        length: int,
+        every: int = 1,
+        labels: Labels | None = None,
+        **options: Unpack[SamplerOptions],
     ) -> ADSampler:
         """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options.
 
@@ -175,7 +181,7 @@ class Dataset(Selection):
             WeakLabelsWarning: see `ADSampler`.
         """
         warn_of_mixed_splits(self)
-        return ADSampler(self, batch_size=batch_size, length=length, labels=labels, **options)
+        return ADSampler(self, batch_size=batch_size, length=length, every=every, labels=labels, **options)
 
     def dpt(
         self,

@@ -168,6 +168,7 @@ def training_summary(histories: dict[str, Any]) -> str:
         f"held out {sizes['histories']} with the same teammates"
         + (f" and {sizes['teammates']} with others (split {split})" if split else ""),
     ]
+    parts += [f"windows of every {histories['every']}-th episode"] if histories["every"] > 1 else []
     return "; ".join(parts + ([f"{histories['labels']} labels"] if histories["labels"] else []))
 
 
@@ -275,7 +276,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         ),
         _experiment_size_option,
         history_filters,
-        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs", "labels")),
+        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs", "labels", "every")),
         evaluation_split_option,
         tasks_option,
         episodes_option,

@@ -28,7 +28,6 @@ from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
-from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
 
@@ -84,7 +83,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: _number_layouts(
-            _sampler(method, selection, options, model.teammate_actions, histories.order, labels), dataset.layouts
+            _sampler(method, selection, options, model.teammate_actions, histories, labels), dataset.layouts
         )
         for part, selection in parts.items()
         if selection is not None
@@ -216,14 +215,21 @@ def _sampler(
     dataset: Dataset,
     options: TrainOptions,
     teammate_actions: bool,
-    order: ContextOrder,
+    histories: HistoryOptions,
     labels: Labels | None,
 ) -> Any:
-    lengths = dataset.column("T")
+    lengths, every = dataset.column("T"), histories.every
     if options.context > lengths.min():
         raise OptionError(
             f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
             + _longer_source(dataset, options.context)
+        )
+    fewest = int(dataset.column("episodes").min())
+    least = fewest // every * dataset.info.environment.kept_steps
+    if every > 1 and options.context > least:
+        raise OptionError(
+            f"context = {options.context}, every = {every}: every {every}-th of the {fewest} episodes of the shortest "
+            f"history of {dataset!r} are {least} steps; take fewer, or a smaller --every"
         )
     shared: Any = {
         "batch_size": options.batch_size,
@@ -233,9 +239,11 @@ def _sampler(
         "process_count": jax.process_count(),
     }
     if method.data == "ad":
-        return dataset.ad(length=options.context, labels=labels, **shared)
+        return dataset.ad(length=options.context, every=every, labels=labels, **shared)
+    if every > 1:
+        raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
     assert labels is not None
-    return dataset.dpt(context=options.context, order=order, labels=labels, **shared)
+    return dataset.dpt(context=options.context, order=histories.order, labels=labels, **shared)
 
 
 def _longer_source(dataset: Dataset, context: int) -> str:

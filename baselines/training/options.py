@@ -73,6 +73,9 @@ class HistoryOptions:
         "Actions to learn: expert (greedy ones of a policy) or oracle (of a script that knows the full state).",
         default_text="expert for dpt, the histories' own actions for the others",
     )
+    every: int = option_field(
+        1, "Windows hold every n-th episode of a history, so that they span more of its learning.", at_least=1
+    )
     held_out: float = option_field(
         0.1,
         "Share of the histories, and of the tasks if there are none of split validation, held out.",

@@ -14,6 +14,7 @@ from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.validation import check_int
 
 
 class ADBatch(NamedTuple):
@@ -55,6 +56,24 @@ class ADBatch(NamedTuple):
         return describe_batch(self)
 
 
+class _Windows(NamedTuple):
+    """Windows of a batch.
+
+    Attributes:
+        position: int64 (B,), positions in the selection.
+        starts: int64 (B,), first steps.
+        valid: int64 (B,), how many steps are valid.
+        rows: the steps of each window, as in `ReadRequest`: `starts`, or all of them, int64 (B, L).
+        previous: the steps before them, in the same way.
+    """
+
+    position: np.ndarray
+    starts: np.ndarray
+    valid: np.ndarray
+    rows: np.ndarray
+    previous: np.ndarray
+
+
 class ADSampler(Sampler[ADBatch]):
     """Windows for Algorithm Distillation: a sequence of batches, each a pure function of (selection, options, seed, i).
 
@@ -69,6 +88,8 @@ class ADSampler(Sampler[ADBatch]):
         dataset: a selection with observations of one shape: of layouts with as many channels, or channels="canonical".
         batch_size: B, over all processes.
         length: L, in steps.
+        every: windows consist of every n-th episode of a history, so that a window of few episodes spans learning. The
+            first of them is drawn for each window, and `prev_*` are of the episode before in the window.
         labels: targets are labels of this kind, "expert" or "oracle", instead of the actions that were taken; see
             `history.LABELS`.
         seed: any non-negative integer below 2**63.
@@ -97,16 +118,21 @@ class ADSampler(Sampler[ADBatch]):
         *,
         batch_size: int,
         length: int,
+        every: int = 1,
         labels: Labels | None = None,
         **options: Unpack[SamplerOptions],
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=length, **options)
+        self.every = check_int("every", every, 1)
+        if every > 1:
+            self.drawn_bytes = 32  # four numbers of each step
         self.labels = None if labels is None else check_labels(dataset, labels)
         if labels is not None:
             warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
-        return super().options() | ({} if self.labels is None else {"labels": self.labels})
+        chosen = {"every": self.every} if self.every > 1 else {}
+        return super().options() | chosen | ({} if self.labels is None else {"labels": self.labels})
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
@@ -135,12 +161,11 @@ class ADSampler(Sampler[ADBatch]):
             OptionError: if the batch is larger than the free memory.
         """
         self._check_memory()
-        position, starts, _ = self._draw(i)
-        return self.dataset.ids[position].astype(np.int64), starts
+        drawn = self._draw(i)
+        return self.dataset.ids[drawn.position].astype(np.int64), drawn.starts
 
-    def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """int64 (B,) each: positions in the selection, first steps, and how many steps of each window are valid."""
-        for_history, for_start = self._random(i, 2)
+    def _draw(self, i: int) -> _Windows:
+        for_history, for_start, for_episode = self._random(i, 3)
         low, high = self._draws.steps(i)
         weights = self._draws.history_weights(low, high)
         if weights is None:
@@ -148,24 +173,42 @@ class ADSampler(Sampler[ADBatch]):
         else:
             position = weighted_choice(for_history, weights)
         low, high = low[position], high[position]
+        if self.every > 1:
+            return self._draw_thinned(position, low, high, for_start, for_episode)
         starts = low + scale_to_range(for_start, np.maximum(high - low - self.length, 0) + 1)
-        return position, starts, np.minimum(high - starts, self.length)
+        return _Windows(position, starts, np.minimum(high - starts, self.length), starts, starts - 1)
+
+    def _draw_thinned(
+        self, position: np.ndarray, low: np.ndarray, high: np.ndarray, for_start: np.ndarray, for_episode: np.ndarray
+    ) -> _Windows:
+        """Windows of every n-th episode between two steps of each history; unfinished episodes are left out."""
+        steps = self._draws.kept_steps
+        episodes = (high - low) // steps
+        first = scale_to_range(for_episode, np.minimum(episodes, self.every))
+        total = -(-(episodes - first) // self.every) * steps  # of the episodes that remain
+        start = scale_to_range(for_start, np.maximum(total - self.length, 0) + 1)
+        step = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
+        rows = low[:, None] + (first[:, None] + self.every * (step // steps)) * steps + step % steps
+        rows[start == 0, 0] = (low + first * steps - 1)[start == 0]  # nothing of the window precedes its first step
+        return _Windows(position, rows[:, 1], np.minimum(total - start, self.length), rows[:, 1:], rows[:, :-1])
 
     def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
         batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
-        position, starts, valid = self._draw(i)
+        position, starts, valid, rows, previous = self._draw(i)
+        if previous.ndim == 2:
+            previous = np.maximum(previous, 0)  # before a history's first step there is none, see below
 
         records = self._observer.records(batch.obs)
         reads = [
-            ReadRequest(self._observer.field, position, starts, records),
-            ReadRequest(self._targets, position, starts, batch.target_actions),
-            ReadRequest("dones", position, starts, batch.dones),
-            # One step earlier; before a history's first step a source reads zeros.
-            ReadRequest("actions", position, starts - 1, batch.prev_actions),
-            ReadRequest("rewards", position, starts - 1, batch.prev_rewards),
+            ReadRequest(self._observer.field, position, rows, records),
+            ReadRequest(self._targets, position, rows, batch.target_actions),
+            ReadRequest("dones", position, rows, batch.dones),
+            # Before a history's first step a source reads zeros.
+            ReadRequest("actions", position, previous, batch.prev_actions),
+            ReadRequest("rewards", position, previous, batch.prev_rewards),
         ]
         if batch.prev_teammate_actions is not None:
-            reads.append(ReadRequest("teammate_actions", position, starts - 1, batch.prev_teammate_actions))
+            reads.append(ReadRequest("teammate_actions", position, previous, batch.prev_teammate_actions))
         self.dataset.storage.read(reads)
 
         self._observer.observe(position, records, batch.obs)
@@ -174,6 +217,8 @@ class ADSampler(Sampler[ADBatch]):
         assert batch.is_first is not None
         batch.is_first[...] = False
         batch.is_first[:, 0] = starts == 0
+        for read in reads[3:]:
+            read.out[starts == 0, 0] = 0
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)

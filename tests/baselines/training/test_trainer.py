@@ -322,6 +322,19 @@ class TestHeldOut:
         with pytest.raises(OptionError, match="labels = expert: amago_offline learns from the histories' own actions"):
             job("amago_offline", labels="expert")
 
+    def test_windows_of_every_nth_episode(self, two_sources):
+        def job(method: str, every: int, context: int = 40) -> Any:
+            options = dataclasses.replace(OPTIONS, context=context)
+            return prepare(method, MODEL, options, HistoryOptions(("demo_wide",), str(two_sources[0]), every=every))
+
+        found = job("ad", 3)
+        assert found.about["histories"]["every"] == 3
+        assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
+        with pytest.raises(OptionError, match=r"context = 41, every = 3: every 3-th of the 6 episodes .* are 40 steps"):
+            job("ad", 3, 41)
+        with pytest.raises(OptionError, match="every = 2: dpt learns from contexts of one part"):
+            job("dpt", 2)
+
     def test_one_teammate_cannot_be_held_out(self):
         dataset = load_icrl4aht(layout="coord_simple")
         dataset = dataset.filter(task_id=dataset.entries[0].task_id)

@@ -1,0 +1,101 @@
+"""Windows of every n-th episode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.sampling.draws import Curriculum
+from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.two_sources import EPISODES, LENGTH
+
+OPTIONS: dict[str, Any] = {"batch_size": 32, "length": 2 * LENGTH + 7, "seed": 2}
+
+
+def following(step: int, every: int) -> int:
+    """The step after a step."""
+    after = step + 1
+    return after if after % LENGTH else after + (every - 1) * LENGTH
+
+
+def before(step: int, every: int) -> int:
+    """The step before a step of the first episodes of a history, or of later ones; -1 before the first step of all."""
+    skipped = (every - 1) * LENGTH
+    return step - 1 if step % LENGTH or step <= skipped else step - 1 - skipped
+
+
+@pytest.mark.parametrize("cache", CACHES)
+@pytest.mark.parametrize("every", [2, 3, EPISODES, EPISODES + 5])
+def test_windows_skip_episodes(two_sources, cache, every):
+    root, written = two_sources
+    dataset = load_icrl4aht(root, split="train", cache=cache, obs="state", channels="canonical")
+    sampler = dataset.ad(every=every, labels="oracle", teammate_actions=True, **OPTIONS)
+    padded = 0
+    for i in range(3):
+        batch = sampler[i]
+        for row, (history, start) in enumerate(zip(*(values.tolist() for values in sampler.windows(i)), strict=True)):
+            arrays, steps = written[history], [start]
+            while len(steps) < OPTIONS["length"] and following(steps[-1], every) < EPISODES * LENGTH:
+                steps.append(following(steps[-1], every))
+            previous = [before(start, every), *steps[:-1]]
+            valid = len(steps)
+            padded += valid < OPTIONS["length"]
+            assert batch.attention_mask[row].tolist() == [True] * valid + [False] * (OPTIONS["length"] - valid)
+            size = arrays["state"].shape[1]
+            np.testing.assert_array_equal(batch.obs[row, :valid, :size], arrays["state"][steps])
+            np.testing.assert_array_equal(batch.target_actions[row, :valid], arrays["oracle_actions"][steps])
+            np.testing.assert_array_equal(batch.dones[row, :valid], arrays["dones"][steps])
+            assert batch.is_first[row].nonzero()[0].tolist() == [0] * (start == 0)
+            for name, values in (
+                ("actions", batch.prev_actions),
+                ("rewards", batch.prev_rewards),
+                ("teammate_actions", batch.prev_teammate_actions),
+            ):
+                expected = np.where(np.array(previous) < 0, 0, arrays[name][previous])
+                np.testing.assert_array_equal(values[row, :valid], expected)
+                assert not values[row, valid:].any()
+    assert bool(padded) == (every > 2)
+
+
+def test_all_windows_are_drawn(two_sources):
+    """With every second of six episodes there are two sequences of three episodes each, and 14 starts in each."""
+    sampler = load_icrl4aht(two_sources[0], layout="demo_wide", split="train").ad(every=2, **OPTIONS)
+    starts = np.concatenate([sampler.windows(i)[1] for i in range(40)])
+    assert set(starts.tolist()) == {*range(14), *range(LENGTH, LENGTH + 14)}
+
+
+def test_every_episode_is_the_default(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    assert_equal(dataset.ad(**OPTIONS)[3], dataset.ad(every=1, **OPTIONS)[3])
+    assert "every" not in dataset.ad(**OPTIONS).options()
+
+
+def test_parts_of_histories(two_sources):
+    """The last four of six episodes, and of these the first half at batch 0: episodes 2 and 3."""
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    parts = dataset.ad(every=2, episodes=(-4, None), curriculum=Curriculum(9, (0, 0.5), (0.5, 1)), **OPTIONS)
+    for i, first in ((0, 2), (9, 4), (50, 4)):
+        assert set((parts.windows(i)[1] // LENGTH).tolist()) == {first, first + 1}
+        assert (parts[i].attention_mask.sum(axis=1) == LENGTH).all()
+
+
+def test_processes_share_a_batch(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    halves = [dataset.ad(every=2, process_index=k, process_count=2, **OPTIONS)[1] for k in (0, 1)]
+    complete = dataset.ad(every=2, **OPTIONS)[1]
+    for name, whole in complete._asdict().items():
+        if whole is not None:
+            np.testing.assert_array_equal(np.concatenate([getattr(half, name) for half in halves]), whole)
+
+
+def test_impossible_numbers(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    with pytest.raises(OptionError, match="every = 0: expected"):
+        dataset.ad(every=0, **OPTIONS)
+    state = dataset.ad(every=2, **OPTIONS).batches(prefetch=0).state_dict()
+    with pytest.raises(OptionError, match="it has every = 2, not 3"):
+        dataset.ad(every=3, **OPTIONS).batches(prefetch=0).load_state_dict(state)
