@@ -31,10 +31,10 @@ $(STAMP): pyproject.toml
 demo: install ## load, sample, verify, train, evaluate on validation tasks and draw it (at most 10 minutes)
 	$(BIN)/python -m baselines demo
 
-generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|small|mini|paper, OUT=folder, OPTIONS=...
+generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|small|mini|cpu|paper, OUT=folder, OPTIONS=...
 	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
-teammates: install ## train the suite of learned teammates: PROFILE=smoke|mini|paper
+teammates: install ## train the suite of learned teammates: PROFILE=smoke|small|mini|cpu|paper
 	$(BIN)/python -m generation teammates --profile $(PROFILE)
 
 verify: install ## verify every byte and the physics of a release: ROOT=folder (default: the bundled mini release)

@@ -67,7 +67,7 @@ class DemoSettings:
     root: Path = MINI
     model: ModelOptions = _MODEL
     training: TrainOptions = _TRAINING
-    sources: tuple[str, ...] = ()
+    sources: tuple[str, ...] = ("noise",)
     tasks: tuple[Task, ...] | None = None
     protocol: Protocol = _PROTOCOL
     seeds: Sequence[int] = range(10)

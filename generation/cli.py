@@ -139,9 +139,9 @@ def generate(
 ) -> None:
     """Rebuild a release, or resume a rebuild.
 
-    Trains the teammates of a profile and the egos of its tasks, records how they learn (OUT/artefacts), or plays noise
-    histories, which need no training, and packs the release OUT/lite or OUT/full. Unfinished work resumes from its last
-    save. This process trains the teammates, the executor collects the tasks. Tasks that fail are listed in
+    Trains the learned teammates of a profile, then collects its tasks into OUT/artefacts: egos that learn (source ppo),
+    noise histories (source noise), or both. Packs the release OUT/lite or OUT/full. Unfinished work resumes from its
+    last save. This process trains the teammates, the executor collects the tasks. Tasks that fail are listed in
     OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1. Hyper-parameters of the egos
     replace those of the profile.
     """

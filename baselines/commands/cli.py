@@ -484,7 +484,8 @@ def control_command(out: Path) -> None:
 def demo_command(out: Path) -> None:
     """Demonstrate every step on the bundled release.
 
-    Loads, samples and verifies it, trains a small AD model, evaluates it, and writes a report of one page.
+    Loads, samples and verifies it, trains a small AD model, compares it with the reference egos on validation tasks,
+    draws its return in each episode, and writes a report of one page.
     """
     from baselines.demo import run_demo
 

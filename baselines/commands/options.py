@@ -99,7 +99,7 @@ save_minutes_option = click.option(
     default=SAVE_MINUTES,
     help="Most minutes between checkpoints, which are also written every --save-every steps.",
 )
-gifs_option = click.option("--films/--no-films", "gifs", default=True, help="A GIF per teammate family on the page.")
+gifs_option = click.option("--gifs/--no-gifs", default=True, help="A GIF per teammate family on the page.")
 root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
 )

@@ -60,7 +60,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     """Returns the training of a method on histories; each process of several gets its share of the batches.
 
     The held-out part `teammates` are the release's histories of split validation on the training layouts that pass the
-    same filters. Without any, some tasks of the training split are held out instead, see `hold_out`.
+    same filters. Without any, some teammates of the training split are held out instead, see `hold_out`.
 
     Args:
         name: of the method.
@@ -290,8 +290,8 @@ class HistorySplit(NamedTuple):
     Attributes:
         train: histories to train on.
         histories: held-out histories of the training tasks.
-        teammates: histories with teammates that are in no other part, of split validation or of held-out tasks; None
-            if there is neither.
+        teammates: histories with teammates that are in no other part, of split validation or held out; None if there is
+            neither. They may act like a teammate in training, with other parameters.
     """
 
     train: Dataset
@@ -300,16 +300,17 @@ class HistorySplit(NamedTuple):
 
 
 def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
-    """Hold out a share of the tasks, and a share of the other tasks' histories; at least one each.
+    """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
 
-    Every task that is not held out keeps at least one history. The choice depends on names and the seed alone.
+    Every task with a teammate that is not held out keeps at least one history. The choice depends on names and the seed
+    alone.
 
     Args:
         dataset: the histories to divide.
-        share: share of the tasks, and of the histories of the others.
+        share: share of the teammates, and of the histories with the others.
         seed: seed of the choice.
         validation: histories with other teammates, such as those of split validation: these are the part `teammates`
-            then, and no task of `dataset` is held out.
+            then, and no teammate of `dataset` is held out.
 
     Raises:
         OptionError: if the share is not between 0 and 1, or every task has one history only.
@@ -317,12 +318,14 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     if not 0 < share < 1:
         raise OptionError(f"share = {share}: expected a number between 0 and 1")
     names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
-    tasks = sorted(np.unique(codes).tolist(), key=lambda code: _rank(seed, names[code]))
-    held_tasks = tasks[: _count(share, len(tasks)) if len(tasks) > 1 and validation is None else 0]
     streams, of_task = _stream_names(dataset), defaultdict(list)
     for row, code in enumerate(codes.tolist()):
         of_task[code].append((_rank(seed, names[code], *streams[row]), row))
-    others = [sorted(of_task[code]) for code in tasks[len(held_tasks) :]]
+    mates = {code: _teammate_name(dataset, ranked[0][1]) for code, ranked in of_task.items()}
+    ranked_mates = sorted(set(mates.values()), key=lambda mate: _rank(seed, mate))
+    held_mates = ranked_mates[: _count(share, len(ranked_mates)) if len(ranked_mates) > 1 and validation is None else 0]
+    held_tasks = [code for code, mate in mates.items() if mate in held_mates]
+    others = [sorted(ranked) for code, ranked in of_task.items() if code not in held_tasks]
     candidates = sorted(one for ranked in others for one in ranked[:-1])  # its last one stays with a task
     if not candidates:
         raise OptionError(
@@ -337,6 +340,13 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
         histories=dataset.select(held),
         teammates=dataset.select(in_held_task) if len(held_tasks) else validation,
     )
+
+
+def _teammate_name(dataset: Dataset, row: int) -> str:
+    """Returns what a history's teammate shares with no other: its layout and id, or the task where it is not known."""
+    history_id, entry = int(dataset.ids[row]), dataset[row].entry
+    ids = teammate_ids(dataset, [history_id])
+    return entry.task_id if ids is None else f"{entry.layout} {ids[0]}"
 
 
 def _stream_names(dataset: Dataset) -> list[tuple[int, ...]]:

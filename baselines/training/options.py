@@ -78,7 +78,7 @@ class HistoryOptions:
     )
     held_out: float = option_field(
         0.1,
-        "Share of the histories, and of the tasks if there are none of split validation, held out.",
+        "Share of the histories to hold out; also of the tasks, if no histories of split validation pass the filters.",
         above=0,
         below=1,
     )

@@ -1,12 +1,12 @@
-"""Which learned teammates an ego matters with: a reference ego, or the partner that a teammate was trained with, earns
-another return than the others."""
+"""Measures whether an ego matters with learned teammates: what the reference egos and the policy that a teammate was
+trained with earn with it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from generation.policy import Policy
 from generation.populations.train import RESPONSES
 from generation.teammates.learned import build_learned
 from generation.teammates.references import REFERENCE_EPISODES, reference_returns
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.checkpoints import checkpoint_folder
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -26,30 +26,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 _SEED = 12
 
 
-class LearnedHeadroom(NamedTuple):
-    """Mean returns of 20 episodes of 100 steps with a learned teammate.
-
-    Attributes:
-        stay, random, oracle: of the reference egos.
-        self_play: of the policy that it was trained with, which draws its actions: its last best response, or itself.
-    """
-
-    stay: float
-    random: float
-    oracle: float
-    self_play: float
-
-    @property
-    def matters(self) -> bool:
-        """Whether some ego earns at least 5 more than another."""
-        return max(self) - min(self) >= LEAST_HEADROOM
-
-    def describe(self) -> str:
-        """Returns the returns as a text."""
-        return ", ".join(f"{name.replace('_', '-')} {value:.1f}" for name, value in self._asdict().items())
-
-
-def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, LearnedHeadroom]:
+def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceEgos]:
     """Measure how much an ego matters with learned teammates.
 
     Args:
@@ -69,7 +46,7 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, LearnedHea
         self_play = [_paired_return(layout, ego, mate) for ego, mate in zip(partners, mates, strict=True)]
         for k, task in enumerate(own):
             stay, random, oracle = (float(returns[name][k]) for name in ("stay", "random", "oracle"))
-            found[task.task_id] = LearnedHeadroom(stay, random, oracle, self_play[k])
+            found[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play[k])
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -66,6 +67,8 @@ def _named_errors(path: Path) -> Iterator[None]:
 
 def _profile(name: str, content: dict[str, Any]) -> Profile:
     _check_keys(content, "", {"xla_threads", "ego", "teammates", "noise", "release", "tasks"})
+    for section in content.keys() - {"xla_threads"}:
+        _typed(section, content[section], dict)
     release, tasks = content["release"], content["tasks"]
     _check_keys(release, "release.", {"keep", "data_version", "policies", "oracle_actions", *_LEAST})
     _check_keys(tasks, "tasks.", {"layouts", "sources", "learners", "presets", "sampled", "algorithms"})
@@ -213,9 +216,9 @@ def _typed(key: str, value: Any, kind: type) -> Any:
 def _number(key: str, value: Any) -> float | None:
     if value is None:
         return None
-    if isinstance(value, int | float) and not isinstance(value, bool):
+    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
         return float(value)
-    raise OptionError(f"{key} = {value!r}: expected a number")
+    raise OptionError(f"{key} = {value!r}: expected a finite number")
 
 
 def _switch(key: str, value: Any) -> bool:

@@ -32,6 +32,7 @@ VALIDATION_DRAWS = 1
 """The base seed of validation teammates; training teammates are drawn with 0, so that no draw is in both splits."""
 
 _SOURCE_SEEDS, _LAYOUT_SEEDS, _FAMILY_SEEDS, _DRAW_SEEDS = 1_000_000, 10_000, 1_000, 500
+_UNSAMPLED_SEEDS = 500_000  # tasks with presets and learned teammates come behind those with drawn ones
 
 
 @dataclass(frozen=True)
@@ -251,15 +252,16 @@ class Profile:
 def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
     """A seed that no other task has, and that does not depend on the rest of the profile."""
     family = list(HEURISTIC_KINDS).index(entry["family"])
-    place = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS + entry["base_seed"] * _DRAW_SEEDS
-    return _first_seed(source) + place + entry["theta_id"]
+    first = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS + entry["base_seed"] * _DRAW_SEEDS
+    return _first_seed(source) + first + entry["theta_id"]
 
 
 def _of_source(task: Task, source: str) -> Task:
     """A task with a preset or a learned teammate as one of a source: those of "ppo" keep their seed."""
     if source == "ppo":
         return task
-    return make_task(task.track, task.split, task.layout.name, task.teammate, _first_seed(source) + task.seed)
+    seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed
+    return make_task(task.track, task.split, task.layout.name, task.teammate, seed)
 
 
 def _first_seed(source: str) -> int:

@@ -13,7 +13,7 @@ from generation.collection.job import CollectionError
 from generation.collection.options import CollectOptions
 from generation.collection.run import collect_tasks
 from generation.populations.build import build_suite
-from generation.populations.headroom import LearnedHeadroom, learned_headroom
+from generation.populations.headroom import learned_headroom
 from generation.populations.select import THRESHOLD, make_tasks
 from generation.profiles import Profile
 from generation.profiles.work import Work
@@ -22,7 +22,9 @@ from generation.releases.measures import teammate_facts
 from generation.releases.package import check_release_folder, package_release
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask, read_info
+from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.writing.card_content import read_content
 from icrl4aht_data.writing.card_tables import print_learning, teammate_name
@@ -98,7 +100,7 @@ def _packing_bars(kind: Kind, tasks: int, console: Console) -> Iterator[Callable
 
 def train_teammates(
     profile: Profile, suite: Path, seed: int, console: Console
-) -> tuple[list[Work], dict[str, LearnedHeadroom], list[LeftOutTask]]:
+) -> tuple[list[Work], dict[str, ReferenceEgos], list[LeftOutTask]]:
     """The units of work of a profile, for which its learned teammates are trained first.
 
     Returns:
@@ -113,14 +115,22 @@ def train_teammates(
     selections = build_suite(profile, suite, profile.algorithms, seed, console)
     learned = make_tasks(suite, selections, "train")
     headroom = learned_headroom(learned, suite)
-    left_out = []
-    for task in learned:
-        if not headroom[task.task_id].matters:
-            reason = f"the ego does not matter: {headroom[task.task_id].describe()}"
-            console.print(f"{task.task_id}: left out, {reason}")
-            name, layout = teammate_name(task), task.layout.name
-            left_out.append(LeftOutTask(task.task_id, layout, name, "ppo", 0, 0, None, None, reason))
-    works = profile.works([task for task in learned if headroom[task.task_id].matters])
+    of_teammate = {_teammate_key(task): headroom[task.task_id] for task in learned}
+    works, left_out = [], []
+    for work in profile.works(learned):
+        earned = of_teammate.get(_teammate_key(work.task))
+        if earned is None or earned.matters:
+            works.append(work)
+        elif work.learner == 0:
+            reason = f"the ego does not matter: {earned.describe()}"
+            console.print(f"{work.task.task_id}: left out, {reason}")
+            task, name = work.task, teammate_name(work.task)
+            left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))
+    if not works and left_out:
+        raise CollectionError(
+            f"{suite}: the ego matters with none of the learned teammates: train others, or add drawn heuristics "
+            f"([tasks.sampled]) to profile {profile.name}"
+        )
     if not works:
         names = dict.fromkeys(chain(*profile.algorithms.values()))
         raise CollectionError(
@@ -128,3 +138,8 @@ def train_teammates(
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
     return works, headroom, left_out
+
+
+def _teammate_key(task: Task) -> tuple[str, str]:
+    """What the tasks of all sources with one teammate share."""
+    return task.layout.name, json_hash(task.teammate)

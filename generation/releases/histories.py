@@ -84,10 +84,9 @@ def select_histories(
         streams = [np.arange(len(own)) for own in returns]
     found = TaskHistories(task, source, folders, returns, streams, least)
     if least is not None and not facts.matters:
-        egos = facts.references
         return found.left_out(
-            f"the ego does not matter: returns of the reference egos differ by less than {LEAST_HEADROOM:g} (stay "
-            f"{egos.stay:.1f}, random {egos.random:.1f}, oracle {egos.oracle:.1f})"
+            f"the ego does not matter: returns of these egos differ by less than {LEAST_HEADROOM:g}: "
+            f"{facts.references.describe()}"
         )
     if not len(found.kept):
         return found.left_out(f"the learners did not learn: no stream's end exceeds its start by {least or 0:g}")

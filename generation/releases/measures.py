@@ -1,7 +1,7 @@
 """Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
 
-Of drawn teammates the table `teammates/draws.jsonl` has it. Others are measured, and the measurements are kept next to
-the artefacts, in hidden files `.<layout>.teammates.json`, and not repeated there.
+Those of drawn teammates are in the table `teammates/draws.jsonl`, those of a release's teammates in its provenance.
+Others are measured once; the measurements are kept next to the artefacts, in hidden files `.<layout>.teammates.json`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from typing import Any, NamedTuple
 import msgspec
 
 from generation.learners.resume import software_versions
-from generation.populations.headroom import LearnedHeadroom, learned_headroom
+from generation.populations.headroom import learned_headroom
 from generation.teammates.distances import nearest_test
 from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, read_draws
 from generation.teammates.references import REFERENCE_EPISODES, reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, LEAST_HEADROOM, TESTED_ON
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.info import LeftOutTask
-from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos
+from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
@@ -39,36 +40,46 @@ class TeammateFacts(NamedTuple):
     Attributes:
         references: returns of the reference egos with it.
         nearest: the test teammate, of any family, that acts most like it; None where it is unknown.
-        matters: whether the ego matters: some ego, or the partner that it was trained with, earns another return.
     """
 
     references: ReferenceEgos
     nearest: NearestTest | None
-    matters: bool
+
+    @property
+    def matters(self) -> bool:
+        """Whether the ego matters with it."""
+        return self.references.matters
 
 
 def teammate_facts(
-    tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, LearnedHeadroom] | None = None
+    tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, ReferenceEgos] | None = None
 ) -> dict[str, TeammateFacts]:
     """Look up or measure the teammates of tasks, each once.
 
     Args:
         tasks: the tasks.
         artefacts: folder of their artefacts, where measurements are kept.
-        suite: folder of the learned teammates.
+        suite: folder of the learned teammates: a suite, or the folder `teammates` of a release, whose provenance has
+            the facts.
         headroom: task id -> measurements of learned teammates that were made before.
 
     Returns:
         task id -> facts.
     """
-    headroom = headroom or {}
+    headroom, recorded = headroom or {}, recorded_provenance(suite)
     groups: dict[tuple[str, str], list[Task]] = {}
     for task in tasks:
         groups.setdefault((task.layout.name, json.dumps(task.teammate, sort_keys=True)), []).append(task)
-    draws = {key: find_draw(key[0], members[0].teammate) for key, members in groups.items()}
-    found = {key: _facts_of_draw(draw) for key, draw in draws.items() if draw is not None}
-    for layout in dict.fromkeys(layout for (layout, _), draw in draws.items() if draw is None):
-        keys = [key for key, draw in draws.items() if draw is None and key[0] == layout]
+    found: dict[tuple[str, str], TeammateFacts] = {}
+    for key, members in groups.items():
+        draw, made = find_draw(key[0], members[0].teammate), recorded.get(members[0].task_id)
+        if draw is not None:
+            found[key] = _facts_of_draw(draw)
+        elif made is not None and made.references is not None:
+            found[key] = TeammateFacts(made.references, made.nearest_test)
+    unknown = [key for key in groups if key not in found]
+    for layout in dict.fromkeys(layout for layout, _ in unknown):
+        keys = [key for key in unknown if key[0] == layout]
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
         kept, settings = artefacts / f".{layout}.teammates.json", _settings(layout, chosen)
         measured = _read(kept, settings)
@@ -79,6 +90,12 @@ def teammate_facts(
                 partial.write_bytes(msgspec.json.encode({"settings": settings, "facts": measured}))
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
+
+
+def recorded_provenance(suite: Path) -> dict[str, Provenance]:
+    """Returns the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
+    path = suite.parent / PROVENANCE
+    return read_provenance(path) if suite.name == TEAMMATES and path.is_file() else {}
 
 
 def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
@@ -117,11 +134,11 @@ def _facts_of_draw(draw: Draw) -> TeammateFacts:
     near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
     if draw.other_distance < draw.distance:
         near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
-    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), near, draw.headroom)
+    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), near)
 
 
 def _measure(
-    layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, LearnedHeadroom]
+    layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]
 ) -> dict[str, TeammateFacts]:
     """Measure teammates of one layout; how unlike the test they act, only of learned ones.
 
@@ -131,20 +148,15 @@ def _measure(
     learned = [task for task in tasks if task.teammate_family == "rl"]
     heuristics = [task for task in tasks if task.teammate_family != "rl"]
     missing = [task for task in learned if task.task_id not in headroom]
-    known = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
-    returns: dict[str, Sequence[float]] = {**known}
+    returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
     returns |= learned_headroom(missing, suite) if missing else {}
     if heuristics:
         egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
         for k, task in enumerate(heuristics):
-            returns[task.task_id] = [float(egos[ego][k]) for ego in ("stay", "random", "oracle")]
+            stay, random, oracle = (float(egos[ego][k]) for ego in ("stay", "random", "oracle"))
+            returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
     nearest = _nearest(layout, learned, suite)
-    facts = {}
-    for task_id, earned in returns.items():
-        stay, random, scripted = (round(value, _DIGITS) for value in earned[:3])
-        references = ReferenceEgos(stay, random, scripted, REFERENCE_EPISODES)
-        facts[task_id] = TeammateFacts(references, nearest.get(task_id), max(earned) - min(earned) >= LEAST_HEADROOM)
-    return facts
+    return {task_id: TeammateFacts(earned, nearest.get(task_id)) for task_id, earned in returns.items()}
 
 
 def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:

@@ -23,7 +23,7 @@ from generation.profiles import Profile
 from generation.profiles.work import Work
 from generation.releases.histories import TaskHistories, select_histories
 from generation.releases.labeller import choose_labeller
-from generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
+from generation.releases.measures import TeammateFacts, recorded_provenance, teammate_facts, unhosted_families
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
@@ -31,7 +31,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES, Kind, episode_ends
+from icrl4aht_data.format.schema import PROVENANCE, Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
 from icrl4aht_data.writing.dataset_card import CURVES_FIGURE
@@ -75,7 +75,7 @@ def package_release(
     if facts is None:
         facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
     headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
-    recorded, new, omitted, curves = _recorded_provenance(suite), [], list(left_out), SourceCurves()
+    recorded, new, omitted, curves = recorded_provenance(suite), [], list(left_out), SourceCurves()
     for task_id, members in tasks.items():
         task = members[0].task
         found = select_histories(artefacts, members, profile, facts[task_id], headroom=task.layout.name in headroom)
@@ -141,12 +141,6 @@ def recorded_sources(release: Path) -> dict[str, str]:
     return {task_id: made.source or "ppo" for task_id, made in recorded.items()}
 
 
-def _recorded_provenance(suite: Path) -> dict[str, Provenance]:
-    """Provenance of the release whose teammates the suite is, by task id; empty for the suite of a profile."""
-    path = suite.parent / PROVENANCE
-    return read_provenance(path) if suite.name == TEAMMATES and path.is_file() else {}
-
-
 def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> TeammateSuite | None:
     """The populations of a learned teammate: the profile's, or those named by the release that it is taken from."""
     if task.task_id in recorded:
@@ -166,7 +160,7 @@ def _new_task(
 ) -> NewTask:
     task, metadata = found.task, json.loads((found.folders[0] / METADATA).read_text(encoding="utf-8"))
     made = Provenance(
-        profile=metadata["profile"],
+        profile=profile.name,
         profile_hash=profile.hash,
         code_version=metadata["code_version"],
         jax_version=metadata["jax_version"],

@@ -103,8 +103,8 @@ def drawn_teammates(
     """Chooses drawn teammates of a layout, without any simulation.
 
     The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
-    layout, of any family, has headroom. Each family first gives one draw of every behaviour, then its other draws, both
-    by how much the ego matters with them and by theta_id.
+    layout, of any family, has headroom. Each family first gives the draws that act unlike all test instances, of these
+    one of every behaviour, then the others, by how much the ego matters with them and by theta_id.
 
     Args:
         layout: a training layout.
@@ -155,7 +155,10 @@ def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
 
 
 def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
-    """The draws of a family that may be chosen, in the order in which they are; at least one."""
+    """The draws of a family that may be chosen, in the order in which they are; at least one.
+
+    Those that act like a test instance of another family come last.
+    """
     draws = _usable(layout, family, base_seed)
     if not draws:
         raise OptionError(
@@ -163,7 +166,11 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
             f"name other families ({_hosted_text(layout, base_seed)})"
         )
     first = {draw.behaviour: draw for draw in reversed(draws)}
-    return sorted(draws, key=lambda draw: (first[draw.behaviour] != draw, -draw.spread, draw.theta_id))
+
+    def order(draw: Draw) -> tuple[bool, bool, float, int]:
+        return draw.other_distance < SAME_BEHAVIOUR, first[draw.behaviour] != draw, -draw.spread, draw.theta_id
+
+    return sorted(draws, key=order)
 
 
 def _usable(layout: str, family: str, base_seed: int) -> list[Draw]:

@@ -108,7 +108,7 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
 
     Prints one line per task: layout, teammate, source, histories, their learners, transitions, the mean return of an
     episode at the start and at the end of learning, and the labels: expert, with what the policy earns that they come
-    from, acting greedily (if somebody measured it), and oracle.
+    from, acting greedily (if it was measured), and oracle.
     """
     tasks = summarize_tasks(_load(root, filters).entries)
     if as_json:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.schema import check_name
 from icrl4aht_data.utils.files import parse_json, read_text
@@ -107,12 +108,30 @@ class ReferenceEgos:
         random: the ego of random actions.
         oracle: the scripted ego, which sees the full state.
         episodes: number of episodes of each measurement.
+        self_play: the policy that a learned teammate was trained with, which draws its actions: its last best response,
+            or itself; None for heuristics, and where it was not measured.
     """
 
     stay: _Return
     random: _Return
     oracle: _Return
     episodes: _Positive
+    self_play: _Return | None = None
+
+    @property
+    def returns(self) -> dict[str, float]:
+        """The returns that are known, by the ego's name."""
+        found = {"stay": self.stay, "random": self.random, "oracle": self.oracle, "self-play": self.self_play}
+        return {name: value for name, value in found.items() if value is not None}
+
+    @property
+    def matters(self) -> bool:
+        """Whether the ego matters: some ego earns at least `LEAST_HEADROOM` more than another."""
+        return max(self.returns.values()) - min(self.returns.values()) >= LEAST_HEADROOM
+
+    def describe(self) -> str:
+        """Return the returns as text."""
+        return ", ".join(f"{name} {value:.1f}" for name, value in self.returns.items())
 
 
 @dataclass(frozen=True)
@@ -193,7 +212,7 @@ class Provenance:
     def to_json(self) -> dict[str, Any]:
         """The object to write, without what was not recorded."""
         content = _recorded(asdict(self))
-        for name in {"expert", "filter", "nearest_test", "suite"} & content.keys():
+        for name in {"expert", "filter", "nearest_test", "references", "suite"} & content.keys():
             content[name] = _recorded(content[name])
         if self.expert is not None:  # null says that the labels come from a script
             content["expert"] = {"policy_sha256": self.expert.policy_sha256} | content["expert"]

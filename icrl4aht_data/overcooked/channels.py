@@ -45,7 +45,7 @@ def channel_names(layout: Layout) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=64)
-def canonical_places(layout: Layout) -> np.ndarray:
+def canonical_positions(layout: Layout) -> np.ndarray:
     """Return the place of each own channel of a layout among the canonical channels, int64 (C,), ascending.
 
     Raises:
@@ -76,5 +76,5 @@ def to_canonical(layout: Layout, obs: Array) -> Array:
     xp = obs.__array_namespace__()
     # The channel after the last one is 0; every canonical channel that the layout does not have is taken from it.
     source = np.full(len(CANONICAL_CHANNELS), layout.channels)
-    source[canonical_places(layout)] = np.arange(layout.channels)
+    source[canonical_positions(layout)] = np.arange(layout.channels)
     return xp.take(xp.concat([obs, xp.zeros_like(obs[..., :1])], axis=-1), xp.asarray(source), axis=-1)

@@ -24,7 +24,7 @@ import numpy as np
 
 from icrl4aht_data.overcooked.channels import (
     CANONICAL_CHANNELS,
-    canonical_places,
+    canonical_positions,
     channel_names,
     observation_shape,
 )
@@ -148,7 +148,7 @@ def _changing_words(xp, state) -> Array:
 @lru_cache(maxsize=64)
 def _lookup(layout: Layout, canonical: bool = False) -> _Lookup:
     if canonical:
-        own, places = _lookup(layout), canonical_places(layout)
+        own, places = _lookup(layout), canonical_positions(layout)
         shift, mask = np.zeros((2, len(CANONICAL_CHANNELS)), np.uint32)  # mask 0: the layout does not have it
         shift[places], mask[places] = own.shift, own.mask
         return own._replace(shift=shift, mask=mask, agent_channels=CANONICAL_CHANNELS.index("wall"))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrl4aht_data.format.schema import record_field
-from icrl4aht_data.overcooked.channels import canonical_places
+from icrl4aht_data.overcooked.channels import canonical_positions
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
@@ -103,5 +103,5 @@ class Observer:
         """Observations of records of one layout; `out` is zeros to write them into."""
         if self._selection.has_states:
             return fast_observe(layout, records[..., : record_size(layout)], out, canonical=self._canonical)
-        out[..., canonical_places(layout)] = records[..., : layout.channels]
+        out[..., canonical_positions(layout)] = records[..., : layout.channels]
         return out

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.provenance import Provenance, ReferenceEgos, read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TASKS, Entry
 from icrl4aht_data.utils.paths import files_below
 
@@ -72,7 +71,7 @@ class CardContent:
             references = self.provenance.get(task_id, Provenance()).references
             if references is not None:
                 layout = members[0].layout
-                layouts[layout] = layouts.get(layout, False) or ego_matters(references)
+                layouts[layout] = layouts.get(layout, False) or references.matters
         return layouts
 
 
@@ -86,12 +85,6 @@ def read_content(root: Path) -> CardContent:
     return CardContent(
         index.info, list(index.entries), read_tasks(root / TASKS), provenance, frozenset(files_below(root))
     )
-
-
-def ego_matters(references: ReferenceEgos) -> bool:
-    """Whether the returns of the reference egos differ by at least `LEAST_HEADROOM`."""
-    returns = references.stay, references.random, references.oracle
-    return max(returns) - min(returns) >= LEAST_HEADROOM
 
 
 def mean_rise(histories: Sequence[Entry]) -> float:

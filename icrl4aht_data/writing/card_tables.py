@@ -9,13 +9,21 @@ from typing import NamedTuple
 import numpy as np
 from rich.console import Console
 
-from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LABEL_EPISODES, SOURCES, SPLITS
+from icrl4aht_data.benchmark.facts import (
+    FAMILIES,
+    KEPT_STEPS,
+    LABEL_EPISODES,
+    LEAST_HEADROOM,
+    SAME_BEHAVIOUR,
+    SOURCES,
+    SPLITS,
+)
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import Entry, are_labels_weak
 from icrl4aht_data.utils.templates import markdown_table
-from icrl4aht_data.writing.card_content import CardContent, ego_matters, share_risen
+from icrl4aht_data.writing.card_content import CardContent, share_risen
 from icrl4aht_data.writing.card_texts import count_in_words, sentence
 
 LEAST_RISE = 5.0
@@ -24,6 +32,7 @@ LEAST_RISE = 5.0
 LONGEST_TABLE = 60
 """Rows from which tables of tasks and teammates are summarized by layout and family."""
 
+_EGOS = ("stay", "random", "oracle", "self-play")
 _NAMES = 4  # columns of the table of learning curves that are no numbers
 
 
@@ -175,7 +184,8 @@ def teammates_table(release: CardContent) -> str:
     mates = card_teammates(release)
     if not any(mate.references or mate.nearest for mate in mates):
         return sentence("unmeasured_teammates")
-    parts = [sentence("teammates_table", **_reference_episodes(mates)), behaviours_in_words(mates)]
+    least = {"least": f"{LEAST_HEADROOM:g}", "same": f"{SAME_BEHAVIOUR:g}"}
+    parts = [sentence("teammates_table", **_reference_episodes(mates), **least), behaviours_in_words(mates)]
     table = _long_teammates(mates) if len(mates) <= LONGEST_TABLE else _summarized_teammates(mates)
     return f"{' '.join(filter(None, parts))}\n\n{table}"
 
@@ -210,21 +220,21 @@ def behaviours_in_words(mates: Sequence[CardTeammate]) -> str:
 
 
 def _long_teammates(mates: Sequence[CardTeammate]) -> str:
-    header = ["layout", "split", "teammate", "seed", "sources", "stay", "random", "oracle", "headroom"]
+    header = ["layout", "split", "teammate", "seed", "sources", *_EGOS, "headroom"]
     header += ["nearest test", "distance", "behaviour"]
     rows = []
     for mate in mates:
         returns, near = mate.references, mate.nearest
         row = [mate.layout, mate.split, mate.name, "" if mate.seed is None else str(mate.seed), ", ".join(mate.sources)]
-        row += ["", "", "", ""] if returns is None else [f"{v:z.1f}" for v in _returns(returns)] + [_yes(returns)]
+        row += [range_in_words(values) for values in _returns([returns] if returns else [])]
+        row.append("" if returns is None else "yes" if returns.matters else "no")
         row += ["", ""] if near is None else [near.teammate, f"{near.distance:.3f}"]
         rows.append([*row, "" if near is None or near.behaviour is None else str(near.behaviour)])
     return markdown_table(header, rows)
 
 
 def _summarized_teammates(mates: Sequence[CardTeammate]) -> str:
-    header = ["layout", "split", "family", "teammates", "behaviours", "headroom", "stay", "random", "oracle"]
-    header += ["nearest tests", "distance"]
+    header = ["layout", "split", "family", "teammates", "behaviours", "headroom", *_EGOS, "nearest tests", "distance"]
     groups: dict[tuple[str, str, str], list[CardTeammate]] = {}
     for mate in mates:
         groups.setdefault((mate.layout, mate.split, mate.family), []).append(mate)
@@ -234,19 +244,16 @@ def _summarized_teammates(mates: Sequence[CardTeammate]) -> str:
         nearest = [mate.nearest for mate in members if mate.nearest]
         behaviours = {near.behaviour for near in nearest} - {None}
         row = [*names, str(len(members)), str(len(behaviours)) if behaviours else ""]
-        row += [f"{sum(map(ego_matters, known))} of {len(known)}" if known else ""]
-        row += [range_in_words([_returns(found)[k] for found in known]) for k in range(3)]
+        row += [f"{sum(found.matters for found in known)} of {len(known)}" if known else ""]
+        row += [range_in_words(values) for values in _returns(known)]
         row += [", ".join(sorted({near.teammate for near in nearest}))]
         rows.append([*row, range_in_words([near.distance for near in nearest], 3)])
     return markdown_table(header, rows)
 
 
-def _returns(references: ReferenceEgos) -> tuple[float, float, float]:
-    return references.stay, references.random, references.oracle
-
-
-def _yes(references: ReferenceEgos) -> str:
-    return "yes" if ego_matters(references) else "no"
+def _returns(known: Sequence[ReferenceEgos]) -> list[list[float]]:
+    """What each of `_EGOS` earns with some teammates, as far as it is known."""
+    return [[found.returns[ego] for found in known if ego in found.returns] for ego in _EGOS]
 
 
 def range_in_words(values: Sequence[float], digits: int = 1) -> str:

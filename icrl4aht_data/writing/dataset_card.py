@@ -21,8 +21,9 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
-from icrl4aht_data.format.schema import FIELDS, KINDS
+from icrl4aht_data.format.schema import FIELDS, KINDS, Entry, are_labels_weak
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.writing.card_content import PARQUET_INDEX, CardContent, mean_rise, read_content
 from icrl4aht_data.writing.card_tables import (
@@ -30,6 +31,7 @@ from icrl4aht_data.writing.card_tables import (
     have_weak_labels,
     labels_table,
     left_out_table,
+    mean_end,
     range_in_words,
     teammate_name,
     teammates_table,
@@ -249,7 +251,12 @@ def _flat_tasks(release: CardContent) -> Iterable[str]:
 
 def _missing_teammates(release: CardContent) -> Iterable[str]:
     """Yield limits about populations with fewer training teammates than their profile wanted."""
-    found = Counter((task.layout.name, task.teammate_kind) for task in release.tasks if task.split == "train")
+    teammates = {
+        (task.layout.name, task.teammate_kind, json_hash(task.teammate))
+        for task in release.tasks
+        if task.split == "train"
+    }  # a teammate has a task of each source
+    found = Counter((layout, kind) for layout, kind, _ in teammates)
     wanted: Counter[tuple[str, str]] = Counter()
     for suite in release.distinct("suite"):
         for layout, names in _algorithms(release, suite).items():
@@ -296,8 +303,22 @@ def _figure(release: CardContent, path: str, caption: str) -> str:
 
 def _labels(release: CardContent) -> str:
     text = labels_table(release)
-    has_oracle = any(entry.has(FIELDS["oracle_actions"]) for entry in release.entries)
-    return f"{text}\n\n{sentence('oracle_labels')}" if has_oracle else text
+    tasks = [members for members in release.histories.values() if members[0].has(FIELDS["oracle_actions"])]
+    if not tasks:
+        return text
+    weak = [members for members in tasks if _have_weak_oracle_labels(release, members)]
+    found = f" {sentence('weak_oracle', weak=_tasks_by_layout(weak))}" if weak else ""
+    return f"{text}\n\n{sentence('oracle_labels')}{found}"
+
+
+def _have_weak_oracle_labels(release: CardContent, histories: list[Entry]) -> bool:
+    references = release.provenance.get(histories[0].task_id, Provenance()).references
+    return references is not None and bool(are_labels_weak(references.oracle, mean_end(histories)))
+
+
+def _tasks_by_layout(tasks: Iterable[list[Entry]]) -> str:
+    counts = Counter((members[0].layout, members[0].source) for members in tasks)
+    return ", ".join(f"{count_in_words(n, 'task')} of {source} on {layout}" for (layout, source), n in counts.items())
 
 
 def _policy_labellers(release: CardContent) -> list[ExpertLabels]:

@@ -257,7 +257,7 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
         return ExperimentOutcome([tmp_path / "report.html"], ["left out: nothing"])
 
     monkeypatch.setattr(experiments, "run_experiment", note_call)
-    small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-films"]
+    small = ["--steps", "1", "--batch-size", "2", "--tasks", "1", "--episodes", "3", "--family", "H4", "--no-gifs"]
     small += ["--layers", "2", "--warmup", "0.5", "--save-minutes", "0.5"]
     small += ["--teammate-family", "rl", "--algorithm", "fcp", "--algorithm", "brdiv"]
     chosen = ["--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]

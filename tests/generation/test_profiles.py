@@ -196,7 +196,7 @@ def test_sampled_teammates_of_both_sources(changed):
     assert [work.task for work in profile.works([learned]) if work.task.teammate == LEARNED_ENTRY] == [
         learned,
         learned,
-        make_task("layout", "train", "cramped_up", LEARNED_ENTRY, 2_000_007),
+        make_task("layout", "train", "cramped_up", LEARNED_ENTRY, 2_500_007),
     ]
 
 
@@ -204,7 +204,7 @@ def test_presets_of_both_sources(changed):
     works = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\npresets =')).works()
     assert [(work.source, work.task.seed) for work in works] == [
         *(("ppo", seed) for seed in range(4)),
-        *(("noise", 2_000_000 + seed) for seed in range(4)),
+        *(("noise", 2_500_000 + seed) for seed in range(4)),
     ]
     assert [work.task.teammate for work in works[:4]] == [work.task.teammate for work in works[4:]]
 
@@ -324,7 +324,12 @@ LEARNED_ENTRY = {
             "[ego.layouts.cramped_up]\nentropi = 0.02\n[release]",
             r"unknown key 'ego\.layouts\.cramped_up\.entropi'",
         ),
-        ("keep = 8", 'keep = 8\nleast_improvement = "5"', r"release\.least_improvement = '5': expected a number"),
+        (
+            "keep = 8",
+            'keep = 8\nleast_improvement = "5"',
+            r"release\.least_improvement = '5': expected a finite number",
+        ),
+        ("keep = 8", "keep = 8\nleast_rise = nan", r"release\.least_rise = nan: expected a finite number"),
         (
             "presets =",
             'sampled = { families = ["territori"], per_layout = 1 }\npresets =',

@@ -28,7 +28,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import FIELDS, JSON_TYPES, Field, Kind
 from icrl4aht_data.overcooked import state
-from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_places
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
@@ -206,8 +206,8 @@ class TestFormat:
         assert set(by_layout) == set(LAYOUTS)
         for layout in LAYOUTS.values():
             parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
-            places = canonical_places(layout).tolist()
-            assert reader["canonical_places"](parsed) == places
+            places = canonical_positions(layout).tolist()
+            assert reader["canonical_positions"](parsed) == places
             size, ranges = by_layout[layout.name]
             assert (int(size), _numbers(ranges)) == (layout.channels, places)
 

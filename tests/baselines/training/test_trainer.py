@@ -22,6 +22,7 @@ from jax.experimental import multihost_utils
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
 from baselines.methods.registry import get_method
+from baselines.training import histories
 from baselines.training.histories import hold_out, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS
@@ -251,9 +252,12 @@ class TestStep:
 
 
 class TestHeldOut:
-    def test_no_history_and_no_teammate_is_in_two_parts(self, tmp_path):
+    def test_no_history_and_no_teammate_is_in_two_parts(self, tmp_path, monkeypatch):
+        """Where a release does not describe teammates, each task counts as one."""
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
+        assert hold_out(dataset, 0.25).teammates is None  # all have the same parameters
+        monkeypatch.setattr(histories, "teammate_ids", lambda dataset, ids: None)
         split = hold_out(dataset, 0.25)
         assert split.teammates is not None
         parts = (split.train, split.histories, split.teammates)
@@ -288,6 +292,22 @@ class TestHeldOut:
         assert (len(split.train), len(split.histories)) == (4, 1)
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
             hold_out(dataset[3:5])
+
+    def test_a_teammate_of_both_sources_is_in_one_part(self, tmp_path, monkeypatch):
+        """Tasks of two sources with one teammate have different ids."""
+        random_release(tmp_path / "r", layouts=("demo_wide",), teammates=4, streams=4, episodes=2)
+        dataset = load_icrl4aht(tmp_path / "r", obs="state")
+        mates = {name: f"mate {number % 2}" for number, name in enumerate(dataset.index.values("task_id"))}
+        monkeypatch.setattr(
+            histories, "teammate_ids", lambda dataset, ids: [mates[dataset.index.entry(ids[0]).task_id]]
+        )
+        for seed in range(5):
+            split = hold_out(dataset, 0.3, seed)
+            assert split.teammates is not None
+            assert [len(part) for part in split if part is not None] == [6, 2, 8]
+            train, held, others = ({mates[n] for n in part.column("task_id").tolist()} for part in split if part)
+            assert held <= train
+            assert not train & others
 
     def test_every_task_keeps_a_history(self, two_sources):
         """A large share takes all others; a small one takes a history of some tasks."""

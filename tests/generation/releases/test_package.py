@@ -33,8 +33,8 @@ from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos, read_pro
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from tests.helpers.tiny import artefact
 
-MATTERS = TeammateFacts(ReferenceEgos(0.0, 1.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3), True)
-DOES_NOT = TeammateFacts(ReferenceEgos(40.0, 39.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3), False)
+MATTERS = TeammateFacts(ReferenceEgos(0.0, 1.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3))
+DOES_NOT = TeammateFacts(ReferenceEgos(40.0, 39.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3))
 
 
 @pytest.fixture
@@ -236,9 +236,7 @@ def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkey
     monkeypatch.setattr(measures, "_measure", measure)
     for _ in range(2):  # the second time from the file
         facts = teammate_facts([drawn, other], tmp_path, tmp_path)
-        assert facts[drawn.task_id] == TeammateFacts(
-            ReferenceEgos(0.0, 1.0, 30.0, 20), NearestTest("H3/t1", 0.3, 1), True
-        )
+        assert facts[drawn.task_id] == TeammateFacts(ReferenceEgos(0.0, 1.0, 30.0, 20), NearestTest("H3/t1", 0.3, 1))
         assert facts[other.task_id] == DOES_NOT
     assert calls == [[other.task_id]]
 

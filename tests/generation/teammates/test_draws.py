@@ -76,7 +76,7 @@ def test_numbers_of_the_table_are_possible():
 
 
 @pytest.mark.parametrize("layout", TESTED_ON)
-def test_no_chosen_teammate_acts_like_a_test_instance(layout):
+def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
     for seed in DRAWS_PER_SEED:
         families = hosted_families(layout, seed)
         usable = [found for family in families for found in read_draws(layout, family, seed) if found.admissible]
@@ -147,6 +147,13 @@ def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):
     assert chosen([H1], 1) == [(H1, 1)]
     with pytest.raises(OptionError, match=f"1 draws act like a test instance .*at most 0.000, to H3/t0.*1 of {H1}"):
         drawn_teammates("demo_wide", [H1, H2], 1)
+
+
+def test_draws_like_a_test_instance_of_another_family_come_last(monkeypatch, tmp_path):
+    like = draw(H1, 0, oracle=50.0)._replace(other="H4/t0", other_distance=0.0199)
+    unlike = draw(H1, 1, oracle=20.0)._replace(other="H4/t0", other_distance=0.02)
+    with_table(monkeypatch, tmp_path, like, unlike, draw(H1, 2, behaviour=1, oracle=10.0))
+    assert [theta_id for _, theta_id in chosen([H1], 3)] == [1, 2, 0]
 
 
 def test_draws_without_headroom_are_left_out_if_others_have_it(monkeypatch, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import INFO, PROVENANCE
 from icrl4aht_data.utils.files import write_json
 
@@ -25,6 +25,17 @@ def test_the_bundled_release_is_written_as_it_was_read(tmp_path):
 def test_unknown_fields_of_a_provenance_are_kept():
     note = {"seed": 3, "laboratory": {"city": "elsewhere"}, "other": [1]}
     assert Provenance.from_json(note).to_json() == note
+
+
+def test_the_ego_matters_if_the_partner_of_a_learned_teammate_earns_more():
+    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).matters
+    learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
+    assert learned.matters
+    assert learned.describe() == "stay 2.0, random 4.8, oracle 6.0, self-play 10.0"
+    for references in (learned, ReferenceEgos(2.0, 4.75, 6.0, 20)):
+        made = Provenance(references=references)
+        assert Provenance.from_json(made.to_json()) == made
+    assert "self_play" not in made.to_json()["references"]
 
 
 def test_what_is_known_of_the_expert_is_kept():

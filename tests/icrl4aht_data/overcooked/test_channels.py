@@ -12,7 +12,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked import observe as observe_module
 from icrl4aht_data.overcooked.channels import (
     CANONICAL_CHANNELS,
-    canonical_places,
+    canonical_positions,
     channel_names,
     observation_shape,
     to_canonical,
@@ -37,7 +37,7 @@ def placed(layout: Layout, own: np.ndarray) -> np.ndarray:
 
 @each_layout
 def test_names_and_places(layout):
-    names, places = channel_names(layout), canonical_places(layout)
+    names, places = channel_names(layout), canonical_positions(layout)
     assert len(names) == layout.channels == len(set(names))
     assert names == tuple(CANONICAL_CHANNELS[place] for place in places)
     assert (np.diff(places) > 0).all(), "own channels keep their order"
@@ -76,7 +76,7 @@ def test_the_table_in_the_docstring_of_observe_lists_the_channels(layout):
 def test_a_channel_that_no_layout_has_is_refused():
     layout = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
     with pytest.raises(OptionError, match=r"layout mine: channels \['self_ingredient_4', .* are not among the 46"):
-        canonical_places(layout)
+        canonical_positions(layout)
 
 
 @each_layout

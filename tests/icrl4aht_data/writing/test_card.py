@@ -96,9 +96,9 @@ def test_totals_of_a_release_whose_headroom_is_unknown(content):
 
 def test_teammates_with_references_distance_and_behaviour(content):
     table = card_tables.teammates_table(content)
-    assert "| demo_wide | train | H3/t12 | 0 | ppo, noise | 0.0 | 1.5 | 40.0 | yes | H3/t1 | 0.250 | 0 |" in table
-    assert "| demo_wide | validation | H3/t7 | 1 | noise | 0.0 | 1.5 | 30.0 | yes | H3/t1 | 0.020 | 4 |" in table
-    assert "| coord_simple | train | H1/t0 | 0 | ppo | 0.0 | 1.5 | 1.5 | no | H1/t0 | 0.500 |  |" in table
+    assert "| demo_wide | train | H3/t12 | 0 | ppo, noise | 0.0 | 1.5 | 40.0 |  | yes | H3/t1 | 0.250 | 0 |" in table
+    assert "| demo_wide | validation | H3/t7 | 1 | noise | 0.0 | 1.5 | 30.0 |  | yes | H3/t1 | 0.020 | 4 |" in table
+    assert "| coord_simple | train | H1/t0 | 0 | ppo | 0.0 | 1.5 | 1.5 |  | no | H1/t0 | 0.500 |  |" in table
     assert "Split train: 1 teammate of known behaviour, 1 different behaviour." in table
     assert "Of the behaviours of validation (1), 0 also occur in training" in table
 
@@ -123,7 +123,9 @@ def test_long_tables_are_summarized(content, monkeypatch):
         provenance=dict(content.provenance) | {other.task_id: made("noise", 4.0, 0.5, 0, "H3/t2")},
     )
     table = card_tables.teammates_table(more)
-    expected = "| demo_wide | train | H3 | 2 | 1 | 1 of 2 | 0.0 | 1.5 | 4.0 to 40.0 | H3/t1, H3/t2 | 0.250 to 0.500 |"
+    expected = (
+        "| demo_wide | train | H3 | 2 | 1 | 1 of 2 | 0.0 | 1.5 | 4.0 to 40.0 |  | H3/t1, H3/t2 | 0.250 to 0.500 |"
+    )
     assert expected in table
     assert "H3/t12" not in table
     labels = card_tables.labels_table(content)
@@ -186,3 +188,13 @@ def test_learning_is_printed(content):
     assert "*" not in text
     assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in text
     assert "left out: demo_wide with H4: all 32 draws act like a test teammate" in text
+
+
+def test_oracle_labels_that_earn_little_are_named(content):
+    assert "it earns less than half" not in render_card(content)  # noise histories, which end as the oracle does
+    labelled = replace(
+        content, entries=[msgspec.structs.replace(entry, has_oracle_actions=True) for entry in content.entries]
+    )
+    text = render_card(labelled)
+    assert "in 1 task of ppo on coord_simple it earns less than half of what the histories earn at their end" in text
+    assert "on demo_wide it earns less" not in text
