@@ -20,6 +20,7 @@ from generation.teammates.references import REFERENCE_EPISODES, reference_return
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.checkpoints import checkpoint_folder
+from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 

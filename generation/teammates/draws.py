@@ -47,7 +47,8 @@ class Draw(NamedTuple):
         stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
         random: mean return of the ego `random`.
         oracle: mean return of the ego `oracle`.
-        other: test instance of the other families that acts most like it; for information, it excludes no draw.
+        other: test instance of the other families that acts most like it. It excludes no draw, but such draws are
+            chosen last.
         other_distance: Hamming distance to that instance.
     """
 
@@ -68,6 +69,11 @@ class Draw(NamedTuple):
     def admissible(self) -> bool:
         """Whether it acts unlike every test instance of its family."""
         return self.distance >= SAME_BEHAVIOUR
+
+    @property
+    def like_another_family(self) -> bool:
+        """Whether it acts like a test instance of another family."""
+        return self.other_distance < SAME_BEHAVIOUR
 
     @property
     def spread(self) -> float:
@@ -165,10 +171,11 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
             f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {_reason(layout, family, base_seed)}; "
             f"name other families ({_hosted_text(layout, base_seed)})"
         )
-    first = {draw.behaviour: draw for draw in reversed(draws)}
+    first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
 
     def order(draw: Draw) -> tuple[bool, bool, float, int]:
-        return draw.other_distance < SAME_BEHAVIOUR, first[draw.behaviour] != draw, -draw.spread, draw.theta_id
+        like = draw.like_another_family
+        return like, first[like, draw.behaviour] != draw, -draw.spread, draw.theta_id
 
     return sorted(draws, key=order)
 
