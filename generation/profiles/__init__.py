@@ -209,7 +209,7 @@ def _layouts(key: str, value: Any) -> tuple[str, ...]:
 
 def _typed(key: str, value: Any, kind: type) -> Any:
     if isinstance(value, bool) or not isinstance(value, kind):
-        raise OptionError(f"{key} = {value!r}: expected {kind.__name__}")
+        raise OptionError(f"{key} = {value!r}: expected {'a table' if kind is dict else kind.__name__}")
     return value
 
 

@@ -276,6 +276,7 @@ LEARNED_ENTRY = {
             'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =',
             r"tasks\.algorithms\.cramped_up = .*: expected names, none twice",
         ),
+        ("[ego]\n", "noise = 5\n[ego]\n", r"noise = 5: expected a table"),
         ("keep = 8", "keep = 0", r"release\.keep = 0: expected 1\.\.8"),
         ("keep = 8", "keep = 9", r"release\.keep = 9: expected 1\.\.8"),
         ("minibatches = 4", "minibatches = 3", r"environments = 8: not a multiple of minibatches = 3"),
@@ -365,7 +366,7 @@ LEARNED_ENTRY = {
             'sampled = { families = ["assembly_line"], per_layout = 0 }',
             r"no tasks: expected teammates in tasks\.presets",
         ),
-        ("presets =", "sampled = 3\npresets =", r"tasks\.sampled = 3: expected dict"),
+        ("presets =", "sampled = 3\npresets =", r"tasks\.sampled = 3: expected a table"),
         (
             "presets =",
             'sampled = { families = ["assembly_line"], per_layout = 1, validation = 1 }\npresets =',
