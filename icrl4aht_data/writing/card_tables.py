@@ -283,7 +283,7 @@ def _long_labels(release: CardContent, tasks: Sequence[Sequence[Entry]]) -> str:
         scripted = first.source == "noise" and first.expert_step is None
         row += ["script" if scripted else _number(first.expert_step), f"{first.expert_return:z.1f}"]
         row += ["" if scripted else _return(first.expert_return_sampled), f"{mean_end(members):z.1f}"]
-        rows.append([f"**{cell}**" for cell in row] if have_weak_labels(members) else row)
+        rows.append(_bold(row) if have_weak_labels(members) else row)
     header = ["layout", "source", "split", "teammate", "step", "greedy", "sampled", "last"]
     return markdown_table(header, rows, right=4)
 
@@ -300,9 +300,13 @@ def _summarized_labels(tasks: Sequence[Sequence[Entry]]) -> str:
         last, weak = [mean_end(members) for members in own], sum(map(have_weak_labels, own))
         ranges = [range_in_words(greedy), range_in_words(sampled), range_in_words(last)]
         row = [*names, str(len(own)), *ranges, str(weak)]
-        rows.append([f"**{cell}**" for cell in row] if weak else row)
+        rows.append(_bold(row) if weak else row)
     header = ["layout", "source", "split", "tasks", "greedy", "sampled", "last", "weak"]
     return markdown_table(header, rows, right=5)
+
+
+def _bold(row: Sequence[str]) -> list[str]:
+    return [cell and f"**{cell}**" for cell in row]
 
 
 def _number(value: int | None) -> str:
