@@ -42,6 +42,7 @@ from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import plot_layout_curves
+from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.new_file import check_new_file
 
 DEMO_LAYOUT = "demo_wide"
@@ -60,6 +61,7 @@ class DemoSettings:
         root: folder of the release.
         model, training: AD's; by default of size tiny, with fewer steps than its own, chosen on validation tasks.
         sources: sources of the histories to train on; all if empty.
+        labels: actions to learn: the labels of this kind, or None for those that were taken.
         tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
         protocol, seeds: of the evaluation.
     """
@@ -68,6 +70,7 @@ class DemoSettings:
     model: ModelOptions = _MODEL
     training: TrainOptions = _TRAINING
     sources: tuple[str, ...] = ("noise",)
+    labels: Labels | None = "oracle"
     tasks: tuple[Task, ...] | None = None
     protocol: Protocol = _PROTOCOL
     seeds: Sequence[int] = range(10)
@@ -111,7 +114,9 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     say(3, "verifying every byte and every step")
     write(_verify(settings.root))
 
-    say(4, f"training AD, {model.layers} layers of width {model.width}, K = {training.context}: {training.steps} steps")
+    targets = f"{settings.labels} labels" if settings.labels else "the actions taken"
+    size = f"{model.layers} layers of width {model.width}, K = {training.context}"
+    say(4, f"training AD on {targets}, {size}: {training.steps} steps")
     _train_demo(out / "ad", settings)
     write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
 
@@ -154,7 +159,7 @@ def _verify(root: Path) -> str:
 
 
 def _train_demo(folder: Path, settings: DemoSettings) -> None:
-    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=settings.sources)
+    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=settings.sources, labels=settings.labels)
     job = prepare("ad", settings.model, settings.training, histories)
     with bars(edges=True, unit="steps") as show:
 
