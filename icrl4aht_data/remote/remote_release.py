@@ -180,8 +180,10 @@ class Remote:
         unlisted = [name for name in wanted if name not in self.manifest]
         if unlisted:
             raise RemoteError(f"{self.url}: its manifest does not list {', '.join(unlisted[:5])}", missing=True)
+        # First, because another thread may complete a file after it was found to be absent.
+        present = {name for name in wanted if self.path(name).exists()}
         absent = [name for name in wanted if not self.is_here(name)]
-        changed = [name for name in absent if self.path(name).exists()]
+        changed = [name for name in absent if name in present]
         self.check_replaceable(changed)
         if absent and offline():
             what = "not downloaded, or changed since" if changed else "not downloaded"

@@ -56,13 +56,13 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
 
 
 def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
-    """Return tasks with heuristic teammates, of the training split if the layout is in it."""
+    """Return tasks with heuristic teammates of unequal parameters, of the training split if the layout is in it."""
     return [
         make_task(
             track_of(layout),
             "train" if layout in TRACKS[track_of(layout)]["train"] else "test",
             layout,
-            {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {}},
+            {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {"x": t}},
             seed,
         )
         for seed, (layout, t) in enumerate((layout, t) for layout in layouts for t in range(teammates))

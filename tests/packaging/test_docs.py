@@ -199,7 +199,7 @@ class TestFormat:
                 np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
 
     def test_canonical_channels(self, reader):
-        listed = rows("format", "canonical places")
+        listed = rows("format", "canonical positions")
         assert tuple(name for cells in listed for name in cells[2].split(", ")) == CANONICAL_CHANNELS
         assert [place for cells in listed for place in _numbers(cells[0])] == list(range(len(CANONICAL_CHANNELS)))
         by_layout = {name: cells[1:] for cells in rows("format", "layouts") for name in cells[0].split(", ")}

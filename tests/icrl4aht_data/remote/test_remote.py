@@ -281,6 +281,25 @@ def test_repair(lite, tmp_path, what):
         assert contents(root) == intact
 
 
+def test_a_file_that_another_thread_downloads_meanwhile_is_no_changed_one(lite, tmp_path, monkeypatch):
+    name = load_icrl4aht(lite[0]).shards[0]
+    with http_server(lite[0]) as server:
+        remote = plan_download(server.url, to=tmp_path / "copy").root.remote
+        is_here = type(remote).is_here
+
+        def downloaded_meanwhile(self, wanted):
+            found = is_here(self, wanted)
+            self.path(wanted).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(lite[0] / wanted, self.path(wanted))
+            return found
+
+        monkeypatch.setattr(type(remote), "is_here", downloaded_meanwhile)
+        remote.fetch([name])
+    assert not remote.owned
+    assert not remote.replaced
+    assert (tmp_path / "copy" / name).read_bytes() == (lite[0] / name).read_bytes()
+
+
 def test_repair_needs_the_right_source(lite, full, tmp_path, monkeypatch):
     root = tmp_path / "copy"
     shutil.copytree(lite[0], root)
