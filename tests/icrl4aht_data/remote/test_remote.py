@@ -285,6 +285,7 @@ def test_a_file_that_another_thread_downloads_meanwhile_is_no_changed_one(lite, 
     name = load_icrl4aht(lite[0]).shards[0]
     with http_server(lite[0]) as server:
         remote = plan_download(server.url, to=tmp_path / "copy").root.remote
+        assert remote is not None
         is_here = type(remote).is_here
 
         def downloaded_meanwhile(self, wanted):

@@ -37,6 +37,7 @@ def test_windows_skip_episodes(two_sources, cache, every):
     padded = 0
     for i in range(3):
         batch = sampler[i]
+        assert batch.is_first is not None
         for row, (history, start) in enumerate(zip(*(values.tolist() for values in sampler.windows(i)), strict=True)):
             arrays, steps = written[history], [start]
             while len(steps) < OPTIONS["length"] and following(steps[-1], every) < EPISODES * LENGTH:
@@ -50,11 +51,8 @@ def test_windows_skip_episodes(two_sources, cache, every):
             np.testing.assert_array_equal(batch.target_actions[row, :valid], arrays["oracle_actions"][steps])
             np.testing.assert_array_equal(batch.dones[row, :valid], arrays["dones"][steps])
             assert batch.is_first[row].nonzero()[0].tolist() == [0] * (start == 0)
-            for name, values in (
-                ("actions", batch.prev_actions),
-                ("rewards", batch.prev_rewards),
-                ("teammate_actions", batch.prev_teammate_actions),
-            ):
+            for name in ("actions", "rewards", "teammate_actions"):
+                values = getattr(batch, f"prev_{name}")
                 expected = np.where(np.array(previous) < 0, 0, arrays[name][previous])
                 np.testing.assert_array_equal(values[row, :valid], expected)
                 assert not values[row, valid:].any()
