@@ -43,7 +43,6 @@ from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks
 from icrl4aht_data.commands.options import COUNT, LAYOUT
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
 from icrl4aht_data.writing.published import PUBLISHED_CHUNK
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -164,7 +163,7 @@ def transition_bytes(streams: int) -> dict[str, Any]:
     dataset = load_icrl4aht(obs="uint8")
     chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
     new = [
-        NewTask(task, Provenance(), len(part), lambda part=part: map(NewHistory.from_history, part))
+        NewTask(task, dataset.provenance[task.task_id], len(part), lambda part=part: map(NewHistory.from_history, part))
         for task, part in chosen
     ]
     transitions = sum(history.entry.T for _, part in chosen for history in part)
