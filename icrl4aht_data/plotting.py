@@ -31,12 +31,21 @@ PICTURES = (".png", ".svg", ".pdf")
 _CURVE_PARTS = 25  # of a history, as points of a curve
 
 
+MOST_PANELS = 12
+"""Tasks of which each has a panel of its own; more are drawn together, by layout."""
+
+
 def plot_learning_curves(dataset: Dataset, path: Path) -> None:
     """Plot the return per episode of every task in a selection: mean over streams, band from 10th to 90th percentile.
+
+    More than 12 tasks are drawn as `plot_layout_curves` does, by layout and source.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
+    if len(dataset.counts("task_id")) > MOST_PANELS:
+        plot_layout_curves(dataset, path)
+        return
     _plot_histories(dataset, path, lambda e: (e.task_id, f"{e.layout} with {e.teammate_kind}"), lambda e: "mean")
 
 

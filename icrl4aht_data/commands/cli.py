@@ -122,7 +122,12 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
 @_root
 @filter_options
 @click.option("--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history.")
-@click.option("--plot", type=NewFile(*PICTURES), metavar="FILE", help="Also draw learning curves: .png, .svg or .pdf.")
+@click.option(
+    "--plot",
+    type=NewFile(*PICTURES),
+    metavar="FILE",
+    help="Also draw learning curves, by task or, of more than 12, by layout: .png, .svg or .pdf.",
+)
 @overwrite_option
 @json_option
 def show(

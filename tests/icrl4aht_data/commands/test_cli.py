@@ -11,6 +11,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
+from icrl4aht_data import load_icrl4aht, plotting
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run as run_command
 from icrl4aht_data.errors import OptionError
@@ -90,6 +91,19 @@ def test_show_plots(lite, tmp_path):
     picture = imread(tmp_path / "curves.png")
     assert picture.shape[0] > 300
     assert len({tuple(pixel) for pixel in picture[::7, ::7].reshape(-1, picture.shape[-1])}) > 5
+
+
+def test_plots_of_many_tasks_have_a_panel_for_each_layout(lite, tmp_path, monkeypatch):
+    from matplotlib.image import imread
+
+    dataset, sizes = load_icrl4aht(lite[0]), []
+    assert len(dataset.counts("task_id")) == 4
+    for most in (4, 3):
+        monkeypatch.setattr(plotting, "MOST_PANELS", most)
+        plotting.plot_learning_curves(dataset, tmp_path / f"{most}.png")
+        sizes.append(imread(tmp_path / f"{most}.png").shape[:2])
+    plotting.plot_layout_curves(dataset, tmp_path / "layouts.png")
+    assert imread(tmp_path / "layouts.png").shape[:2] == sizes[1] != sizes[0]
 
 
 def test_commands_destroy_nothing(lite, full, tmp_path):
