@@ -224,13 +224,6 @@ def _sampler(
             f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
             + _longer_source(dataset, options.context)
         )
-    fewest = int(dataset.column("episodes").min())
-    least = fewest // every * dataset.info.environment.kept_steps
-    if every > 1 and options.context > least:
-        raise OptionError(
-            f"context = {options.context}, every = {every}: every {every}-th of the {fewest} episodes of the shortest "
-            f"history of {dataset!r} are {least} steps; take fewer, or a smaller --every"
-        )
     shared: Any = {
         "batch_size": options.batch_size,
         "seed": options.seed,
@@ -239,11 +232,23 @@ def _sampler(
         "process_count": jax.process_count(),
     }
     if method.data == "ad":
+        _check_thinned(dataset, options.context, every)
         return dataset.ad(length=options.context, every=every, labels=labels, **shared)
     if every > 1:
         raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
     assert labels is not None
     return dataset.dpt(context=options.context, order=histories.order, labels=labels, **shared)
+
+
+def _check_thinned(dataset: Dataset, context: int, every: int) -> None:
+    """Check that every n-th episode of each history makes a complete window."""
+    fewest = int(dataset.column("episodes").min())
+    steps = fewest // every * dataset.info.environment.kept_steps
+    if every > 1 and context > steps:
+        raise OptionError(
+            f"context = {context}, every = {every}: every {every}-th of the {fewest} episodes of the shortest history "
+            f"of {dataset!r} are {steps} steps; take fewer, or a smaller --every"
+        )
 
 
 def _longer_source(dataset: Dataset, context: int) -> str:

@@ -31,7 +31,6 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.checking.report import NamedProgress
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS, TASKS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.threads import usable_cores
@@ -371,7 +370,7 @@ def bytes_per_transition(kind: Kind, source: str = "ppo") -> float:
     of_source = {entry.task_id for entry in dataset.entries if entry.source == source}
     with tempfile.TemporaryDirectory() as folder:
         new = [
-            NewTask(task, Provenance(), 1, partial(_first_history, task))
+            NewTask(task, dataset.provenance[task.task_id], 1, partial(_first_history, task))
             for task in tasks
             if not of_source or task.task_id in of_source
         ]
@@ -381,5 +380,4 @@ def bytes_per_transition(kind: Kind, source: str = "ppo") -> float:
 
 
 def _first_history(task: Task) -> list[NewHistory]:
-    history = NewHistory.from_history(load_icrl4aht(task_id=task.task_id)[0])
-    return [replace(history, learner=0)]  # whose learner it is, the provenance would have to say
+    return [NewHistory.from_history(load_icrl4aht(task_id=task.task_id)[0])]

@@ -24,7 +24,6 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import Kind
-from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.writing.card_content import read_content
 from icrl4aht_data.writing.card_tables import print_learning, teammate_name
@@ -115,10 +114,10 @@ def train_teammates(
     selections = build_suite(profile, suite, profile.algorithms, seed, console)
     learned = make_tasks(suite, selections, "train")
     headroom = learned_headroom(learned, suite)
-    of_teammate = {_teammate_key(task): headroom[task.task_id] for task in learned}
+    of_teammate = {task.teammate_key: headroom[task.task_id] for task in learned}
     works, left_out = [], []
     for work in profile.works(learned):
-        earned = of_teammate.get(_teammate_key(work.task))
+        earned = of_teammate.get(work.task.teammate_key)
         if earned is None or earned.matters:
             works.append(work)
         elif work.learner == 0:
@@ -138,8 +137,3 @@ def train_teammates(
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
     return works, headroom, left_out
-
-
-def _teammate_key(task: Task) -> tuple[str, str]:
-    """What the tasks of all sources with one teammate share."""
-    return task.layout.name, json_hash(task.teammate)

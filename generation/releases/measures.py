@@ -69,7 +69,7 @@ def teammate_facts(
     headroom, recorded = headroom or {}, recorded_provenance(suite)
     groups: dict[tuple[str, str], list[Task]] = {}
     for task in tasks:
-        groups.setdefault((task.layout.name, json.dumps(task.teammate, sort_keys=True)), []).append(task)
+        groups.setdefault(task.teammate_key, []).append(task)
     found: dict[tuple[str, str], TeammateFacts] = {}
     for key, members in groups.items():
         draw, made = find_draw(key[0], members[0].teammate), recorded.get(members[0].task_id)

@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS,
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.files import parse_json, read_lines
+from icrl4aht_data.utils.files import json_hash, parse_json, read_lines
 from icrl4aht_data.utils.paths import is_inside
 
 _FIELDS = {"task_id": str, "track": str, "split": str, "layout_name": str, "seed": int, "teammate": dict}
@@ -51,6 +51,12 @@ class Task:
     @property
     def layout(self) -> Layout:
         return get_layout(self.layout_name)
+
+    @property
+    def teammate_key(self) -> tuple[str, str]:
+        """What this task shares with all others with the same teammate on the same layout, such as those of another
+        source: the layout's name and a hash of the teammate."""
+        return self.layout.name, json_hash(self.teammate)
 
     @property
     def teammate_kind(self) -> str:

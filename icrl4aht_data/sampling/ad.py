@@ -195,15 +195,15 @@ class ADSampler(Sampler[ADBatch]):
     def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
         batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         position, starts, valid, rows, previous = self._draw(i)
-        if previous.ndim == 2:
-            previous = np.maximum(previous, 0)  # before a history's first step there is none, see below
+        if self.every > 1:
+            previous = np.maximum(previous, 0)
 
         records = self._observer.records(batch.obs)
         reads = [
             ReadRequest(self._observer.field, position, rows, records),
             ReadRequest(self._targets, position, rows, batch.target_actions),
             ReadRequest("dones", position, rows, batch.dones),
-            # Before a history's first step a source reads zeros.
+            # Before a history's first step a source reads zeros; of single rows it reads none, see below.
             ReadRequest("actions", position, previous, batch.prev_actions),
             ReadRequest("rewards", position, previous, batch.prev_rewards),
         ]
@@ -217,8 +217,9 @@ class ADSampler(Sampler[ADBatch]):
         assert batch.is_first is not None
         batch.is_first[...] = False
         batch.is_first[:, 0] = starts == 0
-        for read in reads[3:]:
-            read.out[starts == 0, 0] = 0
+        if self.every > 1:
+            for read in reads[3:]:
+                read.out[starts == 0, 0] = 0
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)

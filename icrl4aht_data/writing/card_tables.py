@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -145,10 +144,9 @@ def card_teammates(release: CardContent) -> list[CardTeammate]:
     """Return the teammates of a release, each once, by layout, split and family."""
     found: dict[tuple[str, str, str], tuple[Task, list[str]]] = {}
     for task in release.tasks:
-        key = task.layout.name, task.split, json.dumps(task.teammate, sort_keys=True)
-        found.setdefault(key, (task, []))[1].append(task.task_id)
+        found.setdefault((*task.teammate_key, task.split), (task, []))[1].append(task.task_id)
     teammates = []
-    for (layout, split, _), (task, ids) in found.items():
+    for (layout, _, split), (task, ids) in found.items():
         sources = {entry.source for task_id in ids for entry in release.histories.get(task_id, ())}
         provenance = [release.provenance.get(task_id, Provenance()) for task_id in ids]
         teammates.append(

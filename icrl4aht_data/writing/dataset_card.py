@@ -23,7 +23,6 @@ from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headr
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import FIELDS, KINDS, Entry, are_labels_weak
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.writing.card_content import PARQUET_INDEX, CardContent, mean_rise, read_content
 from icrl4aht_data.writing.card_tables import (
@@ -251,12 +250,8 @@ def _flat_tasks(release: CardContent) -> Iterable[str]:
 
 def _missing_teammates(release: CardContent) -> Iterable[str]:
     """Yield limits about populations with fewer training teammates than their profile wanted."""
-    teammates = {
-        (task.layout.name, task.teammate_kind, json_hash(task.teammate))
-        for task in release.tasks
-        if task.split == "train"
-    }  # a teammate has a task of each source
-    found = Counter((layout, kind) for layout, kind, _ in teammates)
+    teammates = {task.teammate_key: task for task in release.tasks if task.split == "train"}  # in a task of each source
+    found = Counter((task.layout.name, task.teammate_kind) for task in teammates.values())
     wanted: Counter[tuple[str, str]] = Counter()
     for suite in release.distinct("suite"):
         for layout, names in _algorithms(release, suite).items():

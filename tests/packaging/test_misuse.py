@@ -62,6 +62,7 @@ reader: show --plot empty | 'empty' is a directory
 reader: download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 reader: download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 reader: download s3://a/b --to file | 'file' is a file
+reader: convert {MINI} --out out | give the form to convert to: --to full, lite, observations, published, parquet
 reader: convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
 reader: convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist
@@ -104,7 +105,7 @@ reader: list none | none: no release here, expected meta/info.json in it; there 
 reader: list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
 reader: list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
 reader: list file | file: no release here
-reader: list --split test | no history has split=['test']. This release has train/
+reader: list --split test | no history has split=['test']. This release has train/coord_simple
 reader: verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 reader: verify --split test | no history has split=['test']
 reader: list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
@@ -119,7 +120,7 @@ generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 baselines: train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
-baselines: train ad --layout all --channels own | channels = own: the layouts
+baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here
 baselines: report empty | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`

@@ -13,7 +13,7 @@ from icrl4aht_data.errors import NotStoredError, OptionError
 
 @pytest.fixture
 def dataset(two_sources) -> Dataset:
-    """Histories beside two teammates on demo_wide."""
+    """Noise histories of demo_wide with two teammates."""
     return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
 
 

@@ -66,26 +66,30 @@ def test_the_unspoiled_release_is_valid(learned):
         (PROVENANCE, lambda c: first(c).update(seed=77), "seed: expected the task's"),
         (PROVENANCE, lambda c: first(c)["ego"].update(clip=0.3), "ego_hash: expected"),
         (PROVENANCE, lambda c: first(c).update(ego_hash="0" * 16), "ego_hash: expected"),
-        (PROVENANCE, lambda c: first(c).update(streams_recorded=17), "environments, found 17"),
+        (
+            PROVENANCE,
+            lambda c: first(c).update(streams_recorded=17),
+            "streams_recorded: expected {environments} of each of 2 learners' environments, found 17",
+        ),
         (
             PROVENANCE,
             lambda c: first(c).update(streams_kept=1),
-            "streams_kept: expected at least the {stored} hist",
+            "streams_kept: expected at least the {stored} histories",
         ),
         (
             PROVENANCE,
             lambda c: first(c).update(streams_kept=9999),
-            "streams_kept: expected at most the {recorded} r",
+            "streams_kept: expected at most the {recorded} recorded",
         ),
         (
             PROVENANCE,
             lambda c: first(c)["filter"]["before"].update(streams=9),
-            "before.streams: expected {recorded}",
+            "filter.before.streams: expected {recorded}",
         ),
         (PROVENANCE, lambda c: first(c)["filter"]["after"].update(return_end=9.0), "filter.after.return_end: the"),
         (PROVENANCE, lambda c: first(c)["suite"].update(algorithms=["brdiv"]), "but the teammate is of fcp"),
         (HISTORIES, lambda c: c[-1].update(env_idx=-1), "Expected `int` >= 0"),
-        (HISTORIES, lambda c: c[-1].update(env_idx=9999), ": env_idx 9999, but "),
+        (HISTORIES, lambda c: c[-1].update(env_idx=9999), "env_idx 9999, but {recorded} streams were recorded"),
         (HISTORIES, lambda c: c[-1].update(source="human"), "of one task: unlike ['source']"),
         (HISTORIES, lambda c: c[-1].update(expert_return=7.0), "of one task: unlike ['expert_return']"),
         (HISTORIES, lambda c: [line.update(teammate_kind="territory") for line in c], "'territory' is of another fam"),
@@ -100,7 +104,9 @@ def test_the_unspoiled_release_is_valid(learned):
 def test_lies(learned, tmp_path, name, change, message):
     dataset = load_icrl4aht(learned)
     (note,) = read_provenance(learned / PROVENANCE).values()
-    message = message.format(recorded=note.streams_recorded, stored=len(dataset))
+    assert note.ego is not None
+    environments = note.ego["environments"]
+    message = message.format(recorded=note.streams_recorded, stored=len(dataset), environments=environments)
     found = problems(spoiled(learned, tmp_path / "release", name, change))
     assert any(message in problem for problem in found), found
 
