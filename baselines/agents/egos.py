@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from baselines.methods.method import Method
 from baselines.methods.tokens import percept_step
+from baselines.methods.view_change import no_change
 from baselines.training.histories import TrainedModel, read_trained
 from generation.experts.oracle import oracle
 from generation.policy import Policy
@@ -107,12 +108,25 @@ def get_agent(name: str) -> Callable[[Layout], Policy]:
     return AGENTS[name]
 
 
-def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
+def with_hidden_recipe(policy: Policy, layout: Layout, hidden: Sequence[str]) -> Policy:
+    """Returns a policy for percepts with canonical channels that does not see the recipe indicators of some layouts."""
+    if layout.name not in hidden:
+        return policy
+    change = no_change()._replace(hidden=jnp.bool_(True))
+
+    def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
+        return policy.act(params, memory, percept._replace(obs=change.observations(percept.obs)), key)
+
+    return policy._replace(act=act)
+
+
+def find_agent(name: str, acting: Acting = "cached", greedy: bool = True) -> NamedEgo:
     """Returns the reference ego with a name, or the trained model in a run folder of `python -m baselines train`.
 
     Args:
         name: name of a reference ego, or path of a run folder.
         acting: way of acting of a trained model, see `ACTING`.
+        greedy: whether a trained model takes its most probable action, or draws one.
 
     Raises:
         UnknownNameError: if the name is neither.
@@ -122,13 +136,14 @@ def find_agent(name: str, acting: Acting = "cached") -> NamedEgo:
     if name in AGENTS or not folder.is_dir():
         return NamedEgo(name, get_agent(name))
     run = read_trained(folder)
-    policy = learned(run.method, run.params, run.context, acting)
+    policy = learned(run.method, run.params, run.context, acting, greedy)
 
     def make(layout: Layout) -> Policy:
         check_fits(run, layout, folder)
-        return with_channels(policy, run.channels, layout)
+        return with_channels(with_hidden_recipe(policy, layout, run.hide_recipe), run.channels, layout)
 
     details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, "acting": acting}
+    details |= {} if greedy else {"sampled": True}
     return NamedEgo(run.label, make, {**details, "trained_on": run.trained_on})
 
 

@@ -21,21 +21,24 @@ from baselines.commands.options import (
     experiment_options,
     find_ego,
     gifs_option,
+    hide_recipe_option,
     history_filters,
     join_processes,
     model_options,
+    play_options,
+    prepare_method,
+    prepare_rl2,
     process_options,
     protocol_option,
     root_option,
+    sampled_option,
     save_minutes_option,
     seeds_option,
     size_option,
-    sized_settings,
     suite_option,
     tasks_option,
     tensorboard_option,
     training_options,
-    training_summary,
     variant_names,
 )
 from baselines.training.options import HistoryOptions
@@ -43,9 +46,10 @@ from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
-from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
+from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
+    COUNT_OR_NONE,
     LAYOUT,
     SEED,
     SETTINGS,
@@ -61,6 +65,7 @@ from icrl4aht_data.commands.options import (
     run,
     version_option,
 )
+from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
@@ -70,7 +75,7 @@ _console = Console(soft_wrap=True)
 
 
 _SECTIONS = {
-    "Train and evaluate": ("demo", "train", "evaluate", "report", "watch"),
+    "Train and evaluate": ("demo", "train", "evaluate", "report", "watch", "collect"),
     "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
     "Check": ("control", "drift", "headroom"),
 }
@@ -106,6 +111,7 @@ def cli() -> None:
 )
 @click.option("--agent", type=EGO_NAME, required=True, help="stay, random, oracle, or a folder that `train` made.")
 @acting_option
+@sampled_option
 @protocol_option
 @click.option(
     "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
@@ -126,6 +132,7 @@ def cli() -> None:
 def evaluate_command(
     agent: str,
     acting: Any,
+    sampled: bool,
     protocol: str,
     track: tuple[str, ...],
     split: str | None,
@@ -149,7 +156,7 @@ def evaluate_command(
     if manifest and split:
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
     paths = [manifest] if manifest else [manifest_path(name, split or "test") for name in track]
-    ego = find_ego("--agent", agent, acting)
+    ego = find_ego("--agent", agent, acting, not sampled)
     names = {get_layout(name).name for name in layout}
     chosen = limit_tasks(
         [task for path in paths for task in read_tasks(path) if not names or task.layout.name in names], tasks
@@ -329,7 +336,9 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @training_options
 @model_options
 @dataclass_options(HistoryOptions, "histories")
+@hide_recipe_option
 @history_filters
+@play_options
 @save_minutes_option
 @tensorboard_option
 @process_options
@@ -342,7 +351,9 @@ def train_command(
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
+    hide_recipe: tuple[str, ...],
     filters: dict[str, Any],
+    play: dict[str, Any],
     save_minutes: float,
     tensorboard: bool,
     coordinator: str | None,
@@ -351,31 +362,92 @@ def train_command(
 ) -> None:
     """Train a model on learning histories.
 
-    METHOD is ad, dpt, hybrid_ad or amago_offline. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
+    METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories;
+    --epochs to --imitation-end are its own. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
     the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second
     Ctrl-C does not wait for it.
     """
     join_processes(coordinator, processes, process)
-    from baselines.training.histories import prepare
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
-    sized, options, description = sized_settings(size, model, train)
-    choice = replace_given(HistoryOptions(layouts, root and str(root), **filters), histories)
-    job = prepare(method, sized, options, choice)
-    folder = out or Path("runs") / method
-    _console.print(f"{description}\n{training_summary(job.about['histories'])}", highlight=False)
+    choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
+    choice = replace_given(choice, histories)
+    folder, plays = out or Path("runs") / method, method == "rl2"
+    if plays:
+        job, options, description = prepare_rl2(size, model, train, play, choice)
+    else:
+        job, options, description = prepare_method(method, size, model, train, play, choice)
+    _console.print(description, highlight=False)
     with bars(edges=True, unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
             show(method, step, options.steps, format_loss(loss))
 
         watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
-        run_training(job.method, job.data, job.options, folder, job.about, **watched)
+        watched |= {"trainer": job.trainer} if plays else {}
+        run_training(job.method, job.data, options, folder, job.about, **watched)
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
+
+
+@cli.command(
+    "collect",
+    epilog=examples(
+        "python -m baselines collect --agent runs/rl2 --root build/noise/lite --out build/student",
+        "python -m baselines collect --agent runs/ad --layout demo_wide --histories 2 --out build/student",
+    ),
+)
+@click.option("--agent", type=EGO_NAME, required=True, help="A folder that `train` made, or a reference ego.")
+@sampled_option
+@root_option
+@click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
+@history_filters
+@click.option("--histories", type=COUNT, default=8, help="Histories with each teammate.")
+@click.option("--episodes", type=click.IntRange(min=10), default=60, help="Episodes of each history, of 100 steps.")
+@click.option(
+    "--noise",
+    nargs=2,
+    type=FiniteRange(min=0, max=1),
+    default=(0.0, 0.0),
+    metavar="START END",
+    help="Chance of a random action in a history's first and in its last episode.",
+)
+@click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
+@overwrite_option
+def collect_command(
+    agent: str,
+    sampled: bool,
+    root: Any,
+    layouts: tuple[str, ...],
+    filters: dict[str, Any],
+    histories: int,
+    episodes: int,
+    noise: tuple[float, float],
+    number: int,
+    out: Path,
+    overwrite: bool,
+) -> None:
+    """Record histories of an agent with the teammates of a release.
+
+    Writes a release of source student: what the agent did, what it would have done without the noise (expert actions),
+    and what the scripted oracle would have done (oracle actions). Validation teammates are played, too.
+    """
+    from baselines.online.student import collect_release, release_teammates
+    from baselines.training.histories import filter_histories
+    from generation.profiles.noise_config import NoiseConfig
+
+    start, end = noise
+    config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
+    ego = find_ego("--agent", agent, greedy=not sampled)
+    names = [get_layout(name).name for name in layouts] or None
+    dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
+    with bars(edges=True, unit="episodes") as show:
+        collect_release(ego, release_teammates(dataset, number), config, out, overwrite=overwrite, progress=show)
+    _console.print(f"wrote {out}; `icrl4aht-data show {out}` describes it")
 
 
 @cli.command(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import click
 
-from baselines.methods.options import SIZES, ModelOptions
-from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, TrainOptions
+from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
+from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
@@ -31,7 +31,7 @@ class EgoName(Names):
         return value
 
 
-def find_ego(option: str, value: str, acting: Any = "cached") -> Any:
+def find_ego(option: str, value: str, acting: Any = "cached", greedy: bool = True) -> Any:
     """Returns the ego that an option names, a `baselines.agents.egos.NamedEgo`.
 
     Raises:
@@ -45,7 +45,7 @@ def find_ego(option: str, value: str, acting: Any = "cached") -> Any:
         raise click.UsageError(f"{option}: {unknown('agent', value, AGENTS)} {hint}")
     if value not in AGENTS and not (Path(value) / CONFIG).is_file():
         raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `python -m baselines train` makes one")
-    return find_agent(value, acting)
+    return find_agent(value, acting, greedy)
 
 
 class HostPort(click.ParamType):
@@ -75,6 +75,9 @@ protocol_option = click.option(
 _ACTING = Names("acting", lazy_attribute("baselines.agents.egos", "ACTING"))
 _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
 acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
+sampled_option = click.option(
+    "--sampled", is_flag=True, help="Draw the actions of a trained model, instead of taking the most probable ones."
+)
 experiment_acting_option = click.option(
     "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
 )
@@ -139,6 +142,12 @@ def history_filters(command: Any) -> Any:
     return decorated
 
 
+hide_recipe_option = click.option(
+    "--hide-recipe",
+    type=LAYOUT,
+    multiple=True,
+    help="The model does not see the recipe indicators of this layout; repeat for several.",
+)
 _SIZE_NAME = Names("size", lambda: SIZES)
 size_option = click.option(
     "--size",
@@ -155,6 +164,7 @@ _experiment_size_option = click.option(
 _PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
 _BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
 training_options = dataclass_options(TrainOptions, "train", default_text={**_BY_SIZE, "batch_size": _PAPER_OR_CPU})
+play_options = dataclass_options(PlayOptions, "play")
 model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
@@ -203,6 +213,61 @@ def sized_settings(
     return options, training, text
 
 
+def prepare_method(
+    method: str,
+    size: str | None,
+    model: Mapping[str, Any],
+    train: Mapping[str, Any],
+    play: Mapping[str, Any],
+    histories: HistoryOptions,
+) -> tuple[Any, TrainOptions, str]:
+    """Returns the training of a method on histories, its options, and text that describes it.
+
+    Raises:
+        click.UsageError: for options of methods that learn by playing.
+    """
+    from baselines.training.histories import prepare
+
+    if play:
+        raise click.UsageError(f"{_flags(play)}: not with {method}, only with rl2, which learns by playing")
+    sized, options, description = sized_settings(size, model, train)
+    job = prepare(method, sized, options, histories)
+    return job, options, f"{description}\n{training_summary(job.about['histories'])}"
+
+
+def prepare_rl2(
+    size: str | None,
+    model: Mapping[str, Any],
+    train: Mapping[str, Any],
+    play: Mapping[str, Any],
+    histories: HistoryOptions,
+) -> tuple[Any, TrainOptions, str]:
+    """Returns the training of RL^2, its options, and text that describes it.
+
+    Raises:
+        click.UsageError: for options that only methods trained on histories have.
+    """
+    from baselines.online.prepare import prepare_play
+
+    unused = {"context", "accumulate", "weight_decay", "validate_every", "validation_batches"} & train.keys()
+    if size or unused:
+        raise click.UsageError(f"{_flags(unused or ['size'])}: not with rl2, which learns by playing")
+    sized = ModelOptions(**RL2_SETTINGS["model"] | dict(model))
+    options = TrainOptions(**RL2_SETTINGS["train"] | dict(train))
+    job = prepare_play("rl2", sized, options, PlayOptions(**dict(play)), histories)
+    played = job.about["histories"]
+    text = (
+        f"rl2: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps {options.steps}, "
+        f"each an episode of {job.trainer.tasks} tasks\nplaying on {', '.join(played['layouts'])}, canonical channels, "
+        f"with the teammates of {len(played['groups'])} families and layouts"
+    )
+    return job, options, text
+
+
+def _flags(names: Iterable[str]) -> str:
+    return ", ".join("--" + name.replace("_", "-") for name in sorted(names))
+
+
 def process_options(command: Any) -> Any:
     """Add the options of training on several machines; `join_processes` takes their values."""
     options = [
@@ -238,6 +303,9 @@ def variant_names(command: str) -> Names:
     experiments = lazy_attribute("baselines.experiments", "EXPERIMENTS")
     prefix = f"{command} "
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
+
+
+_NOT_IN_EXPERIMENTS = ("order", "held_out", "obs", "labels", "every", "mirror")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:
@@ -276,7 +344,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         ),
         _experiment_size_option,
         history_filters,
-        dataclass_options(HistoryOptions, "histories", exclude=("order", "held_out", "obs", "labels", "every")),
+        dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
         evaluation_split_option,
         tasks_option,
         episodes_option,

@@ -49,11 +49,13 @@ class Episode(NamedTuple):
         record: uint8 (B, T, S), state record before each step.
         actions: int32 (B, T, 2), actions of ego and teammate, 0..5.
         reward: float32 (B, T), reward of the team.
+        end: uint8 (B, S), state record after the last step.
     """
 
     record: UInt8[Array, "B T S"]
     actions: Int[Array, "B T 2"]
     reward: Float[Array, "B T"]
+    end: UInt8[Array, "B S"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +98,7 @@ class EvaluationRollout:
         """Returns the state before the first episode from task keys (B,)."""
         batch = keys.shape[0]
         egos = self.batched_ego.init(self.ego.params, _fold_all(keys, EGO))
-        zero = jnp.zeros(batch, jnp.int32)
-        nothing = Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
-        return RolloutState(self.env.init(keys), egos, nothing)
+        return RolloutState(self.env.init(keys), egos, no_outcome(batch))
 
     def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, Episode]:
         """Returns the state after one episode of every task, and the episode. To be jitted by the caller."""
@@ -108,8 +108,8 @@ class EvaluationRollout:
         memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
         ego_keys, mate_keys = _fold_all(keys, _EGO_STEPS), _fold_all(keys, _TEAMMATE_STEPS)
 
-        def step(carry: Any, t: Array) -> tuple[Any, Episode]:
-            state, memories = carry
+        def step(carry: Any, t: Array) -> tuple[Any, Any]:
+            state, memories, _ = carry
             now = state.env
             mine, egos = self.batched_ego.act(ego_params, state.ego, self.ego_view(state), _fold_all(ego_keys, t))
             theirs, memories = jax.vmap(mate.act)(
@@ -119,11 +119,13 @@ class EvaluationRollout:
             before = state.before._replace(
                 prev_action=mine, prev_reward=after.reward, prev_teammate_action=theirs, prev_done=after.done
             )
-            played = Episode(now.record, jnp.stack([mine, theirs], axis=-1), after.reward)
-            return (RolloutState(after.state, egos, before), memories), played
+            played = now.record, jnp.stack([mine, theirs], axis=-1), after.reward
+            return (RolloutState(after.state, egos, before), memories, after.final), played
 
-        (state, _), played = jax.lax.scan(step, (state, memories), jnp.arange(self.protocol.steps))
-        return state, jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), played)
+        start = (state, memories, state.env.record)
+        (state, _, end), played = jax.lax.scan(step, start, jnp.arange(self.protocol.steps))
+        record, actions, reward = (jnp.swapaxes(leaf, 0, 1) for leaf in played)
+        return state, Episode(record, actions, reward, end)
 
     def ego_view(self, state: RolloutState) -> Any:
         """Returns the input of the egos, with a leading axis (B,): state records, observations or percepts."""
@@ -133,6 +135,12 @@ class EvaluationRollout:
 
     def _view(self, sees: str, state: EnvState, slot: int) -> jax.Array:
         return state.record if sees == "state" else self.env.observe_one(state, slot)
+
+
+def no_outcome(batch: int) -> Percept:
+    """Returns the outcome of the previous step before the first step of B tasks."""
+    zero = jnp.zeros(batch, jnp.int32)
+    return Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 
 
 def _fold_all(keys: jax.Array, data: Any) -> jax.Array:

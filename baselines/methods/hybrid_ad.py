@@ -48,6 +48,12 @@ class RecurrentTrunk(nn.Module):
         features, states = self._advance(x[None], memory)
         return features[0], states
 
+    def follow(
+        self, x: Float[Array, "N B D"], states: tuple[Float[Array, "B D"], ...]
+    ) -> tuple[Float[Array, "N B D"], tuple[Float[Array, "B D"], ...]]:
+        """Returns the features of B sequences with time on the first axis, and the states after them."""
+        return self._scan(x, states, True)
+
     def _advance(self, x: Float[Array, "N D"], states: tuple[Array, ...]) -> tuple[Float[Array, "N D"], tuple]:
         features, states = self._scan(x[:, None], tuple(hidden[None] for hidden in states), True)
         return features[:, 0], tuple(hidden[0] for hidden in states)

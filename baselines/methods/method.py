@@ -53,7 +53,7 @@ class Method:
     Attributes:
         name: as in `registry.METHODS`.
         label: name in reports.
-        data: sampler of the batches to train on, "ad" or "dpt".
+        data: what it is trained on: batches of the sampler "ad" or "dpt", or "tasks" that it plays.
         model: module with the methods `start` and `act`.
         example: arguments that the model's parameters are made for.
         loss: see `Loss`.
@@ -64,7 +64,7 @@ class Method:
 
     name: str
     label: str
-    data: Literal["ad", "dpt"]
+    data: Literal["ad", "dpt", "tasks"]
     model: nn.Module
     example: tuple
     loss: Loss
@@ -105,7 +105,15 @@ def make_transformer(options: ModelOptions) -> Transformer:
 def make_tokens(kind: type[TokensType], options: ModelOptions, world: World) -> TokensType:
     """Returns a tokenizer of the given class for a world."""
     dtype = compute_dtype(options)
-    return kind(world.encoder(dtype), options.width, world.actions, options.teammate_actions, options.dropout, dtype)
+    return kind(
+        encoder=world.encoder(dtype),
+        width=options.width,
+        actions=world.actions,
+        teammate_actions=options.teammate_actions,
+        dropout=options.dropout,
+        dtype=dtype,
+        reward_scale=options.reward_scale,
+    )
 
 
 class NextObsHead(nn.Module):

@@ -51,6 +51,27 @@ SIZES = {
 }
 """Sizes by name: one for two cores of a CPU, and the paper's (Sec. 5.3, "Model Scale and Training Budget")."""
 
+RL2_SETTINGS: dict[str, dict[str, Any]] = {
+    "model": {
+        "width": 128,
+        "recurrent_layers": 1,
+        "dropout": 0.0,
+        "encoder": "mlp",
+        "teammate_actions": True,
+        "reward_scale": 0.05,
+    },
+    "train": {
+        "steps": 2000,
+        "batch_size": 256,
+        "learning_rate": 1e-3,
+        "warmup": 0.02,
+        "clip": 0.5,
+        "log_every": 20,
+        "save_every": 200,
+    },
+}
+"""Defaults of RL^2: values of `ModelOptions` and of `TrainOptions`, for two cores of a CPU."""
+
 PAPER_SIZES = ("small", "medium", "large")
 
 
@@ -72,6 +93,7 @@ class ModelOptions:
     )
     positions: Positions = option_field("none", "Position embedding: none, as published, or rope.")
     teammate_actions: bool = option_field(False, "+TA: input the teammate's previous action, too.", flags=["--ta"])
+    reward_scale: float = option_field(1.0, "Factor of the rewards in tokens; a delivery earns 20.", above=0)
     next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")
     label_smoothing: float = option_field(0.0, "Label smoothing of the action loss.", at_least=0, below=1)
     discounts: tuple[float, ...] = option_field(

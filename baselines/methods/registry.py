@@ -12,6 +12,7 @@ from baselines.methods.encoder import FEATURES
 from baselines.methods.hybrid_ad import hybrid_ad
 from baselines.methods.method import Method, World
 from baselines.methods.options import ModelOptions
+from baselines.methods.rl2 import rl2
 from baselines.methods.tokens import BatchView
 from generation.learners.config import EncoderKind
 from generation.learners.encoder import CompactView, WindowEncoder
@@ -24,6 +25,7 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "dpt": dpt,
     "hybrid_ad": hybrid_ad,
     "amago_offline": amago_offline,
+    "rl2": rl2,
 }
 """Methods: name -> function from (ModelOptions, World) to the method."""
 

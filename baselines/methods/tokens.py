@@ -90,6 +90,7 @@ class Tokens(nn.Module):
         teammate_actions: whether tokens hold the teammate's actions (+TA).
         dropout: rate in training.
         dtype: of the tokens.
+        reward_scale: factor of the rewards in tokens.
     """
 
     encoder: nn.Module
@@ -98,6 +99,7 @@ class Tokens(nn.Module):
     teammate_actions: bool = False
     dropout: float = 0.1
     dtype: Any = jnp.float32
+    reward_scale: float = 1.0
 
 
 class StepTokens(Tokens):
@@ -109,7 +111,7 @@ class StepTokens(Tokens):
         parts = [nn.Embed(self.actions, FEATURES, name="action")(step.prev_action)]
         if self.teammate_actions:
             parts.append(nn.Embed(self.actions, FEATURES, name="teammate_action")(step.prev_teammate_action))
-        parts += [step.prev_reward[..., None], self.encoder(step.obs)]
+        parts += [self.reward_scale * step.prev_reward[..., None], self.encoder(step.obs)]
         token = nn.Dense(self.width, name="project")(jnp.concatenate(parts, -1, dtype=self.dtype))
         return nn.Dropout(self.dropout)(token, deterministic=deterministic)
 
@@ -130,7 +132,7 @@ class TransitionTokens(Tokens):
         parts = [before, jax.nn.one_hot(transition.action, self.actions)]
         if self.teammate_actions:
             parts.append(jax.nn.one_hot(transition.teammate_action, self.actions))
-        return self._token([*parts, after, transition.reward[..., None]], deterministic), before
+        return self._token([*parts, after, self.reward_scale * transition.reward[..., None]], deterministic), before
 
     def query(self, obs: Any, deterministic: bool = True) -> Float[Array, "*B D"]:
         """Returns one token per observation for which an action is predicted."""

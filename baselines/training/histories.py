@@ -15,7 +15,8 @@ import numpy as np
 from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
-from baselines.methods.tokens import plain_view
+from baselines.methods.tokens import BatchView, plain_view
+from baselines.methods.view_change import changed_view, mirrored_action
 from baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
 from baselines.training.seen import TRAINED_ON, teammate_ids
@@ -76,14 +77,16 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     """
     dataset, validation = _load(histories)
     split = hold_out(dataset, histories.held_out, validation=validation)
-    view = None if dataset.obs == "state" else plain_view
-    canonical = dataset.channels == "canonical"
+    hidden = [get_layout(one).name for one in histories.hide_recipe]
+    view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
     labels = _labels_of(method, histories.labels)
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: _number_layouts(
-            _sampler(method, selection, options, model.teammate_actions, histories, labels), dataset.layouts
+            _sampler(method, selection, options, model.teammate_actions, histories, labels),
+            dataset.layouts,
+            histories.mirror,
         )
         for part, selection in parts.items()
         if selection is not None
@@ -95,6 +98,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
             "manifest_sha256": file_hash(dataset.root / MANIFEST),
             "layouts": [layout.name for layout in dataset.layouts],
+            "hide_recipe": hidden,
             "obs": dataset.obs,
             "channels": dataset.channels,
             "labels": labels,
@@ -107,6 +111,19 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         TRAINED_ON: training_cells(split.train, labels),
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
+
+
+def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
+    """Returns the view of a training's batches; None for the default one, of state records."""
+    changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
+    if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
+        raise OptionError(
+            f"{changed[0]}: expected state records and canonical channels, found {dataset.obs} and {dataset.channels} "
+            f"channels; add --channels canonical, or choose a release with state records"
+        )
+    if changed:
+        return changed_view(dataset.layouts, hidden)
+    return None if dataset.obs == "state" else plain_view
 
 
 def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
@@ -282,9 +299,37 @@ class LayoutNumbers:
         return batch._replace(layouts=self._numbers[rows if batch.layouts is None else batch.layouts])
 
 
-def _number_layouts(sampler: Any, layouts: Sequence[Layout]) -> Any:
+class MirroredBatches(LayoutNumbers):
+    """A sampler's batches of state records, of which each row is mirrored at random; see `view_change.changed_view`.
+
+    Args:
+        sampler: of histories on some of the layouts.
+        numbers: int32, new number of each layout of `sampler.layouts`.
+        layouts: number of all layouts.
+    """
+
+    def __init__(self, sampler: Any, numbers: np.ndarray, layouts: int) -> None:
+        super().__init__(sampler, numbers)
+        self._layouts = layouts
+
+    def batch(self, i: int, out: Any = None) -> Any:
+        """Returns batch i, written into `out` if it is given."""
+        batch = super().batch(i, out)
+        drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
+        mirroring = drawn.integers(4, size=len(batch.layouts), dtype=np.int32)
+        actions = {
+            name: mirrored_action(values, mirroring)
+            for name, values in batch._asdict().items()
+            if values is not None and (name.endswith("actions") or name == "query_target")
+        }
+        return batch._replace(**actions, layouts=batch.layouts + self._layouts * mirroring)
+
+
+def _number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
     """Returns the sampler with layouts numbered as in `layouts`, of which its histories may be on a part only."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
+    if mirror:
+        return MirroredBatches(sampler, numbers, len(layouts))
     agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
     return sampler if agree else LayoutNumbers(sampler, numbers)
 
@@ -383,6 +428,7 @@ class TrainedModel(NamedTuple):
         encoder: kind of the encoder.
         hash: of the run's settings.
         trained_on: the histories that it was trained on, see `training_cells`.
+        hide_recipe: names of layouts whose recipe indicators it does not see.
     """
 
     method: Method
@@ -396,6 +442,7 @@ class TrainedModel(NamedTuple):
     encoder: EncoderKind
     hash: str
     trained_on: list[dict[str, Any]]
+    hide_recipe: tuple[str, ...] = ()
 
 
 def read_trained(folder: Path) -> TrainedModel:
@@ -428,4 +475,7 @@ def read_trained(folder: Path) -> TrainedModel:
     label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
     names = tuple(layout.name for layout in layouts)
     digest = json_hash(config)
-    return TrainedModel(method, params, step, context, names, channels, obs_shape, label, model.encoder, digest, cells)
+    hidden = tuple(histories.get("hide_recipe", ()))
+    return TrainedModel(
+        method, params, step, context, names, channels, obs_shape, label, model.encoder, digest, cells, hidden
+    )

@@ -37,6 +37,29 @@ class TrainOptions:
         check_fields(self)
 
 
+@dataclass(frozen=True)
+class PlayOptions:
+    """Settings of a method that is trained by playing; one step plays an episode of each of `batch_size` tasks.
+
+    Raises:
+        OptionError: if a value is out of bounds.
+    """
+
+    epochs: int = option_field(2, "Passes over the episodes of a step.", at_least=1)
+    minibatches: int = option_field(4, "Parts of a pass, each with an update of the parameters.", at_least=1)
+    discount: float = option_field(
+        0.99, "Discount of rewards, which continue over a task's episodes.", at_least=0, at_most=1
+    )
+    gae_lambda: float = option_field(0.95, "Decay of the advantage estimate's trace.", at_least=0, at_most=1)
+    entropy: float = option_field(0.01, "Weight of the entropy bonus.", at_least=0)
+    task_end: float = option_field(1 / 16, "Chance that a task ends after an episode.", above=0, at_most=1)
+    imitation: float = option_field(1.0, "Weight of imitating the oracle at the start.", at_least=0)
+    imitation_end: float = option_field(0.5, "Share of the steps at which that weight has fallen to 0.", above=0)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
 SAVE_MINUTES = 5.0
 """Most minutes between checkpoints of a training run; no setting of the run, whose results do not depend on it."""
 
@@ -58,7 +81,8 @@ class HistoryOptions:
         split: split of the release.
         teammate_family: families of teammates, "rl" or "H1".."H4"; any by default.
         algorithm: algorithms of learned teammates or kinds of heuristics, such as "fcp"; any by default.
-        source: how histories were made, "ppo" or "noise"; any by default.
+        source: how histories were made, "ppo", "noise" or "student"; any by default.
+        hide_recipe: names of layouts whose recipe indicators the model does not see, in training and when it acts.
     """
 
     layouts: tuple[str, ...]
@@ -92,6 +116,11 @@ class HistoryOptions:
         "Channels of observations: a layout's own, or canonical, which all layouts share.",
         default_text="canonical for --layout all and for layouts of unequal shape, or else own",
     )
+
+    mirror: bool = option_field(
+        False, "Mirror histories at random, up and down or left and right exchanged, to learn of more layouts."
+    )
+    hide_recipe: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -197,10 +197,11 @@ def train(
     about: Mapping[str, Any],
     *,
     devices: Any = None,
+    trainer: Any = None,
     tensorboard: bool = False,
     save_minutes: float = SAVE_MINUTES,
     done: StepProgress = lambda step, loss: None,
-) -> TrainState:
+) -> Any:
     """Train to the end, from the start or from the last checkpoint in the folder.
 
     SIGTERM and SIGINT end the training after the running step, once its state is saved; a second SIGINT does not wait.
@@ -213,12 +214,13 @@ def train(
             checkpoints/.
         about: further settings for config.json, such as the model's and the data's.
         devices: all by default.
+        trainer: what computes the steps, with the interface of `Trainer`, which is the default.
         tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
         save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
         done: called after every step, see `StepProgress`.
 
     Returns:
-        The state after the last step.
+        The state after the last step, such as a `TrainState`.
 
     Raises:
         OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which the
@@ -228,7 +230,7 @@ def train(
     """
     if tensorboard:
         check_installed()
-    trainer = Trainer(method, options, devices)
+    trainer = trainer or Trainer(method, options, devices)
     config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
     with ExitStack() as stack:
         writes = jax.process_index() == 0

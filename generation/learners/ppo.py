@@ -9,7 +9,7 @@ algorithms for egos and populations differ only in the partner and in the weight
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from generation.learners.config import PPOConfig
 from generation.learners.encoder import CompactView, Seen
-from generation.learners.network import ActorCritic
 from generation.learners.rollout import Rollout, slot_records
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.rules import PRESS_REWARD
@@ -54,6 +53,8 @@ class Sequences(NamedTuple):
         partner: int32 (1, M), number of the other agent's policy, an input of the critic.
         weight: float32 (1, M), factor of the advantage; negative to minimise the return.
         last_value: float32 (1, M), the critic's estimate for the observation after the last step.
+        expert: int32 (T, M), an expert's actions in the same states, to be imitated as well; None for none.
+        imitation: float32 (1, M), weight of the cross-entropy of these actions; None for none.
     """
 
     seen: Seen
@@ -67,6 +68,8 @@ class Sequences(NamedTuple):
     partner: Int[Array, "1 M"]
     weight: Float[Array, "1 M"]
     last_value: Float[Array, "1 M"]
+    expert: Int[Array, "T M"] | None = None
+    imitation: Float[Array, "1 M"] | None = None
 
 
 def sequences(
@@ -110,6 +113,19 @@ def sequences(
     )
 
 
+class RecurrentNetwork(Protocol):
+    """Interface of the actor-critics that PPO trains, such as `ActorCritic`."""
+
+    def apply(self, variables: Any, /, *inputs: Any) -> Any:
+        """Returns the recurrent state after T steps of M sequences, logits (T, M, A), and values (T, M).
+
+        Args:
+            variables: the parameters.
+            inputs: recurrent state before the first step (M, H), and `seen`, `reset` and `partner` as in `Sequences`.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class PPO:
     """Proximal policy optimisation (Schulman et al. 2017) of a recurrent actor-critic.
@@ -119,7 +135,7 @@ class PPO:
         config: hyper-parameters.
     """
 
-    network: ActorCritic
+    network: RecurrentNetwork
     config: PPOConfig
 
     def learn(
@@ -162,6 +178,7 @@ class PPO:
     def loss(self, params: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
         """Returns the loss of a minibatch, and its parts by name: clipped surrogate, clipped value error, entropy.
 
+        If an expert's actions are given, their cross-entropy is a part, too (kickstarting, Schmitt et al. 2018).
         Source: paper, App. B.1, table of PPO hyper-parameters; Schulman et al. 2017, eq. 7.
         """
         config, played = self.config, batch.played
@@ -180,7 +197,12 @@ class PPO:
         value_loss = 0.5 * error.mean()
         entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1).mean()
         total = policy + config.value * value_loss - config.entropy * entropy
-        return total, {"policy_loss": policy, "value_loss": value_loss, "entropy": entropy}
+        log = {"policy_loss": policy, "value_loss": value_loss, "entropy": entropy}
+        if played.expert is not None and played.imitation is not None:
+            errors = -jnp.take_along_axis(log_probs, played.expert[..., None], axis=-1)[..., 0]
+            log["imitation_loss"] = errors.mean()
+            total += (played.imitation * errors).mean()
+        return total, log
 
 
 class Batch(NamedTuple):

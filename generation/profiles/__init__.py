@@ -13,7 +13,7 @@ from typing import Any
 from generation.learners.config import PPOConfig, Widths
 from generation.profiles.noise_config import NoiseConfig
 from generation.profiles.profile import Profile, SampledConfig, TeammateConfig
-from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, SOURCES
+from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, REBUILT_SOURCES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -75,10 +75,10 @@ def _profile(name: str, content: dict[str, Any]) -> Profile:
     layouts = _layouts("tasks.layouts", tasks["layouts"])
     sources = _names("tasks.sources", tasks.get("sources", ["ppo"]))
     for source in sources:
-        if source not in SOURCES:
-            raise OptionError(f"tasks.sources: {unknown('source', source, SOURCES)}")
+        if source not in REBUILT_SOURCES:
+            raise OptionError(f"tasks.sources: {unknown('source', source, REBUILT_SOURCES)}")
     if not sources:
-        raise OptionError(f"tasks.sources = []: expected at least one of {', '.join(SOURCES)}")
+        raise OptionError(f"tasks.sources = []: expected at least one of {', '.join(REBUILT_SOURCES)}")
     ego = dict(content["ego"]) if "ppo" in sources else dict(content.get("ego", {}))
     of_layouts = _tables("ego.layouts", ego.pop("layouts", {}), layouts)
     egos = _options(PPOConfig(), "ego", ego)

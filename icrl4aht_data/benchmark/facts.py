@@ -54,9 +54,13 @@ ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
 KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 """teammate kind -> family, for algorithms and heuristics."""
 
-SOURCES = ("ppo", "noise")
-"""How generated histories are made: by an ego that learns with PPO, or by a script whose actions are replaced by random
-ones, ever more rarely (noise distillation, Zisman et al. 2024). Releases may name others."""
+SOURCES = ("ppo", "noise", "student")
+"""How histories are made: by an ego that learns with PPO; by a script whose actions are replaced by random ones, ever
+more rarely (noise distillation, Zisman et al. 2024); by a trained agent, whose actions may be replaced in the same way.
+Releases may name others."""
+
+REBUILT_SOURCES = SOURCES[:2]
+"""The sources that a release is rebuilt from nothing with."""
 
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""

@@ -24,7 +24,7 @@ ORDER = {
     "writing checking publishing commands",
     "generation": "progress plotting env policy paths learners experts teammates profiles collection populations "
     "releases planning cli",
-    "baselines": "plotting methods training agents evaluate control report experiments demo commands",
+    "baselines": "plotting methods training agents evaluate online control report experiments demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
 
@@ -34,6 +34,8 @@ BASELINES_MAY_USE = (
     "generation.teammates",
     "generation.learners",
     "generation.experts",
+    "generation.collection",
+    "generation.profiles",
 )
 JAX = {"jax", "jaxlib", "flax", "optax"}
 JAX_ON_DEMAND = {"icrl4aht_data.sampling.batches"}

@@ -1,0 +1,379 @@
+"""Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with the teammates of a release.
+
+A step plays one episode of every task, then learns from all of them. A task goes on after an episode, with the same
+teammate and the model's recurrent state, or ends by chance; its next episode is then the first of another task. Rewards
+of later episodes count, so that finding out something pays.
+
+Learning starts from imitation: the loss contains the cross-entropy of the scripted oracle's actions in the states that
+the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
+oracle knows what the model has to find out, so imitation alone is not the goal.
+
+Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.rollout import Episode, EvaluationRollout, RolloutState, no_outcome
+from baselines.methods.method import Method
+from baselines.methods.tokens import StepInput, percept_step
+from baselines.methods.view_change import ViewChange, no_change
+from baselines.online.teammates import mixed_chances, with_manners
+from baselines.training.options import PlayOptions, TrainOptions
+from generation.experts.oracle import oracle
+from generation.learners.config import PPOConfig
+from generation.learners.ppo import PPO, Sequences, ppo_optimizer
+from generation.policy import Policy
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.channels import to_canonical
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+
+REWARD_SCALE = 0.05
+"""Unit of the values: a delivery, which earns 20 points."""
+
+
+class PlayerMemory(NamedTuple):
+    """Memory of the model in a task.
+
+    Attributes:
+        change: changes of its view, see `ViewChange`.
+        state: float32 (S,), its recurrent state.
+    """
+
+    change: ViewChange
+    state: Float[Array, " S"]
+
+
+class PlayState(NamedTuple):
+    """State of the training: a step maps it to the next one, and a resume needs nothing else.
+
+    Attributes:
+        params: pytree of float32 arrays.
+        optimizer: state of the optimizer.
+        tasks: the running tasks of each group.
+        step: int32 (), steps so far.
+    """
+
+    params: Any
+    optimizer: Any
+    tasks: tuple[RolloutState, ...]
+    step: Int[Array, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class TaskGroup:
+    """Tasks of one layout and one family of teammates, which are played side by side.
+
+    Attributes:
+        layout: the layout.
+        family: kind of the teammates, such as "assembly_line".
+        teammates: policies that share their functions, one for each task.
+        hidden: whether the model does not see recipe indicators.
+    """
+
+    layout: Layout
+    family: str
+    teammates: Sequence[Policy]
+    hidden: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name in the log."""
+        return f"{self.layout.name} {self.family}"
+
+
+def make_groups(
+    teammates: Mapping[tuple[Layout, str], Sequence[Policy]],
+    tasks: int,
+    shares: Mapping[str, float],
+    hidden: Sequence[str] = (),
+) -> list[TaskGroup]:
+    """Divides tasks among layouts by their shares, and equally among the families of each layout.
+
+    Args:
+        teammates: layout and family -> training teammates, which take turns.
+        tasks: number of all tasks; the result has a few fewer or more, at least one in each group.
+        shares: name of a layout -> its share.
+        hidden: names of layouts whose recipe indicators the model does not see.
+    """
+    families: dict[str, int] = defaultdict(int)
+    for layout, _ in teammates:
+        families[layout.name] += 1
+    total = sum(shares[name] for name in families)
+    groups = []
+    for (layout, family), policies in teammates.items():
+        count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
+        # Another order than that of the manners, so that every teammate has several of them.
+        order = np.random.default_rng(0).permutation(np.arange(max(count, len(policies))) % len(policies))[:count]
+        chosen = with_manners([policies[number] for number in order], mixed_chances(count))
+        groups.append(TaskGroup(layout, family, chosen, layout.name in hidden))
+    return groups
+
+
+class _Network(NamedTuple):
+    """The model with the interface of `ppo.RecurrentNetwork`."""
+
+    model: Any
+
+    def apply(self, variables: Any, /, *inputs: Any) -> Any:
+        hidden, seen, *_ = inputs
+        output, state = self.model.apply({"params": variables}, seen, hidden)
+        return state, output.logits, output.value
+
+
+class _GroupPlayer:
+    """Plays one episode after another of a group's tasks."""
+
+    def __init__(self, group: TaskGroup, method: Method, play: PlayOptions, mirror: bool) -> None:
+        self.group, self._method, self._play, self._mirror = group, method, play, mirror
+        self._changes = mirror or group.hidden
+        ego = _model_policy(method, group.layout, self._changes)
+        self.rollout = EvaluationRollout(group.layout, ego, group.teammates, get_protocol("seeded"))
+        self.tasks = len(group.teammates)
+        self.episode = jax.jit(self._episode)
+
+    def start(self, key: Key[Array, ""]) -> RolloutState:
+        """Returns the state before the first episode of all tasks."""
+        env_key, change_key = jax.random.split(key)
+        state = self.rollout.start(jax.random.split(env_key, self.tasks))
+        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key)))
+
+    def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
+        change = no_change(self.tasks)._replace(hidden=jnp.full(self.tasks, self.group.hidden))
+        if not self._mirror:
+            return change
+        upside_down, sideways = jax.random.bernoulli(key, 0.5, (2, self.tasks))
+        return change._replace(upside_down=upside_down, sideways=sideways)
+
+    def _episode(
+        self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
+    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
+        """Returns the state after one episode of every task, the episode for learning, and its returns."""
+        change_key, end_key = jax.random.split(key)
+        after, played = self.rollout.episode(params, mates, state)
+        ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
+        sequences = self._sequences(params, state, after, played, ended)
+        begun = _select(ended, self._draw_change(change_key), after.ego.change)
+        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state))
+        before = _select(ended, no_outcome(self.tasks), after.before)
+        return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
+
+    def _sequences(
+        self, params: Any, state: RolloutState, after: RolloutState, played: Episode, ended: Bool[Array, " B"]
+    ) -> Sequences:
+        layout, change = self.group.layout, state.ego.change
+        record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
+        taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
+        # One step more than was played: the value there is what the last step leads to.
+        steps = StepInput(
+            obs=observe(layout, jnp.concatenate([record, after.env.record[None]]), EGO, canonical=True),
+            prev_action=jnp.concatenate([state.before.prev_action[None], taken]),
+            prev_reward=jnp.concatenate([state.before.prev_reward[None], reward]),
+            prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),
+        )
+        seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps) if self._changes else steps
+        _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
+        own = change.at_each_step(len(record), 0)
+        action = own.actions(taken)
+        log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
+        return Sequences(
+            seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
+            reset=jnp.zeros(reward.shape, bool),
+            action=action,
+            log_prob=log_prob,
+            value=value[:-1],
+            reward=REWARD_SCALE * reward,
+            done=jnp.zeros(reward.shape, bool).at[-1].set(ended),
+            hidden=state.ego.state[None],
+            partner=jnp.zeros((1, self.tasks), jnp.int32),
+            weight=jnp.ones((1, self.tasks)),
+            last_value=value[-1][None],
+            expert=own.actions(_oracle_actions(layout, record, taken)),
+        )
+
+
+def seen_steps(change: ViewChange, steps: StepInput) -> StepInput:
+    """Returns steps as an ego sees them whose view is changed."""
+    mate = steps.prev_teammate_action
+    return steps._replace(
+        obs=change.observations(steps.obs),
+        prev_action=change.actions(steps.prev_action),
+        prev_teammate_action=None if mate is None else change.actions(mate),
+    )
+
+
+def _select(which: Bool[Array, " B"], one: Any, other: Any) -> Any:
+    """Returns a pytree with the leaves of `one` where `which`, and of `other` elsewhere."""
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, one, other)
+
+
+def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
+    """Returns the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
+
+    def init(params: Any, key: Array) -> PlayerMemory:
+        return PlayerMemory(no_change(), method.start(0, True))
+
+    def act(params: Any, memory: PlayerMemory, percept: Any, key: Array) -> tuple[Array, PlayerMemory]:
+        step = percept_step(percept._replace(obs=to_canonical(layout, percept.obs)))
+        step = seen_steps(memory.change, step) if changes else step
+        logits, state = method.act(params, step, percept.prev_done, memory.state)
+        action = jax.random.categorical(key, logits).astype(jnp.int32)
+        return memory.change.actions(action), memory._replace(state=state)
+
+    return Policy({}, init, act, "percept")
+
+
+def _oracle_actions(layout: Layout, record: Array, taken: Int[Array, "T B"]) -> Int[Array, "T B"]:
+    """Returns what the scripted oracle would do in each state of an episode in which others acted."""
+    script, key = oracle(layout), jax.random.key(0)  # which draws nothing
+    act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
+
+    def step(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
+        wanted, memory = act((), memory, now[0], key)
+        return memory._replace(action=now[1].astype(jnp.int32)), wanted
+
+    memory = jax.vmap(lambda _: script.init((), key))(taken[0])
+    return jax.lax.scan(step, memory, (record, taken))[1]
+
+
+class StepNumbers:
+    """The numbers of the steps, in place of batches."""
+
+    waited = 0.0
+
+    def __init__(self, start: int, stop: int) -> None:
+        self._numbers = range(start, stop)
+
+    def __enter__(self) -> StepNumbers:
+        return self
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._numbers)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+
+class PlayTrainer:
+    """Training by playing, with the interface of `baselines.training.trainer.Trainer`.
+
+    Args:
+        method: RL^2.
+        options: `steps`, `batch_size`, `learning_rate`, `warmup`, `clip` and `seed` count.
+        play: hyper-parameters of playing and learning.
+        groups: the tasks.
+        mirror: whether tasks are mirrored at random.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        options: TrainOptions,
+        play: PlayOptions,
+        groups: Sequence[TaskGroup],
+        mirror: bool = False,
+    ) -> None:
+        self.method, self.options, self.play = method, options, play
+        self.players = [_GroupPlayer(group, method, play, mirror) for group in groups]
+        self._mates = [player.rollout.teammate_params for player in self.players]
+        self.tasks = sum(player.tasks for player in self.players)
+        config = PPOConfig(
+            total_steps=options.steps * self.tasks * KEPT_STEPS,
+            environments=self.tasks - self.tasks % play.minibatches,
+            rollout=KEPT_STEPS,
+            epochs=play.epochs,
+            minibatches=play.minibatches,
+            learning_rate=options.learning_rate,
+            warmup=options.warmup,
+            discount=play.discount,
+            gae_lambda=play.gae_lambda,
+            entropy=play.entropy,
+            max_grad_norm=options.clip,
+        )
+        self.ppo = PPO(_Network(method.model), config)
+        self._learn = jax.jit(self._learn_from, donate_argnums=(0, 1))
+        self._compiled: list[Any] | None = None
+
+    def init(self) -> PlayState:
+        """Returns the state before the first step."""
+        return jax.jit(self._initial_state)()
+
+    def state_like(self) -> Any:
+        """Returns shapes and dtypes of the state, to restore a checkpoint by."""
+        return jax.eval_shape(self._initial_state)
+
+    def _initial_state(self) -> PlayState:
+        key = jax.random.key(self.options.seed)
+        params = self.method.model.init(key, *self.method.example)["params"]
+        keys = jax.random.split(jax.random.fold_in(key, 1), len(self.players))
+        tasks = tuple(player.start(own) for player, own in zip(self.players, keys, strict=True))
+        return PlayState(params, ppo_optimizer(self.ppo.config).init(params), tasks, jnp.int32(0))
+
+    def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> StepNumbers:
+        """Returns the numbers of the steps."""
+        return StepNumbers(start, stop)
+
+    def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
+        """Returns nothing: such models are compared by `evaluate` on validation tasks."""
+        return []
+
+    def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
+        """Plays one episode of every task and learns from them; returns the state after it and the numbers to log."""
+        play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
+        keys = jax.random.split(play_key, len(self.players))
+        if self._compiled is None:
+            self._compiled = self._compile(state, keys[0])
+        played = [
+            episode(state.params, mates, tasks, key)
+            for episode, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
+        ]
+        tasks, sequences, returns = zip(*played, strict=True)
+        weight = imitation_weight(self.play, state.step, self.options.steps)
+        params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
+        log |= {f"return {one.group.name}": own.mean() for one, own in zip(self.players, returns, strict=True)}
+        return PlayState(params, optimizer, tasks, state.step + 1), log
+
+    def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
+        """Compiles the episodes of all groups side by side."""
+        with ThreadPoolExecutor() as pool:
+            lowered = [
+                player.episode.lower(state.params, mates, tasks, key)
+                for player, mates, tasks in zip(self.players, self._mates, state.tasks, strict=True)
+            ]
+            return list(pool.map(lambda one: one.compile(), lowered))
+
+    def _learn_from(
+        self, params: Any, optimizer: Any, parts: tuple[Sequences, ...], key: Key[Array, ""], weight: Array
+    ) -> tuple[Any, Any, dict[str, Array]]:
+        played: Sequences = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
+        played = played._replace(imitation=jnp.full((1, self.tasks), weight))
+        params, optimizer, log = self.ppo.learn(params, optimizer, played, key)
+        config = self.ppo.config
+        total = log["policy_loss"] + config.value * log["value_loss"] - config.entropy * log["entropy"]
+        total += weight * log["imitation_loss"]
+        return params, optimizer, {"loss": total, **log, "imitation_weight": weight}
+
+
+def imitation_weight(play: PlayOptions, step: Int[Array, ""], steps: int) -> Float[Array, ""]:
+    """Returns the weight of imitating the oracle in a step of a training of `steps` steps; it falls linearly to 0."""
+    return play.imitation * jnp.maximum(0.0, 1.0 - step / (play.imitation_end * steps))

@@ -1,0 +1,293 @@
+"""Histories of the source `student`: a trained agent plays with the teammates of a release, and the oracle labels it.
+
+The agent's memory lasts for a history, as it does in a test. A chance of a random action may fall over a history's
+episodes, as in noise distillation (Zisman et al. 2024); with a chance of 0 the histories show what the agent itself
+visits, and their `oracle_actions` are the labels of on-policy imitation (DAgger, Ross et al. 2011). `expert_actions`
+are the agent's own choices, before the noise.
+
+Shapes: `B` histories that are played side by side, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Int8
+
+from baselines.agents.egos import NamedEgo
+from baselines.evaluate.evaluator import prepare_rollout
+from baselines.evaluate.protocols import get_protocol
+from generation.collection.curate import oracle_labels
+from generation.collection.noise_rollout import noise_schedules
+from generation.learners.resume import differing_settings, xla_threads
+from generation.policy import Policy
+from generation.profiles.noise_config import NoiseConfig
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks
+from icrl4aht_data.commands.options import counted
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, episode_ends
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.release_folder import atomic_folder, check_target
+
+SOURCE = "student"
+
+FIRST_SEED = 3_000_000
+"""Seed of the first student task; those of other sources are below."""
+
+_SEEDS = 100_000
+"""Student tasks of one collection have seeds from a range of this size."""
+
+
+class NoisyMemory(NamedTuple):
+    """Memory of an agent whose actions are replaced by random ones with a chance.
+
+    Attributes:
+        own: the agent's memory.
+        chance: float32 (), of a random action, in this episode.
+        steps: int32 (), steps so far.
+        clean: int8 (T,), the agent's own choices in the last T steps.
+    """
+
+    own: Any
+    chance: Float[Array, ""]
+    steps: Int[Array, ""]
+    clean: Int8[Array, " T"]
+
+
+def with_noise(policy: Policy, length: int) -> Policy:
+    """Returns an agent that sometimes acts at random, and remembers what it would have done.
+
+    Args:
+        policy: the agent.
+        length: T, steps of an episode.
+    """
+
+    def init(params: Any, key: Any) -> NoisyMemory:
+        return NoisyMemory(policy.init(params, key), jnp.float32(0), jnp.int32(0), jnp.zeros(length, jnp.int8))
+
+    def act(params: Any, memory: NoisyMemory, view: Any, key: Any) -> tuple[Any, NoisyMemory]:
+        clean, own = policy.act(params, memory.own, view, key)
+        whether, which = jax.random.split(jax.random.fold_in(key, 1))
+        drawn = jax.random.randint(which, (), 0, len(ACTIONS))
+        action = jnp.where(jax.random.uniform(whether) < memory.chance, drawn, clean).astype(jnp.int32)
+        kept = memory.clean.at[memory.steps % length].set(clean.astype(jnp.int8))
+        return action, NoisyMemory(own, memory.chance, memory.steps + 1, kept)
+
+    return Policy(policy.params, init, act, policy.sees)
+
+
+class RecordedHistories(NamedTuple):
+    """Histories of some tasks; NumPy.
+
+    Attributes:
+        state: uint8 (B, E * T, S), state records before each step.
+        actions: int8 (B, E * T), the agent's.
+        teammate_actions: int8 (B, E * T).
+        rewards: int8 (B, E * T).
+        expert_actions: int8 (B, E * T), the agent's choices before the noise.
+        episode_end_state: uint8 (B, E, S), state records after each episode.
+    """
+
+    state: np.ndarray
+    actions: np.ndarray
+    teammate_actions: np.ndarray
+    rewards: np.ndarray
+    expert_actions: np.ndarray
+    episode_end_state: np.ndarray
+
+
+def record_histories(
+    make_ego: Callable[[Layout], Policy],
+    tasks: Sequence[Task],
+    config: NoiseConfig,
+    suite: Path | None = None,
+    played: Callable[[int], None] = lambda episodes: None,
+) -> RecordedHistories:
+    """Play histories of tasks that share a layout and a teammate family; `config.histories` of each, in their order.
+
+    Args:
+        make_ego: layout -> agent, which sees percepts, observations or state records.
+        tasks: the tasks; their seeds determine schedules and episodes.
+        config: number and length of the histories, and their noise.
+        suite: folder of learned teammates, if tasks have any.
+        played: called with the number of episodes played since the last call.
+    """
+    chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
+    seeds = range(config.histories)
+
+    def noisy(layout: Layout) -> Policy:
+        return with_noise(make_ego(layout), KEPT_STEPS)
+
+    rollout, state, episode = prepare_rollout(noisy, tasks, get_protocol("seeded", config.episodes), seeds, suite)
+    parts: list[tuple[np.ndarray, ...]] = []
+    for number in range(config.episodes):
+        state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, number])))
+        state, one = episode(rollout.ego.params, rollout.teammate_params, state)
+        actions = np.asarray(one.actions, np.int8)
+        rewards, clean = np.asarray(one.reward, np.int8), np.asarray(state.ego.clean)
+        record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
+        parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, clean, end))
+        played(len(chances))
+    return RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
+
+
+class Teammates(NamedTuple):
+    """Teammates of a release, and what it says of them.
+
+    Attributes:
+        tasks: one task for each teammate, numbered as a student task.
+        references: task id -> returns of egos that do not learn, where the release states them.
+        suite: folder of the checkpoints of learned teammates.
+    """
+
+    tasks: list[Task]
+    references: dict[str, ReferenceEgos]
+    suite: Path
+
+
+def release_teammates(dataset: Dataset, number: int = 0) -> Teammates:
+    """Returns student tasks with the teammates of a selection's histories, each once, whatever the source.
+
+    Args:
+        dataset: the selection.
+        number: number of the collection, from 0, which decides the tasks' seeds.
+    """
+    path = Path(dataset.root) / PROVENANCE
+    provenance = read_provenance(path) if path.is_file() else {}
+    wanted = set(dataset.column("task_id").tolist())
+    found: dict[tuple[str, str], Task] = {}
+    references = {}
+    for task in read_tasks(Path(dataset.root) / TASKS):
+        if task.task_id not in wanted or task.teammate_key in found:
+            continue
+        seed = FIRST_SEED + number * _SEEDS + len(found)
+        student = make_task(task.track, task.split, task.layout.name, task.teammate, seed)
+        found[task.teammate_key] = student
+        made = provenance.get(task.task_id)
+        if made is not None and made.references is not None:
+            references[student.task_id] = made.references
+    return Teammates(list(found.values()), references, Path(dataset.root) / TEAMMATES)
+
+
+def collect_release(
+    agent: NamedEgo,
+    teammates: Teammates,
+    config: NoiseConfig,
+    out: Path,
+    *,
+    data_version: str = "1.0.0",
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> Path:
+    """Play histories with every teammate, and write them as a release of source `student`.
+
+    Finished groups of tasks are kept in a folder beside `out` until the release is complete, so that the same call
+    resumes a stopped one.
+
+    Args:
+        agent: the agent.
+        teammates: tasks to play.
+        config: number and length of each task's histories, and their noise.
+        out: folder of the release.
+        data_version: version of the data.
+        overwrite: whether to replace a release at `out`.
+        progress: called with (description, episodes played, episodes).
+
+    Raises:
+        OptionError: if `out` may not be written, or the parts beside it are of other settings.
+    """
+    check_target(out, overwrite=overwrite)
+    parts = out.with_name(f"{out.name}.parts")
+    settings = {
+        "agent": agent.name,
+        "details": agent.details,
+        "noise": asdict(config),
+        "tasks": [task.task_id for task in teammates.tasks],
+        "xla_threads": xla_threads(),
+        "code_version": version("icrl4aht-data"),
+    }
+    _check_settings(parts / "settings.json", settings)
+    groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
+    for task in teammates.tasks:
+        groups[task.layout.name, task.teammate_kind].append(task)
+    total = len(teammates.tasks) * config.histories * config.episodes
+    show = counted(progress, f"{agent.name}: episodes", total)
+    for (layout, kind), tasks in groups.items():
+        folder = parts / f"{layout}-{kind}"
+        if folder.is_dir():
+            show(len(tasks) * config.histories * config.episodes)
+            continue
+        recorded = record_histories(agent.make, tasks, config, teammates.suite, show)
+        with atomic_folder(folder) as partial:
+            for name, array in recorded._asdict().items():
+                np.save(partial / f"{name}.npy", array)
+    new = [
+        _student_task(task, number, parts / f"{layout}-{kind}", agent, config, teammates)
+        for (layout, kind), tasks in groups.items()
+        for number, task in enumerate(tasks)
+    ]
+    write_release(out, "lite", new, data_version=data_version, overwrite=overwrite)
+    shutil.rmtree(parts)
+    return out
+
+
+def _check_settings(path: Path, settings: dict[str, Any]) -> None:
+    """Write the settings of a collection, or check that they are those of the one that was begun here."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as partial:
+            write_json(partial, settings)
+        return
+    different = differing_settings(parse_json(read_text(path)), settings)
+    if different:
+        listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
+        raise OptionError(f"{path.parent}: parts of other settings ({listed}); remove it, or give another --out")
+
+
+def _student_task(
+    task: Task, number: int, folder: Path, agent: NamedEgo, config: NoiseConfig, teammates: Teammates
+) -> NewTask:
+    """A task with the histories of one group that belong to it, which are read when they are written."""
+    first = number * config.histories
+
+    def load() -> Iterator[NewHistory]:
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in RecordedHistories._fields}
+        for stream in range(config.histories):
+            of_history = {name: array[first + stream] for name, array in arrays.items()}
+            states, actions = of_history["state"], of_history["actions"]
+            (labels,) = oracle_labels(task.layout, [states], [actions])
+            dones = episode_ends(len(actions), KEPT_STEPS)
+            yield NewHistory(stream, of_history | {"dones": dones, "oracle_actions": labels})
+
+    made = Provenance(
+        code_version=version("icrl4aht-data"),
+        jax_version=jax.__version__,
+        platform=jax.default_backend(),
+        xla_threads=xla_threads(),
+        seed=task.seed,
+        source=SOURCE,
+        noise=json.loads(json.dumps(asdict(config))),
+        references=teammates.references.get(task.task_id),
+        teammate={"slot": TEAMMATE, "noise": "seeded"},
+        streams_recorded=config.histories,
+        streams_kept=config.histories,
+        expert=ExpertLabels(policy_sha256=None, action=f"{agent.name}, a trained agent, before the noise"),
+    )
+    return NewTask(task, made, config.histories, load, checkpoint_files(teammates.suite, task))
