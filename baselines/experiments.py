@@ -18,7 +18,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from baselines.agents.egos import Acting, find_agent
+from baselines.agents.egos import Acting, PlayMode, find_agent
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import EVALUATION_SPLITS, get_protocol, limit_tasks
 from baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
@@ -419,7 +419,7 @@ def _evaluate_entry(
     folder: Path,
     progress: ExperimentProgress,
 ) -> None:
-    agent = find_agent(str(folder / "run"), plan.acting or experiment.acting)
+    agent = find_agent(str(folder / "run"), PlayMode(plan.acting or experiment.acting))
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
     names = list(dict.fromkeys(task.layout.name for task in tasks))
     what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"

@@ -286,7 +286,7 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
     method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
-    policy = learned(method, method.init(jax.random.key(0)), context, "cached")
+    policy = learned(method, method.init(jax.random.key(0)), context)
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps)
     started = time.perf_counter()
     prepared = prepare_rollout(lambda layout: policy, tasks, protocol, range(seeds))

@@ -25,7 +25,7 @@ import h5py
 import jax
 import numpy as np
 
-from baselines.agents.egos import Acting, learned
+from baselines.agents.egos import Acting, PlayMode, learned
 from baselines.evaluate.evaluator import PreparedRollout, evaluate, play_episodes, prepare_rollout
 from baselines.evaluate.protocols import PROTOCOLS, Protocol
 from baselines.methods.ad import dropped_steps
@@ -192,7 +192,7 @@ def compare_acting(layout: Layout, size: ModelSize, steps: int, rounds: int, mos
 
 
 def _ego(method: Method, params: Any, context: int, acting: Acting) -> Any:
-    policy = learned(method, params, context, acting)
+    policy = learned(method, params, context, PlayMode(acting))
     return lambda layout: policy
 
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from baselines.agents.bundled import BundledModel, bundled_models
 from baselines.methods.method import Method
 from baselines.methods.tokens import percept_step
 from baselines.methods.view_change import no_change
 from baselines.training.histories import TrainedModel, read_trained
 from generation.experts.oracle import oracle
 from generation.policy import Policy
+from icrl4aht_data.benchmark.facts import track_of
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
 from icrl4aht_data.overcooked.channels import Channels, to_canonical
@@ -30,6 +32,31 @@ rest is computed again, so that it has between 4/5 K and K steps. The context of
 it is computed once for each episode and is that of `exact`."""
 
 
+class PlayMode(NamedTuple):
+    """Way in which a trained model plays.
+
+    Attributes:
+        acting: how it remembers, see `ACTING`.
+        greedy: whether it takes its most probable action, as published, or draws one.
+        forget: whether its memory is cleared at the start of each episode, which cuts its context off.
+    """
+
+    acting: Acting = "cached"
+    greedy: bool = True
+    forget: bool = False
+
+    @classmethod
+    def from_details(cls, details: Mapping[str, Any]) -> PlayMode:
+        """Returns the mode that the details of results state."""
+        return cls(details.get("acting", "cached"), not details.get("sampled"), bool(details.get("forget")))
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Settings that results depend on."""
+        changed = {"sampled": not self.greedy, "forget": self.forget}
+        return {"acting": self.acting} | {name: True for name, value in changed.items() if value}
+
+
 class NamedEgo(NamedTuple):
     """An ego that was chosen by name.
 
@@ -37,11 +64,13 @@ class NamedEgo(NamedTuple):
         name: name of the ego in reports.
         make: layout -> policy.
         details: settings that results depend on in addition to the name; None for reference egos.
+        run: run folder of a trained model; None for other egos.
     """
 
     name: str
     make: Callable[[Layout], Policy]
     details: dict[str, Any] | None = None
+    run: Path | None = None
 
 
 def stay(layout: Layout) -> Policy:
@@ -58,28 +87,39 @@ def random(layout: Layout) -> Policy:
     return Policy((), lambda params, key: (), act, "observation")
 
 
-def learned(method: Method, params: Any, context: int, acting: Acting = "cached", greedy: bool = True) -> Policy:
-    """Returns the ego of a trained model, whose memory lasts for the complete task.
+AS_PUBLISHED = PlayMode()
+"""The default way of playing."""
+
+
+def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
+    """Returns the ego of a trained model, whose memory lasts for the complete task, unless it is to forget.
 
     Args:
         method: the method with which the model was trained.
         params: parameters of the model, float32.
         context: K, number of steps or transitions in the memory.
-        acting: "cached", the default of evaluations, or "exact"; see `ACTING`.
-        greedy: whether to take the most probable action, as published, or to draw one from the policy.
+        mode: way in which it plays.
 
     Raises:
         UnknownNameError: if there is no such way of acting.
     """
-    if acting not in ACTING:
-        raise unknown("acting", acting, ACTING)
+    if mode.acting not in ACTING:
+        raise unknown("acting", mode.acting, ACTING)
+
+    def start() -> Any:
+        return method.start(context, mode.acting == "cached")
 
     def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
-        logits, memory = method.act(params, percept_step(percept), percept.prev_done, memory)
-        action = logits.argmax() if greedy else jax.random.categorical(key, logits)
+        step, done = percept_step(percept), percept.prev_done
+        if mode.forget:
+            memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), start(), memory)
+            before = {name: jnp.where(done, 0, value) for name, value in step._asdict().items() if name != "obs"}
+            step, done = step._replace(**before), jnp.bool_(False)
+        logits, memory = method.act(params, step, done, memory)
+        action = logits.argmax() if mode.greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory
 
-    return Policy(params, lambda params, key: method.start(context, acting == "cached"), act, "percept")
+    return Policy(params, lambda params, key: start(), act, "percept")
 
 
 def with_channels(policy: Policy, channels: Channels, layout: Layout) -> Policy:
@@ -120,31 +160,56 @@ def with_hidden_recipe(policy: Policy, layout: Layout, hidden: Sequence[str]) ->
     return policy._replace(act=act)
 
 
-def find_agent(name: str, acting: Acting = "cached", greedy: bool = True) -> NamedEgo:
-    """Returns the reference ego with a name, or the trained model in a run folder of `python -m baselines train`.
+def find_agent(name: str, mode: PlayMode = AS_PUBLISHED) -> NamedEgo:
+    """Returns a reference ego, a bundled model, or the trained model in a run folder of `python -m baselines train`.
 
     Args:
-        name: name of a reference ego, or path of a run folder.
-        acting: way of acting of a trained model, see `ACTING`.
-        greedy: whether a trained model takes its most probable action, or draws one.
+        name: name of a reference ego or of a bundled model, or path of a run folder.
+        mode: way in which a trained model plays.
 
     Raises:
-        UnknownNameError: if the name is neither.
+        UnknownNameError: if the name is none of these.
         OptionError: if the run has another format or no checkpoint; from `make`, if the model does not fit the layout.
     """
-    folder = Path(name)
-    if name in AGENTS or not folder.is_dir():
-        return NamedEgo(name, get_agent(name))
+    if name in AGENTS:
+        return NamedEgo(name, AGENTS[name])
+    folder, bundled = Path(name), bundled_models()
+    if name in bundled:
+        return _bundled_ego(bundled[name], mode)
+    if not folder.is_dir():
+        raise unknown("agent", name, [*AGENTS, *bundled])
     run = read_trained(folder)
-    policy = learned(run.method, run.params, run.context, acting, greedy)
+    details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, **mode.details}
+    return NamedEgo(run.label, _maker(run, mode, folder), {**details, "trained_on": run.trained_on}, folder)
+
+
+def _bundled_ego(model: BundledModel, mode: PlayMode) -> NamedEgo:
+    """Returns a bundled model as an ego, which plays each layout by the model of the layout's track."""
+    runs = {track: read_trained(folder) for track, folder in model.runs.items()}
+
+    def make(layout: Layout) -> Policy:
+        track = track_of(layout.name)
+        if track not in runs:
+            raise OptionError(
+                f"{model.name}: has no model of track {track}, whose layout is {layout.name}; it has "
+                f"{' and '.join(runs)}: choose tasks of these, or another agent"
+            )
+        return _maker(runs[track], mode, model.runs[track])(layout)
+
+    details = {"model": model.name, "run": {track: run.hash for track, run in runs.items()}, **mode.details}
+    cells = [cell for run in runs.values() for cell in run.trained_on]
+    return NamedEgo(model.name, make, {**details, "trained_on": cells})
+
+
+def _maker(run: TrainedModel, mode: PlayMode, folder: Path) -> Callable[[Layout], Policy]:
+    """Returns the function from a layout to the policy of a trained model."""
+    policy = learned(run.method, run.params, run.context, mode)
 
     def make(layout: Layout) -> Policy:
         check_fits(run, layout, folder)
         return with_channels(with_hidden_recipe(policy, layout, run.hide_recipe), run.channels, layout)
 
-    details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, "acting": acting}
-    details |= {} if greedy else {"sampled": True}
-    return NamedEgo(run.label, make, {**details, "trained_on": run.trained_on})
+    return make
 
 
 def check_fits(run: TrainedModel, layout: Layout, folder: Path) -> None:

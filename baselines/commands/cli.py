@@ -20,6 +20,7 @@ from baselines.commands.options import (
     evaluation_split_option,
     experiment_options,
     find_ego,
+    forget_option,
     gifs_option,
     hide_recipe_option,
     history_filters,
@@ -112,6 +113,7 @@ def cli() -> None:
 @click.option("--agent", type=EGO_NAME, required=True, help="stay, random, oracle, or a folder that `train` made.")
 @acting_option
 @sampled_option
+@forget_option
 @protocol_option
 @click.option(
     "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
@@ -133,6 +135,7 @@ def evaluate_command(
     agent: str,
     acting: Any,
     sampled: bool,
+    forget: bool,
     protocol: str,
     track: tuple[str, ...],
     split: str | None,
@@ -156,7 +159,7 @@ def evaluate_command(
     if manifest and split:
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
     paths = [manifest] if manifest else [manifest_path(name, split or "test") for name in track]
-    ego = find_ego("--agent", agent, acting, not sampled)
+    ego = find_ego("--agent", agent, acting=acting, greedy=not sampled, forget=forget)
     names = {get_layout(name).name for name in layout}
     chosen = limit_tasks(
         [task for path in paths for task in read_tasks(path) if not names or task.layout.name in names], tasks
@@ -180,7 +183,7 @@ def evaluate_command(
             details=ego.details,
             played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
         )
-    note_results(out, Path(agent) if ego.details else None, chosen if manifest or split == "validation" else ())
+    note_results(out, ego.run, chosen if manifest or split == "validation" else ())
     noun = "result" if len(chosen) == 1 else "results"
     _console.print(f"{len(chosen)} {noun} in {out}; `python -m baselines report {out}` shows them")
 

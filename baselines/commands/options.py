@@ -31,21 +31,28 @@ class EgoName(Names):
         return value
 
 
-def find_ego(option: str, value: str, acting: Any = "cached", greedy: bool = True) -> Any:
+def find_ego(option: str, value: str, **mode: Any) -> Any:
     """Returns the ego that an option names, a `baselines.agents.egos.NamedEgo`.
 
+    Args:
+        option: name of the option, for messages.
+        value: the ego's name or folder.
+        mode: values of `baselines.agents.egos.PlayMode`.
+
     Raises:
-        click.UsageError: if the value is neither a reference ego nor a run folder.
+        click.UsageError: if the value is neither a reference ego, nor a bundled model, nor a run folder.
     """
-    from baselines.agents.egos import AGENTS, find_agent
+    from baselines.agents.bundled import bundled_models
+    from baselines.agents.egos import AGENTS, PlayMode, find_agent
     from baselines.training.run_folder import CONFIG
 
-    if value not in AGENTS and not Path(value).is_dir():
+    names = [*AGENTS, *bundled_models()]
+    if value not in names and not Path(value).is_dir():
         hint = "A trained model is named by its folder, which `python -m baselines train` makes."
-        raise click.UsageError(f"{option}: {unknown('agent', value, AGENTS)} {hint}")
-    if value not in AGENTS and not (Path(value) / CONFIG).is_file():
+        raise click.UsageError(f"{option}: {unknown('agent', value, names)} {hint}")
+    if value not in names and not (Path(value) / CONFIG).is_file():
         raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `python -m baselines train` makes one")
-    return find_agent(value, acting, greedy)
+    return find_agent(value, PlayMode(**mode))
 
 
 class HostPort(click.ParamType):
@@ -60,7 +67,14 @@ class HostPort(click.ParamType):
         return value
 
 
-EGO_NAME = EgoName("agent", lazy_attribute("baselines.agents.egos", "AGENTS"))
+def _ego_names() -> list[str]:
+    return [
+        *lazy_attribute("baselines.agents.egos", "AGENTS")(),
+        *lazy_attribute("baselines.agents.bundled", "bundled_models")()(),
+    ]
+
+
+EGO_NAME = EgoName("agent", _ego_names)
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
 _EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
@@ -75,6 +89,9 @@ protocol_option = click.option(
 _ACTING = Names("acting", lazy_attribute("baselines.agents.egos", "ACTING"))
 _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
 acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
+forget_option = click.option(
+    "--forget", is_flag=True, help="Clear the memory of a trained model at the start of each episode."
+)
 sampled_option = click.option(
     "--sampled", is_flag=True, help="Draw the actions of a trained model, instead of taking the most probable ones."
 )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.agents.egos import AGENTS, find_agent, get_agent
+from baselines.agents.egos import AGENTS, PlayMode, find_agent, get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import Protocol
 from baselines.report.overlap import describe_overlap
@@ -138,15 +138,15 @@ def restore_ego(source: ResultSource) -> Callable[[Layout], Policy]:
         OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
-    if source.trained is None:
-        if name not in AGENTS:
-            raise OptionError(f"{name} is neither a reference ego nor of a run folder")
+    if name in AGENTS:
         return get_agent(name)
-    folder = source.trained["run"]
-    if not Path(folder).is_dir():
+    if source.trained is None and "model" not in details:
+        raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
+    folder = details.get("model") or (source.trained or {})["run"]
+    if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
     details.pop("variant", None)
-    agent = find_agent(folder, details.get("acting", "cached"))
+    agent = find_agent(folder, PlayMode.from_details(details))
     if agent.details != details:
         raise OptionError(f"{folder} holds another model than these results are of: {agent.details}, not {details}")
     return agent.make

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from baselines.agents.egos import find_agent
+from baselines.agents.egos import PlayMode, find_agent
 from baselines.commands.cli import cli
 from baselines.evaluate.drift import Drift, measure_drift
 from baselines.evaluate.evaluator import evaluate
@@ -55,7 +55,7 @@ def runs(lite, tmp_path_factory) -> Path:
     [pytest.param("ad", "AD+TA", "exact", marks=pytest.mark.slow), ("dpt", "DPT+TA", "cached")],
 )
 def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting):
-    agent = find_agent(str(runs / name), acting)
+    agent = find_agent(str(runs / name), PlayMode(acting))
     assert agent.name == label
     (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(result.returns) == (1, 2)

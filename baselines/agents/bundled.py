@@ -1,0 +1,83 @@
+"""The models that this package bundles, in `baselines/models`: NAME/TRACK is the run folder of a model of one track.
+
+A bundled run has its settings, its card and its last parameters, without the optimizer's state.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from baselines.training.histories import read_trained
+from baselines.training.run_folder import CHECKPOINTS, CONFIG
+from generation.learners.resume import Checkpoints
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.errors import OptionError, unknown
+
+MODELS = Path(__file__).parents[1] / "models"
+"""Folder of the bundled models."""
+
+MODEL_CARD = "README.md"
+"""File name of a bundled model's card, in the folder NAME."""
+
+_LARGEST = 2 * 10**6  # bytes of a bundled model's parameters
+
+
+class BundledModel(NamedTuple):
+    """A bundled model.
+
+    Attributes:
+        name: such as "ad-reference".
+        runs: track -> run folder of its model.
+    """
+
+    name: str
+    runs: dict[str, Path]
+
+
+def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
+    """Returns the bundled models by name."""
+    found = {}
+    for path in sorted(folder.glob("*/")):
+        runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
+        if runs:
+            found[path.name] = BundledModel(path.name, runs)
+    return found
+
+
+def find_bundled(name: str, folder: Path = MODELS) -> BundledModel:
+    """Returns a bundled model.
+
+    Raises:
+        UnknownNameError: if there is none of this name; lists the names and the nearest.
+    """
+    models = bundled_models(folder)
+    if name not in models:
+        raise unknown("bundled model", name, models)
+    return models[name]
+
+
+def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
+    """Copy a finished run into the bundled models, with its parameters alone; one that is there is replaced.
+
+    Raises:
+        OptionError: if the run has no checkpoint, or its parameters are too large.
+    """
+    trained = read_trained(run)
+    size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
+    if size > _LARGEST:
+        raise OptionError(
+            f"{run}: parameters of {f'{size:,} bytes'}, expected at most {plain_size(_LARGEST)}: bundle a smaller model"
+        )
+    target = folder / name / track
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    config = json.loads((run / CONFIG).read_text(encoding="utf-8"))
+    config["histories"]["root"] = Path(config["histories"]["root"]).name  # a path of the machine that trained it
+    (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
+    return target
