@@ -61,6 +61,21 @@ def find_bundled(name: str, folder: Path = MODELS) -> BundledModel:
     return models[name]
 
 
+def describe_model(model: BundledModel) -> list[str]:
+    """Returns a line for each track of a bundled model."""
+    lines = []
+    for track, folder in model.runs.items():
+        trained = read_trained(folder)
+        count = sum(leaf.size for leaf in jax.tree.leaves(trained.params))
+        sources = sorted({cell["source"] for cell in trained.trained_on})
+        context = "" if trained.method.data == "tasks" else f", K = {trained.context}"
+        lines.append(
+            f"{model.name}, track {track}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
+            f"{', '.join(trained.layouts)} (source {' and '.join(sources)})"
+        )
+    return lines
+
+
 def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
     """Copy a finished run into the bundled models, with its parameters alone; one that is there is replaced.
 
@@ -70,9 +85,7 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
     trained = read_trained(run)
     size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
     if size > _LARGEST:
-        raise OptionError(
-            f"{run}: parameters of {f'{size:,} bytes'}, expected at most {plain_size(_LARGEST)}: bundle a smaller model"
-        )
+        raise OptionError(f"{run}: parameters of {size:,} bytes, expected at most {_LARGEST:,}: bundle a smaller model")
     target = folder / name / track
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)

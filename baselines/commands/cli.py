@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from baselines.commands.options import (
     EGO_NAME,
     METHOD_NAME,
     PROTOCOL_NAME,
+    REFERENCE_NAME,
     TRAINING_LAYOUT,
     acting_option,
     default_batch_size,
@@ -77,6 +79,7 @@ _console = Console(soft_wrap=True)
 
 _SECTIONS = {
     "Train and evaluate": ("demo", "train", "evaluate", "report", "watch", "collect"),
+    "Reference models": ("models", "reference"),
     "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
     "Check": ("control", "drift", "headroom"),
 }
@@ -335,6 +338,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 )
 @root_option
 @click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
+@click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run.")
 @size_option
 @training_options
 @model_options
@@ -350,6 +354,7 @@ def train_command(
     layouts: tuple[str, ...],
     root: Any,
     out: Path | None,
+    init: Path | None,
     size: str | None,
     train: dict[str, Any],
     model: dict[str, Any],
@@ -371,6 +376,7 @@ def train_command(
     Ctrl-C does not wait for it.
     """
     join_processes(coordinator, processes, process)
+    from baselines.training.histories import read_trained
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
@@ -389,6 +395,9 @@ def train_command(
 
         watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
         watched |= {"trainer": job.trainer} if plays else {}
+        if init is not None:
+            before = read_trained(init)
+            watched["params"], job.about["init"] = before.params, before.hash
         run_training(job.method, job.data, options, folder, job.about, **watched)
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
@@ -418,6 +427,8 @@ def train_command(
     metavar="START END",
     help="Chance of a random action in a history's first and in its last episode.",
 )
+@click.option("--labeller", type=EGO_NAME, help="Another agent, whose choices become the expert actions.")
+@click.option("--unreliable", is_flag=True, help="Also play with heuristics that do nothing, hesitate or err.")
 @click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
@@ -430,6 +441,8 @@ def collect_command(
     histories: int,
     episodes: int,
     noise: tuple[float, float],
+    labeller: str | None,
+    unreliable: bool,
     number: int,
     out: Path,
     overwrite: bool,
@@ -446,10 +459,13 @@ def collect_command(
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
     ego = find_ego("--agent", agent, greedy=not sampled)
+    other = find_ego("--labeller", labeller) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
+    teammates = release_teammates(dataset, number, unreliable)
     with bars(edges=True, unit="episodes") as show:
-        collect_release(ego, release_teammates(dataset, number), config, out, overwrite=overwrite, progress=show)
+        options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
+        collect_release(ego, teammates, config, out, **options)
     _console.print(f"wrote {out}; `icrl4aht-data show {out}` describes it")
 
 
@@ -530,6 +546,53 @@ def _run_experiment(
         click.echo(note)
     for path in found.report:
         click.echo(f"wrote {path}")
+
+
+@cli.command(
+    "reference",
+    epilog=examples(
+        "python -m baselines reference --name ad-student",
+        "python -m baselines reference --name rl2 --track teammate --out runs/reference",
+    ),
+)
+@click.option("--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model; repeat for several.")
+@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of this track.")
+@click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
+@click.option("--bundle", is_flag=True, help="Also replace the package's model of this name.")
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
+def reference_command(names: tuple[str, ...], track: tuple[str, ...], evaluates: bool, bundle: bool, out: Path) -> None:
+    """Make reference models, with everything that they need.
+
+    Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
+    and evaluates. One model for each track. The same command resumes a stopped one. `rl2` is trained by playing with
+    training teammates; ad and dpt learn from histories: -noise of the scripted oracle whose noise falls, -ppo and -both
+    of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
+    """
+    from baselines.agents.bundled import bundle_run
+    from baselines.reference import make_reference
+
+    with bars(edges=True) as show:
+        for name, of_track in product(names, track):
+            found = make_reference(name, of_track, out, show, evaluates)
+            _console.print(f"{name}, {of_track}: {found.run}", highlight=False)
+            for kind, folder in found.results.items():
+                _console.print(f"  {kind}: {folder}", highlight=False)
+            if bundle:
+                _console.print(f"  bundled: {bundle_run(found.run, name, of_track)}", highlight=False)
+
+
+@cli.command("models")
+def models_command() -> None:
+    """List the bundled models.
+
+    Their names are agents of `evaluate`, `watch` and `collect`. One line per model and track: method, parameters,
+    context, training layouts and sources.
+    """
+    from baselines.agents.bundled import bundled_models, describe_model
+
+    for model in bundled_models().values():
+        for line in describe_model(model):
+            click.echo(line)
 
 
 @cli.command("control")

@@ -68,16 +68,17 @@ class HostPort(click.ParamType):
 
 
 def _ego_names() -> list[str]:
-    return [
-        *lazy_attribute("baselines.agents.egos", "AGENTS")(),
-        *lazy_attribute("baselines.agents.bundled", "bundled_models")()(),
-    ]
+    from baselines.agents.bundled import bundled_models
+    from baselines.agents.egos import AGENTS
+
+    return [*AGENTS, *bundled_models()]
 
 
 EGO_NAME = EgoName("agent", _ego_names)
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
 _EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
+REFERENCE_NAME = Names("reference model", lazy_attribute("baselines.reference", "RECIPES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
 protocol_option = click.option(

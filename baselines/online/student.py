@@ -2,8 +2,8 @@
 
 The agent's memory lasts for a history, as it does in a test. A chance of a random action may fall over a history's
 episodes, as in noise distillation (Zisman et al. 2024); with a chance of 0 the histories show what the agent itself
-visits, and their `oracle_actions` are the labels of on-policy imitation (DAgger, Ross et al. 2011). `expert_actions`
-are the agent's own choices, before the noise.
+visits. `expert_actions` are the agent's own choices, before the noise, or those of another trained agent, which sees
+the same history. Labels on what a student visits are those of on-policy imitation (DAgger, Ross et al. 2011).
 
 Shapes: `B` histories that are played side by side, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
 """
@@ -55,6 +55,18 @@ _SEEDS = 100_000
 """Student tasks of one collection have seeds from a range of this size."""
 
 
+UNRELIABLE: dict[str, tuple[dict[str, float], ...]] = {
+    "recipe_aware_button": ({"idle_prob": 1.0}, {"idle_prob": 0.5}),
+    "territory": ({"behavior_mode": 3, "action_probability": 0.3},),
+    "assembly_line": ({"hesitation_prob": 1.0}, {"hesitation_prob": 0.5}, {"wrong_action_prob": 0.5}),
+}
+"""Kind of heuristic -> changes of its parameters that make a teammate which does nothing, hesitates or errs. A student
+learns to do without help only if some of its training teammates give none."""
+
+_VARIANT_IDS = 1000
+"""Numbers of the variants, above those of all draws."""
+
+
 class NoisyMemory(NamedTuple):
     """Memory of an agent whose actions are replaced by random ones with a chance.
 
@@ -62,35 +74,49 @@ class NoisyMemory(NamedTuple):
         own: the agent's memory.
         chance: float32 (), of a random action, in this episode.
         steps: int32 (), steps so far.
-        clean: int8 (T,), the agent's own choices in the last T steps.
+        labels: int8 (T,), the labeller's choices in the last T steps.
+        labeller: the labeller's memory; None if the agent labels its own histories.
     """
 
     own: Any
     chance: Float[Array, ""]
     steps: Int[Array, ""]
-    clean: Int8[Array, " T"]
+    labels: Int8[Array, " T"]
+    labeller: Any = None
 
 
-def with_noise(policy: Policy, length: int) -> Policy:
-    """Returns an agent that sometimes acts at random, and remembers what it would have done.
+def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> Policy:
+    """Returns an agent that sometimes acts at random, and remembers labels of the steps.
 
     Args:
         policy: the agent.
         length: T, steps of an episode.
+        labeller: another agent that sees the same; by default the labels are what the agent does without the noise.
+
+    Raises:
+        OptionError: if the labeller sees something else than the agent.
     """
+    if labeller is not None and labeller.sees != policy.sees:
+        raise OptionError(f"the labeller sees a {labeller.sees}, expected a {policy.sees}, as the agent does")
+    params = policy.params, None if labeller is None else labeller.params
 
     def init(params: Any, key: Any) -> NoisyMemory:
-        return NoisyMemory(policy.init(params, key), jnp.float32(0), jnp.int32(0), jnp.zeros(length, jnp.int8))
+        labels = jnp.zeros(length, jnp.int8)
+        other = None if labeller is None else labeller.init(params[1], key)
+        return NoisyMemory(policy.init(params[0], key), jnp.float32(0), jnp.int32(0), labels, other)
 
     def act(params: Any, memory: NoisyMemory, view: Any, key: Any) -> tuple[Any, NoisyMemory]:
-        clean, own = policy.act(params, memory.own, view, key)
+        clean, own = policy.act(params[0], memory.own, view, key)
+        label, other = clean, None
+        if labeller is not None:
+            label, other = labeller.act(params[1], memory.labeller, view, jax.random.fold_in(key, 2))
         whether, which = jax.random.split(jax.random.fold_in(key, 1))
         drawn = jax.random.randint(which, (), 0, len(ACTIONS))
         action = jnp.where(jax.random.uniform(whether) < memory.chance, drawn, clean).astype(jnp.int32)
-        kept = memory.clean.at[memory.steps % length].set(clean.astype(jnp.int8))
-        return action, NoisyMemory(own, memory.chance, memory.steps + 1, kept)
+        labels = memory.labels.at[memory.steps % length].set(label.astype(jnp.int8))
+        return action, NoisyMemory(own, memory.chance, memory.steps + 1, labels, other)
 
-    return Policy(policy.params, init, act, policy.sees)
+    return Policy(params, init, act, policy.sees)
 
 
 class RecordedHistories(NamedTuple):
@@ -101,7 +127,7 @@ class RecordedHistories(NamedTuple):
         actions: int8 (B, E * T), the agent's.
         teammate_actions: int8 (B, E * T).
         rewards: int8 (B, E * T).
-        expert_actions: int8 (B, E * T), the agent's choices before the noise.
+        expert_actions: int8 (B, E * T), the labels.
         episode_end_state: uint8 (B, E, S), state records after each episode.
     """
 
@@ -119,6 +145,7 @@ def record_histories(
     config: NoiseConfig,
     suite: Path | None = None,
     played: Callable[[int], None] = lambda episodes: None,
+    make_labeller: Callable[[Layout], Policy] | None = None,
 ) -> RecordedHistories:
     """Play histories of tasks that share a layout and a teammate family; `config.histories` of each, in their order.
 
@@ -128,12 +155,13 @@ def record_histories(
         config: number and length of the histories, and their noise.
         suite: folder of learned teammates, if tasks have any.
         played: called with the number of episodes played since the last call.
+        make_labeller: layout -> another agent that labels the histories.
     """
     chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
     seeds = range(config.histories)
 
     def noisy(layout: Layout) -> Policy:
-        return with_noise(make_ego(layout), KEPT_STEPS)
+        return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
 
     rollout, state, episode = prepare_rollout(noisy, tasks, get_protocol("seeded", config.episodes), seeds, suite)
     parts: list[tuple[np.ndarray, ...]] = []
@@ -141,9 +169,9 @@ def record_histories(
         state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, number])))
         state, one = episode(rollout.ego.params, rollout.teammate_params, state)
         actions = np.asarray(one.actions, np.int8)
-        rewards, clean = np.asarray(one.reward, np.int8), np.asarray(state.ego.clean)
+        rewards, labels = np.asarray(one.reward, np.int8), np.asarray(state.ego.labels)
         record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
-        parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, clean, end))
+        parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
         played(len(chances))
     return RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
 
@@ -162,12 +190,13 @@ class Teammates(NamedTuple):
     suite: Path
 
 
-def release_teammates(dataset: Dataset, number: int = 0) -> Teammates:
+def release_teammates(dataset: Dataset, number: int = 0, unreliable: bool = False) -> Teammates:
     """Returns student tasks with the teammates of a selection's histories, each once, whatever the source.
 
     Args:
         dataset: the selection.
         number: number of the collection, from 0, which decides the tasks' seeds.
+        unreliable: whether variants of the training heuristics are added that do little, see `UNRELIABLE`.
     """
     path = Path(dataset.root) / PROVENANCE
     provenance = read_provenance(path) if path.is_file() else {}
@@ -183,7 +212,22 @@ def release_teammates(dataset: Dataset, number: int = 0) -> Teammates:
         made = provenance.get(task.task_id)
         if made is not None and made.references is not None:
             references[student.task_id] = made.references
-    return Teammates(list(found.values()), references, Path(dataset.root) / TEAMMATES)
+    tasks = list(found.values())
+    if unreliable:
+        tasks += _unreliable_tasks(tasks, FIRST_SEED + number * _SEEDS + len(tasks))
+    return Teammates(tasks, references, Path(dataset.root) / TEAMMATES)
+
+
+def _unreliable_tasks(tasks: Sequence[Task], seed: int) -> list[Task]:
+    """Returns tasks with variants of the first training heuristic of each layout and kind, with seeds from `seed`."""
+    variants = []
+    first = {(task.layout.name, task.teammate_kind): task for task in reversed(tasks) if task.split == "train"}
+    for task in reversed(first.values()):
+        for changes in UNRELIABLE.get(task.teammate_kind, ()):
+            theta = task.teammate["theta"] | changes
+            teammate = task.teammate | {"theta": theta, "theta_id": _VARIANT_IDS + len(variants)}
+            variants.append(make_task(task.track, task.split, task.layout.name, teammate, seed + len(variants)))
+    return variants
 
 
 def collect_release(
@@ -192,6 +236,7 @@ def collect_release(
     config: NoiseConfig,
     out: Path,
     *,
+    labeller: NamedEgo | None = None,
     data_version: str = "1.0.0",
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
@@ -206,6 +251,7 @@ def collect_release(
         teammates: tasks to play.
         config: number and length of each task's histories, and their noise.
         out: folder of the release.
+        labeller: another agent, whose choices become the expert actions; by default the agent's own, without noise.
         data_version: version of the data.
         overwrite: whether to replace a release at `out`.
         progress: called with (description, episodes played, episodes).
@@ -218,6 +264,7 @@ def collect_release(
     settings = {
         "agent": agent.name,
         "details": agent.details,
+        "labeller": labeller and [labeller.name, labeller.details],
         "noise": asdict(config),
         "tasks": [task.task_id for task in teammates.tasks],
         "xla_threads": xla_threads(),
@@ -234,12 +281,15 @@ def collect_release(
         if folder.is_dir():
             show(len(tasks) * config.histories * config.episodes)
             continue
-        recorded = record_histories(agent.make, tasks, config, teammates.suite, show)
+        label = labeller and labeller.make
+        recorded = record_histories(agent.make, tasks, config, teammates.suite, show, label)
         with atomic_folder(folder) as partial:
             for name, array in recorded._asdict().items():
                 np.save(partial / f"{name}.npy", array)
+    by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
+    labels = ExpertLabels(policy_sha256=None, action=by)
     new = [
-        _student_task(task, number, parts / f"{layout}-{kind}", agent, config, teammates)
+        _student_task(task, number, parts / f"{layout}-{kind}", labels, config, teammates)
         for (layout, kind), tasks in groups.items()
         for number, task in enumerate(tasks)
     ]
@@ -262,7 +312,7 @@ def _check_settings(path: Path, settings: dict[str, Any]) -> None:
 
 
 def _student_task(
-    task: Task, number: int, folder: Path, agent: NamedEgo, config: NoiseConfig, teammates: Teammates
+    task: Task, number: int, folder: Path, labels: ExpertLabels, config: NoiseConfig, teammates: Teammates
 ) -> NewTask:
     """A task with the histories of one group that belong to it, which are read when they are written."""
     first = number * config.histories
@@ -288,6 +338,6 @@ def _student_task(
         teammate={"slot": TEAMMATE, "noise": "seeded"},
         streams_recorded=config.histories,
         streams_kept=config.histories,
-        expert=ExpertLabels(policy_sha256=None, action=f"{agent.name}, a trained agent, before the noise"),
+        expert=labels,
     )
     return NewTask(task, made, config.histories, load, checkpoint_files(teammates.suite, task))

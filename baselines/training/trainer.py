@@ -198,6 +198,7 @@ def train(
     *,
     devices: Any = None,
     trainer: Any = None,
+    params: Any = None,
     tensorboard: bool = False,
     save_minutes: float = SAVE_MINUTES,
     done: StepProgress = lambda step, loss: None,
@@ -215,6 +216,7 @@ def train(
         about: further settings for config.json, such as the model's and the data's.
         devices: all by default.
         trainer: what computes the steps, with the interface of `Trainer`, which is the default.
+        params: initial parameters, such as those of another run; drawn by the seed by default.
         tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
         save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
         done: called after every step, see `StepProgress`.
@@ -238,7 +240,11 @@ def train(
             stack.enter_context(run_lock(folder))
         open_run(folder, config)
         checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
-        state = trainer.init() if checkpoints.latest is None else checkpoints.load(trainer.state_like())[0]
+        if checkpoints.latest is None:
+            state = trainer.init()
+            state = state if params is None else _with_params(state, params)
+        else:
+            state = checkpoints.load(trainer.state_like())[0]
         first = int(state.step)
         log = stack.enter_context(RunLog(folder, lambda line: line["step"] <= first))
         events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
@@ -273,6 +279,19 @@ def train(
         if writes:
             plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
     return state
+
+
+def _with_params(state: Any, params: Any) -> Any:
+    """Returns a state before the first step with other parameters.
+
+    Raises:
+        OptionError: if they are of another model.
+    """
+    found, expected = (jax.tree.map(jnp.shape, tree) for tree in (params, state.params))
+    if found != expected:
+        raise OptionError("initial parameters: of a model of other options; give those of the run that they come from")
+    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
+    return state._replace(params=placed)
 
 
 def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:

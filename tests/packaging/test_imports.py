@@ -24,7 +24,7 @@ ORDER = {
     "writing checking publishing commands",
     "generation": "progress plotting env policy paths learners experts teammates profiles collection populations "
     "releases planning cli",
-    "baselines": "plotting methods training agents evaluate online control report experiments demo commands",
+    "baselines": "plotting methods training agents evaluate online control report experiments reference demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
 

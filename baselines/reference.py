@@ -1,0 +1,283 @@
+"""Reference models: from a release that one command makes to models that are evaluated, step by step.
+
+    OUT/noise/lite              release of noise histories, as `generation generate --profile noise` makes it
+    OUT/rl2-TRACK               RL^2, trained by playing with the training teammates of that release
+    OUT/histories-TRACK         histories of RL^2 whose noise falls, source `student`
+    OUT/NAME-TRACK              run folder of a model
+    OUT/NAME-TRACK-first        its first training, before it was labelled on histories of its own
+    OUT/NAME-TRACK-own          these histories, and OUT/NAME-TRACK-mixed with the others
+    OUT/results/NAME-TRACK/...  results on validation tasks and on test tasks
+
+Everything resumes: finished parts are kept, stopped ones continue.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from baselines.agents.egos import AS_PUBLISHED, PlayMode, find_agent
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import get_protocol
+from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
+from baselines.online.prepare import prepare_play
+from baselines.online.student import collect_release, release_teammates
+from baselines.report.results import note_results, shipped_validation_tasks
+from baselines.training.histories import prepare, read_trained
+from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
+from baselines.training.trainer import format_loss, train
+from generation.profiles.noise_config import NoiseConfig
+from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
+from icrl4aht_data.commands.options import counted
+from icrl4aht_data.dataset import MINI, load_icrl4aht
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.writing.combine import combine_releases
+
+Data = Literal["tasks", "noise", "ppo", "both", "student"]
+"""What a model learns from: playing, noise histories, those of PPO learners of the bundled release, both, or histories
+of RL^2."""
+
+PROFILE = "noise"
+"""Profile of the release that everything starts from."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a reference model is made.
+
+    Attributes:
+        method: name of the method.
+        data: see `Data`.
+        model: values of `ModelOptions`.
+        train: values of `TrainOptions`.
+        histories: values of `HistoryOptions`.
+        rounds: number of further trainings, each with histories that the model plays and RL^2 labels.
+        mode: way in which the model plays.
+    """
+
+    method: str
+    data: Data
+    model: dict[str, Any] = field(default_factory=dict)
+    train: dict[str, Any] = field(default_factory=dict)
+    histories: dict[str, Any] = field(default_factory=dict)
+    rounds: int = 0
+    mode: PlayMode = AS_PUBLISHED
+
+
+_TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
+_STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
+_TEACHER: dict[str, Any] = {**RL2_SETTINGS["train"], "steps": 1400}
+
+RECIPES = {
+    "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER),
+    "ad-noise": Recipe("ad", "noise", _TINY, _STEPS, {"labels": "oracle"}),
+    "dpt-noise": Recipe("dpt", "noise", _TINY, _STEPS, {"labels": "oracle"}),
+    "ad-ppo": Recipe("ad", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
+    "dpt-ppo": Recipe("dpt", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
+    "ad-both": Recipe("ad", "both", _TINY, _STEPS, {"labels": "oracle"}),
+    "dpt-both": Recipe("dpt", "both", _TINY, _STEPS, {"labels": "oracle"}),
+    "ad-student": Recipe("ad", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
+    "dpt-student": Recipe("dpt", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
+    "ad-rising": Recipe("ad", "student", _TINY, _STEPS | {"context": 500, "batch_size": 8}, {"every": 4}),
+}
+"""Reference models by name."""
+
+TRACK_VIEWS: dict[str, dict[str, Any]] = {
+    "teammate": {},
+    "layout": {"mirror": True, "hide_recipe": ("asymm_both",)},
+}
+"""Track -> values of `HistoryOptions` for all of its models. Models of the layout track are tested on other layouts
+than they are trained on, so they learn from mirrored games, too; asymm_right has no recipe indicator that the ego could
+see, so that of asymm_both is hidden from them."""
+
+HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
+"""Histories of RL^2 with each teammate: half and more of a history is without noise."""
+
+OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
+"""Histories that a model plays itself."""
+
+OWN_SHARE = 0.5
+"""Learning rate of a training on own histories, as a share of the first training's."""
+
+PROTOCOL_SEEDS = {"seeded": 3, "published": 1}
+"""Protocol of the evaluation on test tasks -> number of seeds."""
+
+
+class ReferenceOutcome(NamedTuple):
+    """Outcome of one reference model on one track.
+
+    Attributes:
+        name: name of the recipe.
+        track: the track.
+        run: the model's run folder.
+        results: kind of tasks -> folder of results.
+    """
+
+    name: str
+    track: str
+    run: Path
+    results: dict[str, Path]
+
+
+Show = Callable[..., None]
+"""Called with (description, units done, units, note)."""
+
+
+def make_reference(name: str, track: str, out: Path, show: Show, evaluates: bool = True) -> ReferenceOutcome:
+    """Make a reference model of a track, with everything that it needs, or resume it.
+
+    Args:
+        name: one of `RECIPES`.
+        track: the track.
+        out: folder, see this module's docstring.
+        show: called now and then, for progress.
+        evaluates: whether to evaluate it as well.
+
+    Raises:
+        UnknownNameError: for an unknown recipe or track.
+        OptionError: if a folder holds something of other settings.
+        TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
+    """
+    if name not in RECIPES:
+        raise unknown("reference model", name, RECIPES)
+    if track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    made = _Making(out, track, show)
+    recipe = RECIPES[name]
+    run = made.play(name) if recipe.data == "tasks" else made.train(name, recipe)
+    return ReferenceOutcome(name, track, run, made.evaluate(name, run, recipe) if evaluates else {})
+
+
+@dataclass(frozen=True)
+class _Making:
+    """The steps towards the reference models of a track."""
+
+    out: Path
+    track: str
+    show: Show
+
+    @property
+    def layouts(self) -> tuple[str, ...]:
+        return TRACKS[self.track]["train"]
+
+    def noise_release(self) -> Path:
+        """Returns the release of noise histories, which is made if it is missing."""
+        folder = self.out / "noise"
+        if not (folder / "lite").is_dir():
+            command = ["-m", "generation", "generate", "--profile", PROFILE, "--out", str(folder)]
+            if subprocess.run([sys.executable, *command], check=False).returncode:
+                raise OptionError(f"{folder}: `python {' '.join(command)}` failed; its messages are above")
+        return folder / "lite"
+
+    def play(self, name: str = "rl2") -> Path:
+        """Returns the run folder of RL^2."""
+        recipe, folder = RECIPES[name], self.out / f"{name}-{self.track}"
+        options = TrainOptions(**recipe.train)
+        choice = HistoryOptions(self.layouts, str(self.noise_release()), **TRACK_VIEWS[self.track])
+        job = prepare_play(recipe.method, ModelOptions(**recipe.model), options, PlayOptions(), choice)
+        train(
+            job.method,
+            job.data,
+            options,
+            folder,
+            job.about,
+            trainer=job.trainer,
+            done=self._progress(folder.name, options.steps),
+        )
+        return folder
+
+    def histories(self) -> Path:
+        """Returns the release with histories of RL^2."""
+        folder = self.out / f"histories-{self.track}"
+        if not folder.is_dir():
+            agent = find_agent(str(self.play()), PlayMode(greedy=False))
+            dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
+            teammates = release_teammates(dataset, unreliable=True)
+            collect_release(agent, teammates, HISTORIES, folder, progress=self.show)
+        return folder
+
+    def root(self, recipe: Recipe) -> Path:
+        """Returns the release that a model is first trained on."""
+        if recipe.data == "student":
+            return self.histories()
+        return MINI if recipe.data in ("ppo", "both") else self.noise_release()
+
+    def train(self, name: str, recipe: Recipe) -> Path:
+        """Returns the run folder of a model that learns from histories, and then perhaps from its own."""
+        folder, root = self.out / f"{name}-{self.track}", self.root(recipe)
+        first = folder if not recipe.rounds else folder.with_name(f"{folder.name}-first")
+        self._train_once(recipe, root, first, TrainOptions(**recipe.train))
+        for number in range(1, recipe.rounds + 1):
+            end = "" if number == recipe.rounds else f"-{number}"
+            target = folder.with_name(folder.name + end)
+            self._train_on_own(recipe, root, first, target, number)
+            first = target
+        return folder
+
+    def _train_on_own(self, recipe: Recipe, root: Path, before: Path, target: Path, number: int) -> None:
+        """Train a model further, half of the time on histories that it plays itself and RL^2 labels."""
+        own, mixed = (target.with_name(f"{target.name}-{kind}") for kind in ("own", "mixed"))
+        if not mixed.is_dir():
+            dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
+            labeller = find_agent(str(self.play()))
+            teammates = release_teammates(dataset, number, unreliable=True)
+            agent = find_agent(str(before), PlayMode(greedy=False))
+            if not own.is_dir():
+                collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
+            combine_releases(mixed, [root, own])
+        options = TrainOptions(**recipe.train)
+        rate = OWN_SHARE * options.learning_rate
+        self._train_once(recipe, mixed, target, replace(options, learning_rate=rate), before)
+
+    def _train_once(
+        self, recipe: Recipe, root: Path, folder: Path, options: TrainOptions, before: Path | None = None
+    ) -> None:
+        sources = (recipe.data,) if recipe.data in ("noise", "ppo") else ()
+        views = TRACK_VIEWS[self.track]
+        histories = HistoryOptions(
+            self.layouts, str(root), source=sources, channels="canonical", **recipe.histories, **views
+        )
+        job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
+        params = None
+        if before is not None:
+            trained = read_trained(before)
+            params, job.about["init"] = trained.params, trained.hash
+        done = self._progress(folder.name, options.steps)
+        train(job.method, job.data, job.options, folder, job.about, params=params, done=done)
+
+    def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
+        """Returns the folders of a model's results, by the kind of tasks."""
+        agent, found = find_agent(str(run), recipe.mode), {}
+        kinds = [("validation", "seeded", 1), *((f"test-{p}", p, seeds) for p, seeds in PROTOCOL_SEEDS.items())]
+        for kind, protocol, seeds in kinds:
+            tasks, folder = self._tasks(kind), self.out / "results" / f"{name}-{self.track}" / kind
+            if not tasks:
+                continue
+            played = get_protocol(protocol)
+            evaluate(
+                name,
+                agent.make,
+                tasks,
+                played,
+                seeds=range(seeds),
+                out=folder,
+                details=agent.details,
+                played=counted(self.show, f"{name}, {kind}", len(tasks) * seeds * played.episodes),
+            )
+            note_results(folder, run, tasks if kind == "validation" else ())
+            found[kind] = folder
+        return found
+
+    def _tasks(self, kind: str) -> list[Task]:
+        if kind == "validation":
+            return [task for task in shipped_validation_tasks().values() if task.layout.name in self.layouts]
+        tested = {TESTED_ON[layout] for layout in self.layouts}
+        return [task for task in read_tasks(manifest_path(self.track, "test")) if task.layout.name in tested]
+
+    def _progress(self, what: str, steps: int) -> Callable[[int, float | None], None]:
+        return lambda step, loss: self.show(what, step, steps, format_loss(loss))
