@@ -79,7 +79,7 @@ _console = Console(soft_wrap=True)
 
 _SECTIONS = {
     "Train and evaluate": ("demo", "train", "evaluate", "report", "watch", "collect"),
-    "Reference models": ("models", "reference"),
+    "Reference models": ("models", "reference", "results"),
     "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
     "Check": ("control", "drift", "headroom"),
 }
@@ -579,6 +579,43 @@ def reference_command(names: tuple[str, ...], track: tuple[str, ...], evaluates:
                 _console.print(f"  {kind}: {folder}", highlight=False)
             if bundle:
                 _console.print(f"  bundled: {bundle_run(found.run, name, of_track)}", highlight=False)
+
+
+@cli.command(
+    "results",
+    epilog=examples(
+        "python -m baselines results --out build/results",
+        "python -m baselines results runs/ad-results --about 'AD on noise histories' --out build/results",
+    ),
+)
+@click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
+@click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
+@click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
+@overwrite_option
+def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, overwrite: bool) -> None:
+    """Compare reference models with the paper's numbers.
+
+    Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
+    `evaluate` made, are added.
+    """
+    from baselines.report.comparison import (
+        RESULTS_BEGINS,
+        add_results,
+        read_stored,
+        results_file,
+        write_comparison,
+        write_stored,
+    )
+
+    check_new_files(out, overwrite, RESULTS_BEGINS)
+    stored = read_stored(results_file())
+    for run in runs:
+        stored = add_results(stored, run, about)
+    if store:
+        write_stored(results_file(), stored)
+    for path in write_comparison(stored, out):
+        _console.print(f"wrote {path}")
 
 
 @cli.command("models")

@@ -27,9 +27,8 @@ from icrl4aht_data.overcooked.rules import PRESS_REWARD
 def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     """Returns Adam with linear warm-up, cosine decay (paper, App. C.2.3) and gradients clipped by global norm."""
     steps = config.updates * config.epochs * config.minibatches
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, max(1, round(config.warmup * steps)), steps
-    )
+    warmup = max(1, round(config.warmup * steps))
+    schedule = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(steps, warmup + 1))
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule, eps=1e-5))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -203,6 +204,8 @@ def _limits(release: CardContent) -> list[str]:
         limits.append(sentence("dependent_streams"))
     if "noise" in sources:
         limits.append(sentence("noise_is_no_learning"))
+    if "student" in sources:
+        limits.append(sentence("student_is_no_learning"))
     if release.distinct("filter"):
         limits.append(sentence("filtered"))
     limits += _flat_tasks(release)
@@ -418,14 +421,20 @@ def _egos(release: CardContent) -> Iterable[str]:
 
 
 def _noise(release: CardContent) -> Iterable[str]:
-    """Yield a sentence on each kind of noise schedule."""
-    for noise in release.distinct("noise"):
+    """Yield a sentence on each kind of noise schedule, and on the labels of students."""
+    made = [of_task for of_task in release.provenance.values() if of_task.noise]
+    schedules = {json.dumps([of_task.source, of_task.noise]): of_task for of_task in made}
+    labels = dict.fromkeys(of_task.expert.action for of_task in made if of_task.source == "student" and of_task.expert)
+    if labels:
+        yield sentence("student", labels=", or ".join(labels))
+    for of_task in schedules.values():
+        noise = of_task.noise or {}
         settings = {
             name: range_in_words(value, 2) if isinstance(value, list | tuple) else f"{value:,}"
             for name, value in noise.items()
         }
         if {"histories", "episodes", "start", "end", "begin", "finish", "power"} <= settings.keys():
-            yield sentence("noise", **settings)
+            yield sentence("noise", source=of_task.source or "noise", **settings)
 
 
 def _bullets(lines: Iterable[str]) -> str:

@@ -1,0 +1,141 @@
+"""Bundled models: copies of runs, found by name, and listed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.agents import Percept, bundled
+from baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models, find_bundled
+from baselines.agents.egos import PlayMode, find_agent
+from baselines.commands.cli import cli
+from baselines.evaluate.evaluator import evaluate
+from baselines.evaluate.protocols import get_protocol
+from baselines.methods.options import ModelOptions
+from baselines.training.histories import prepare, read_trained
+from baselines.training.options import HistoryOptions, TrainOptions
+from baselines.training.trainer import train
+from generation.teammates.instances import published_task
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import get_layout
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
+OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("bundled") / "run"
+    histories = HistoryOptions(("demo_wide",), source=("noise",), channels="canonical", labels="oracle")
+    job = prepare("ad", MODEL, OPTIONS, histories)
+    train(job.method, job.data, job.options, folder, job.about)
+    return folder
+
+
+@pytest.fixture
+def models(run, tmp_path, monkeypatch) -> Path:
+    """A folder of bundled models in place of the package's, with one model of one track."""
+    bundle_run(run, "ad-tiny", "teammate", tmp_path)
+    monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
+    return tmp_path
+
+
+def test_a_bundled_model_is_the_run(run, models):
+    one, two = read_trained(run), read_trained(models / "ad-tiny" / "teammate")
+    jax.tree.map(np.testing.assert_array_equal, one.params, two.params)
+    assert (one.step, one.context, one.layouts, one.trained_on) == (two.step, two.context, two.layouts, two.trained_on)
+    text = (models / "ad-tiny" / "teammate" / "config.json").read_text(encoding="utf-8")
+    assert json.loads(text)["histories"]["root"] == "mini" and str(Path.home()) not in text
+
+
+def test_it_plays_as_the_run_does(run, models, tmp_path):
+    task, protocol = published_task("demo_wide", "H4/t0"), get_protocol("seeded", 2)
+    found = []
+    for name in (str(run), "ad-tiny"):
+        agent = find_agent(name)
+        out = tmp_path / "results" / agent.name
+        found.append(evaluate(agent.name, agent.make, [task], protocol, out=out, details=agent.details)[0])
+    assert [result.settings["agent"] for result in found] == ["AD+mlp", "ad-tiny"]
+    assert found[0].returns == found[1].returns
+    assert found[1].settings["details"]["model"] == "ad-tiny"
+    assert found[1].settings["details"]["trained_on"] == read_trained(run).trained_on
+
+
+def test_layouts_of_other_tracks(models):
+    message = "ad-tiny: has no model of track layout, whose layout is cramped_down; it has teammate: choose tasks"
+    with pytest.raises(OptionError, match=message):
+        find_agent("ad-tiny").make(get_layout("cramped_down"))
+
+
+def test_unknown_names(models):
+    with pytest.raises(UnknownNameError, match="unknown agent 'ad-tinny'; valid: stay, random, oracle, ad-tiny"):
+        find_agent("ad-tinny")
+    with pytest.raises(UnknownNameError, match="unknown bundled model 'x'; valid: ad-tiny"):
+        find_bundled("x", models)
+
+
+def test_large_models_are_refused(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(bundled, "_LARGEST", 1000)
+    with pytest.raises(OptionError, match=r"parameters of [\d,]+ bytes, expected at most 1,000: bundle a smaller"):
+        bundle_run(run, "ad-tiny", "teammate", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_package_bundles_models_that_play_and_have_cards():
+    for model in bundled_models(MODELS).values():
+        assert (MODELS / model.name / MODEL_CARD).is_file()
+        for track, folder in model.runs.items():
+            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            assert size < 2.1e6, folder
+            trained = read_trained(folder)
+            for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
+                policy = find_agent(model.name).make(get_layout(layout))
+                assert policy.sees == "percept" and trained.channels == "canonical"
+
+
+def test_models_command(models):
+    result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "ad-tiny, track teammate: AD+mlp, " in result.output
+    assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in result.output
+
+
+class TestPlayMode:
+    def test_details_and_back(self):
+        for mode in (PlayMode(), PlayMode("exact", False), PlayMode(forget=True)):
+            assert PlayMode.from_details(mode.details) == mode
+        assert PlayMode().details == {"acting": "cached"}
+
+    def test_a_model_that_forgets_plays_each_episode_as_its_first(self, run):
+        """With its memory cleared, what came before an episode changes nothing."""
+        agent = find_agent(str(run), PlayMode(greedy=False, forget=True))
+        policy = agent.make(get_layout("demo_wide"))
+        rng = np.random.default_rng(0)
+        percepts = [_percept(rng, done=False) for _ in range(3)]
+        begin = _percept(rng, done=True)
+
+        def after(history: list) -> np.ndarray:
+            memory, found = policy.init(policy.params, jax.random.key(0)), []
+            for percept in [*history, begin, *percepts]:
+                logits_key = jax.random.key(len(found))
+                action, memory = policy.act(policy.params, memory, percept, logits_key)
+                found.append(int(action))
+            return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(memory)])
+
+        np.testing.assert_array_equal(after([]), after([_percept(rng, done=False) for _ in range(2)]))
+        keeps = find_agent(str(run), PlayMode(greedy=False)).make(get_layout("demo_wide"))
+        policy = keeps
+        assert not np.array_equal(after([]), after([_percept(rng, done=False) for _ in range(2)]))
+
+
+def _percept(rng: np.random.Generator, done: bool) -> Percept:
+    obs = rng.integers(0, 2, (5, 5, 45), dtype=np.uint8)
+    numbers = np.int32(rng.integers(6)), np.float32(rng.choice([0, 20])), np.int32(rng.integers(6))
+    return Percept(obs, *numbers, np.bool_(done))

@@ -1,0 +1,124 @@
+"""Mirrored and hidden views: what an ego sees in a mirrored view is what it would see on the mirrored layout."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import product
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from baselines.methods.view_change import ViewChange, changed_view, mirrored_action, no_change
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import EGO, INTERACT
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
+from icrl4aht_data.overcooked.layouts import FACINGS, Layout, get_layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import start
+
+LAYOUT = get_layout("cramped_up")
+MIRRORINGS = list(product((False, True), repeat=2))
+"""Whether rows and whether columns are exchanged."""
+
+
+def mirrored_layout(layout: Layout, rows: bool, columns: bool) -> Layout:
+    kept = layout.rows[::-1] if rows else layout.rows
+    return dataclasses.replace(layout, name="mirrored", rows=tuple(r[::-1] if columns else r for r in kept))
+
+
+def mirrored_cells(layout: Layout, cells: np.ndarray, rows: bool, columns: bool) -> np.ndarray:
+    y, x = np.divmod(cells, layout.width)
+    y, x = (layout.height - 1 - y if rows else y), (layout.width - 1 - x if columns else x)
+    return (y * layout.width + x).astype(np.uint8)
+
+
+def mirrored_facings(facings: np.ndarray, rows: bool, columns: bool) -> np.ndarray:
+    swapped = {"up": "down", "down": "up"} if rows else {}
+    swapped |= {"left": "right", "right": "left"} if columns else {}
+    return np.array([FACINGS.index(swapped.get(name, name)) for name in FACINGS], np.uint8)[facings]
+
+
+def change(rows: bool, columns: bool, hidden: bool = False) -> ViewChange:
+    return ViewChange(*(jnp.asarray(flag) for flag in (hidden, rows, columns)))
+
+
+@pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
+def test_a_mirrored_view_is_that_of_the_mirrored_layout_at_every_step(rows, columns):
+    """The same play on both layouts, with mirrored actions on the mirrored one."""
+    rng, other = np.random.default_rng(0), mirrored_layout(LAYOUT, rows, columns)
+    free = np.flatnonzero(LAYOUT.walkable)
+    positions = rng.choice(free, (64, 2)).astype(np.uint8)
+    positions = positions[positions[:, 0] != positions[:, 1]]
+    facings = rng.integers(4, size=positions.shape).astype(np.uint8)
+    recipe = rng.choice(LAYOUT.recipe_items, len(positions)).astype(np.uint8)
+    one = start(LAYOUT, positions, facings, recipe)
+    two = start(
+        other, mirrored_cells(LAYOUT, positions, rows, columns), mirrored_facings(facings, rows, columns), recipe
+    )
+    view, seen = change(rows, columns), 0
+    for _ in range(60):
+        expected = observe(other, two, EGO, canonical=True)
+        np.testing.assert_array_equal(
+            view.observations(jnp.asarray(observe(LAYOUT, one, EGO, canonical=True))), expected
+        )
+        seen += int(expected[..., CANONICAL_CHANNELS.index("item_ingredient_0")].sum())
+        actions = rng.choice([0, 1, 2, 3, INTERACT, INTERACT], (len(one), 2))
+        mirrored = np.asarray(view.actions(jnp.asarray(actions)))
+        one = rules.step(LAYOUT, one, actions, recipe).state
+        two = rules.step(other, two, mirrored, recipe).state
+    assert seen > 0  # something was carried around
+
+
+@pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
+def test_mirroring_twice_changes_nothing(rows, columns):
+    view, actions = change(rows, columns), jnp.arange(6)
+    np.testing.assert_array_equal(view.actions(view.actions(actions)), actions)
+    obs = jnp.asarray(np.random.default_rng(0).integers(0, 20, (3, 5, 5, 46), dtype=np.uint8))
+    np.testing.assert_array_equal(view.observations(view.observations(obs)), obs)
+
+
+def test_a_hidden_recipe_indicator_looks_like_a_counter():
+    """asymm_right is asymm_both without the recipe indicator in the ego's room; nothing else tells them apart."""
+    both, right = get_layout("asymm_both"), get_layout("asymm_right")
+    positions = np.array([[both.agent_cells[0], both.agent_cells[1]]], np.uint8)
+    facings, recipe = np.zeros((1, 2), np.uint8), both.recipe_items[:1]
+    shown, without = (
+        jnp.asarray(observe(layout, start(layout, positions, facings, recipe), EGO, canonical=True))
+        for layout in (both, right)
+    )
+    assert not np.array_equal(shown, without)
+    np.testing.assert_array_equal(change(False, False, hidden=True).observations(shown), without)
+    np.testing.assert_array_equal(no_change().observations(shown), shown)
+
+
+def test_views_of_batches():
+    """The number of a row's layout says which layout it is, and how it is mirrored."""
+    layouts = [get_layout("asymm_both"), LAYOUT]
+    size = max(layout_size(layout) for layout in layouts)
+    records = np.zeros((4, 2, size), np.uint8)
+    for row, layout in enumerate((layouts[0], layouts[1], layouts[1], layouts[0])):
+        positions = np.array([layout.agent_cells], np.uint8)
+        record = start(layout, positions, np.zeros((1, 2), np.uint8), layout.recipe_items[:1])
+        records[row, :, : record.shape[-1]] = record
+    numbers = np.array([0, 1, 1 + 2 * 3, 0 + 2 * 1], np.int32)
+    seen: Any = changed_view(layouts, hidden=["asymm_both"])(jnp.asarray(records), numbers)
+    plain: Any = changed_view(layouts)(jnp.asarray(records), numbers % 2)
+    expected = [change(False, False, True), no_change(), change(True, True), change(True, False, True)]
+    for row, view in enumerate(expected):
+        np.testing.assert_array_equal(seen[row], view.observations(plain[row]))
+    assert len({np.asarray(obs[0]).tobytes() for obs in seen}) == 4
+
+
+def layout_size(layout: Layout) -> int:
+    one = np.zeros((1, 2), np.uint8)
+    return start(layout, one, one, layout.recipe_items[:1]).shape[-1]
+
+
+def test_mirrored_actions_of_rows():
+    actions = np.tile(np.arange(6, dtype=np.int32), (4, 1))
+    found = mirrored_action(actions, np.arange(4))
+    for row, (columns, rows) in enumerate(MIRRORINGS):
+        np.testing.assert_array_equal(found[row], change(rows, columns).actions(jnp.arange(6)))
+    assert found.dtype == np.int32

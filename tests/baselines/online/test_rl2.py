@@ -1,0 +1,242 @@
+"""RL^2: the model along a sequence and step by step, its episodes for learning, its training and resume."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.agents.egos import PlayMode, find_agent
+from baselines.commands.cli import cli
+from baselines.evaluate.evaluator import prepare_rollout
+from baselines.evaluate.protocols import get_protocol
+from baselines.methods.options import ModelOptions
+from baselines.methods.registry import get_method, overcooked_world
+from baselines.methods.tokens import StepInput
+from baselines.online.rl2 import REWARD_SCALE, PlayTrainer, imitation_weight, make_groups
+from baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
+from baselines.training.histories import read_trained
+from baselines.training.options import PlayOptions, TrainOptions
+from baselines.training.trainer import TrainingData, train
+from generation.teammates.instances import published_task
+from generation.teammates.registry import build_teammate, sample_teammate
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.state import start
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+LAYOUT = get_layout("cramped_up")
+MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
+OPTIONS = TrainOptions(steps=4, batch_size=8, learning_rate=3e-3, warmup=0.0, log_every=1, save_every=2)
+PLAY = PlayOptions(epochs=1, minibatches=2, task_end=0.5, imitation_end=1.0)
+METHOD = get_method("rl2")(MODEL, overcooked_world([LAYOUT], "mlp", canonical=True))
+
+
+def teammates(count: int) -> list[Any]:
+    return [build_teammate(LAYOUT, sample_teammate("assembly_line", k, "train")) for k in range(count)]
+
+
+@pytest.fixture(scope="module")
+def trainer() -> PlayTrainer:
+    groups = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
+    return PlayTrainer(METHOD, OPTIONS, PLAY, groups, mirror=True)
+
+
+@pytest.fixture(scope="module")
+def through(trainer, tmp_path_factory) -> tuple[Path, Any]:
+    folder = tmp_path_factory.mktemp("rl2") / "run"
+    return folder, train(METHOD, TrainingData(None, {}), OPTIONS, folder, {}, trainer=trainer)
+
+
+def test_the_state_carries_over_steps_and_calls():
+    """The output along a sequence is that of its steps one by one, and of its halves."""
+    rng = np.random.default_rng(0)
+    steps = StepInput(
+        jnp.asarray(rng.integers(0, 2, (6, 3, 5, 5, 46)), jnp.uint8),
+        jnp.asarray(rng.integers(6, size=(6, 3))),
+        jnp.asarray(rng.choice([-20.0, 0.0, 20.0], (6, 3))),
+        jnp.asarray(rng.integers(6, size=(6, 3))),
+    )
+    params = METHOD.init(jax.random.key(0))
+    start = jnp.zeros((3, 16))
+    output, end = METHOD.model.apply({"params": params}, steps, start)
+    half, state = METHOD.model.apply({"params": params}, jax.tree.map(lambda x: x[:3], steps), start)
+    rest, last = METHOD.model.apply({"params": params}, jax.tree.map(lambda x: x[3:], steps), state)
+    np.testing.assert_allclose(output.logits, jnp.concatenate([half.logits, rest.logits]), atol=1e-5)
+    np.testing.assert_allclose(end, last, atol=1e-5)
+    memory = METHOD.start(0, True)
+    for t in range(6):
+        logits, memory = METHOD.act(params, jax.tree.map(lambda x, t=t: x[t, 1], steps), jnp.bool_(False), memory)
+        np.testing.assert_allclose(logits, output.logits[t, 1], atol=1e-5)
+    with pytest.raises(TypeError, match="trained by playing"):
+        METHOD.loss(params, None, None, None)
+
+
+def test_episodes_for_learning(trainer):
+    """What is learned from is what the model saw and did: its recomputed policy is the one that played."""
+    player, state = trainer.players[0], trainer.init()
+    tasks, key = state.tasks[0], jax.random.key(3)
+    for number in range(3):  # the second and third episodes go on with the tasks that did not end
+        after, played, returns = player.episode(state.params, trainer._mates[0], tasks, jax.random.fold_in(key, number))
+        assert played.action.shape == (100, 8)
+        np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
+        np.testing.assert_allclose(played.reward.sum(axis=0) / REWARD_SCALE, returns, rtol=1e-5)
+        ended = np.asarray(played.done[-1])
+        assert not played.done[:-1].any()
+        memory = np.asarray(after.ego.state)
+        assert not memory[ended].any() and np.abs(memory[~ended]).sum() > 0
+        np.testing.assert_array_equal(played.hidden[0], tasks.ego.state)
+        tasks = after
+    changes = np.asarray(tasks.ego.change.upside_down), np.asarray(tasks.ego.change.sideways)
+    assert all(0 < flags.sum() < 8 for flags in changes)
+
+
+def test_the_first_step_of_a_task_knows_nothing_of_the_one_before(trainer):
+    player, state = trainer.players[0], trainer.init()
+    tasks = state.tasks[0]
+    for number in range(4):
+        tasks, played, _ = player.episode(state.params, trainer._mates[0], tasks, jax.random.key(number))
+        ended = np.asarray(played.done[-1])
+        for before in (tasks.before.prev_action, tasks.before.prev_reward, tasks.before.prev_teammate_action):
+            assert not np.asarray(before)[ended].any()
+        if ended.any():
+            return
+    raise AssertionError("no task ended")
+
+
+def test_imitation_teaches_what_the_oracle_does(through):
+    lines = [json.loads(line) for line in (through[0] / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4]
+    assert [line["imitation_weight"] for line in lines] == pytest.approx([1.0, 0.75, 0.5, 0.25])
+    assert lines[-1]["imitation_loss"] < lines[0]["imitation_loss"] - 0.01
+    assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
+
+
+def test_the_weight_of_imitation_falls_to_nothing():
+    play = PlayOptions(imitation=2.0, imitation_end=0.5)
+    found = [float(imitation_weight(play, jnp.int32(step), 100)) for step in (0, 25, 50, 99)]
+    assert found == pytest.approx([2.0, 1.0, 0.0, 0.0])
+
+
+def test_a_stopped_training_resumes_to_the_same_bits(trainer, through, tmp_path):
+    def stop(step: int, loss: float | None) -> None:
+        if step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(METHOD, TrainingData(None, {}), OPTIONS, tmp_path, {}, trainer=trainer, done=stop)
+    state = train(METHOD, TrainingData(None, {}), OPTIONS, tmp_path, {}, trainer=trainer)
+    jax.tree.map(np.testing.assert_array_equal, state.params, through[1].params)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
+
+
+class TestGroups:
+    def test_shares(self):
+        wide = get_layout("demo_wide")
+        mates = {(LAYOUT, "a"): teammates(1), (LAYOUT, "b"): teammates(1), (wide, "a"): teammates(3)}
+        groups = make_groups(mates, 40, {LAYOUT.name: 1.0, wide.name: 0.25}, hidden=[wide.name])
+        assert [(group.name, len(group.teammates), group.hidden) for group in groups] == [
+            ("cramped_up a", 16, False),
+            ("cramped_up b", 16, False),
+            ("demo_wide a", 8, True),
+        ]
+
+    def test_every_teammate_has_several_manners(self):
+        group = make_groups({(LAYOUT, "a"): teammates(3)}, 60, {LAYOUT.name: 1.0})[0]
+        found: dict[bytes, set[bytes]] = {}
+        for mate in group.teammates:
+            theta = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(mate.params["script"]))
+            found.setdefault(theta, set()).add(np.asarray(mate.params["chances"]).tobytes())
+        assert all(len(manners) >= 3 for manners in found.values())
+
+    def test_mixture(self):
+        chances = mixed_chances(100)
+        assert chances.shape == (100, len(MANNERS)) and np.allclose(chances.sum(axis=1), 1)
+        assert (chances[:, 0] == 1).sum() == 100 * MIXTURE[0][0]
+        assert mixed_chances(1)[0].tolist() == [1.0, 0.0, 0.0, 0.0]
+
+    @pytest.mark.parametrize("manner", MANNERS)
+    def test_manners(self, manner):
+        """With the manner `stay` the teammate never moves, with `script` it plays as without manners."""
+        base = teammates(1)[0]
+        chances = np.eye(len(MANNERS), dtype=np.float32)[[MANNERS.index(manner)]]
+        (mate,) = with_manners([base], chances)
+        taken, plain = played_actions(mate), played_actions(base)
+        if manner == "stay":
+            assert (taken == STAY).all()
+        elif manner == "script":
+            np.testing.assert_array_equal(taken, plain)
+        else:
+            assert 0.05 < (taken != plain).mean() < 1.0
+
+
+def played_actions(mate: Any) -> np.ndarray:
+    """40 actions of a teammate in one state, the start of an episode."""
+    cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
+    record = jnp.asarray(start(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
+    memory, found = mate.init(mate.params, jax.random.key(0)), []
+    act = jax.jit(mate.act)
+    for t in range(40):
+        action, memory = act(mate.params, memory, record, jax.random.fold_in(jax.random.key(1), t))
+        found.append(int(action))
+    return np.array(found)
+
+
+class TestCommand:
+    def test_train_and_play(self, tmp_path):
+        out = tmp_path / "run"
+        sizes = ["--steps", "1", "--batch-size", "2", "--width", "8", "--epochs", "1", "--minibatches", "1"]
+        choice = [
+            "--layout",
+            "cramped_up",
+            "--source",
+            "noise",
+            "--teammate-family",
+            "H3",
+            "--hide-recipe",
+            "cramped_up",
+        ]
+        arguments = ["train", "rl2", *choice, "--out", str(out), *sizes]
+        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        assert "each an episode of 2 tasks" in result.output
+        trained = read_trained(out)
+        assert (trained.label, trained.step, trained.channels) == ("RL2+TA+mlp", 1, "canonical")
+        assert {cell["labels"] for cell in trained.trained_on} == {"oracle"}
+        agent = find_agent(str(out), PlayMode(greedy=False))
+        assert agent.details and agent.details["sampled"] is True
+        assert trained.hide_recipe == ("cramped_up",)
+        task = published_task("cramped_down", "H1/t0")
+        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # compiles: it fits what the evaluator passes
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (["--every", "2"], "every = 2: rl2 learns by playing, not from histories; leave it out"),
+            (["--channels", "own"], "channels = own: rl2 takes canonical channels; leave it out"),
+        ],
+    )
+    def test_options_of_histories(self, lite, tmp_path, options, message):
+        arguments = ["train", "rl2", "--layout", "coord_simple", "--root", str(lite[0]), "--out", str(tmp_path / "run")]
+        result = CliRunner().invoke(cli, [*arguments, *options])
+        assert isinstance(result.exception, OptionError) and str(result.exception) == message
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["rl2", "--context", "5"], "--context: not with rl2, which learns by playing"),
+            (["rl2", "--size", "tiny"], "--size: not with rl2, which learns by playing"),
+            (["ad", "--epochs", "2"], "--epochs: not with ad, only with rl2, which learns by playing"),
+        ],
+    )
+    def test_options_of_other_methods(self, tmp_path, arguments, message):
+        result = CliRunner().invoke(cli, ["train", *arguments, "--layout", "demo_wide", "--out", str(tmp_path / "run")])
+        assert result.exit_code == 2 and message in result.output

@@ -1,0 +1,156 @@
+"""Histories of trained agents: what is recorded, labels, teammates, resume, and the release."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.agents.egos import AGENTS, NamedEgo, stay
+from baselines.commands.cli import cli
+from baselines.online import student
+from baselines.online.student import UNRELIABLE, collect_release, record_histories, release_teammates, with_noise
+from generation.policy import Policy
+from generation.profiles.noise_config import NoiseConfig
+from generation.teammates.registry import build_teammate
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.actions import STAY
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
+
+
+def cook(layout: Any) -> Policy:
+    """An agent that always interacts, and sees percepts."""
+    return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "percept")
+
+
+def idle(layout: Any) -> Policy:
+    return stay(layout)._replace(sees="percept")
+
+
+COOK, IDLE = NamedEgo("cook", cook, {"version": 1}), NamedEgo("idle", idle)
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Any:
+    """Bundled histories of one layout with heuristics of one kind."""
+    return load_icrl4aht(layout="cramped_up").filter(teammate_family="H3")
+
+
+@pytest.fixture(scope="module")
+def release(dataset, tmp_path_factory) -> Path:
+    return collect_release(COOK, release_teammates(dataset), CONFIG, tmp_path_factory.mktemp("student") / "release")
+
+
+def test_the_release_is_verified_to_the_last_step(release):
+    report = verify_release(release, level="deep")
+    assert report.ok, report.findings
+    assert not list(release.parent.glob("*.parts"))
+
+
+def test_what_the_release_says(release, dataset):
+    found = load_icrl4aht(release)
+    made, given = release_teammates(found).tasks, release_teammates(dataset).tasks
+    assert found.counts("source") == {"student": 2 * len(given)}
+    assert set(found.counts("split")) == {"train", "validation"}
+    card = (release / "README.md").read_text(encoding="utf-8")
+    assert "cook, before the noise" in card and "a trained agent plays" in card
+    assert {task.teammate_key for task in made} == {task.teammate_key for task in given}
+    assert not set(found.column("task_id")) & set(dataset.column("task_id"))
+
+
+def test_the_noise_falls_and_the_labels_are_without_it(release):
+    found = load_icrl4aht(release)
+    for history in (found[0], found[len(found) - 1]):
+        taken, labels = (np.asarray(values[:]).reshape(10, 100) for values in (history.actions, history.expert_actions))
+        assert (labels == 5).all()
+        share = (taken == labels).mean(axis=1)
+        assert share[0] < 0.4 and (share[-1] == 1).all()
+        assert np.corrcoef(share, np.arange(10))[0, 1] > 0.9
+        oracle = np.asarray(history.oracle_actions[:])
+        assert len(set(oracle.tolist())) > 3  # the script sees the same states, and does something else
+
+
+def test_another_agent_labels(dataset):
+    """The labeller sees the history that the agent makes, its actions included."""
+
+    def counts(layout: Any) -> Policy:
+        def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
+            return jnp.int32((memory + 1) % 6), memory + (percept.prev_action == STAY)
+
+        return Policy((), lambda params, key: jnp.int32(0), act, "percept")
+
+    tasks = release_teammates(dataset).tasks[:1]
+    config = NoiseConfig(1, 10, start=(0.0, 0.0))
+    found = record_histories(idle, tasks, config, make_labeller=counts)
+    assert (found.actions == STAY).all()
+    # Nothing was done before the first step; then every step was a "stay".
+    np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
+    with pytest.raises(OptionError, match="the labeller sees a state, expected a percept, as the agent does"):
+        with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
+
+
+def test_unreliable_teammates_are_training_tasks_that_can_be_built(dataset):
+    plain, more = release_teammates(dataset), release_teammates(dataset, number=1, unreliable=True)
+    added = more.tasks[len(plain.tasks) :]
+    assert len(added) == len(UNRELIABLE["assembly_line"])
+    assert {task.split for task in added} == {"train"}
+    assert len({task.task_id for task in plain.tasks + more.tasks}) == len(plain.tasks) + len(more.tasks)
+    acted = []
+    for task, changes in zip(added, UNRELIABLE["assembly_line"], strict=True):
+        assert changes.items() <= task.teammate["theta"].items()
+        build_teammate(task.layout, task.teammate)
+        acted.append(record_histories(idle, [task], NoiseConfig(1, 10, start=(0.0, 0.0))).teammate_actions)
+    assert (acted[0] == STAY).all()  # hesitates always
+    assert 0 < (acted[1] != STAY).mean() < (acted[2] != STAY).mean()
+
+
+def test_a_stopped_collection_resumes(release, dataset, tmp_path, monkeypatch):
+    played: list[str] = []
+
+    def killed_in_the_end(*args: Any, **options: Any) -> Any:
+        raise KeyboardInterrupt
+
+    def record(make: Any, tasks: Any, *args: Any) -> Any:
+        played.append(tasks[0].layout.name)
+        return original(make, tasks, *args)
+
+    original, target = record_histories, tmp_path / "release"
+    monkeypatch.setattr(student, "record_histories", record)
+    with monkeypatch.context() as patch:
+        patch.setattr(student, "write_release", killed_in_the_end)
+        with pytest.raises(KeyboardInterrupt):
+            collect_release(COOK, release_teammates(dataset), CONFIG, target)
+    assert not target.exists() and played == ["cramped_up"]
+    with pytest.raises(OptionError, match=r"release\.parts: parts of other settings \(.*noise.histories.*; remove it"):
+        collect_release(COOK, release_teammates(dataset), NoiseConfig(3, 10), target)
+    collect_release(COOK, release_teammates(dataset), CONFIG, target)
+    assert played == ["cramped_up"]
+    assert (target / "MANIFEST.sha256").read_bytes() == (release / "MANIFEST.sha256").read_bytes()
+
+
+def test_the_command(tmp_path):
+    choice = ["--layout", "cramped_up", "--teammate-family", "H3", "--histories", "1", "--episodes", "10"]
+    arguments = ["collect", "--agent", "random", *choice, "--out", str(tmp_path / "release")]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0 and "describes it" in result.output
+    again = CliRunner().invoke(cli, arguments)
+    assert isinstance(again.exception, OptionError) and "--overwrite" in str(again.exception)
+
+
+def test_memory_of_the_noise():
+    policy = with_noise(idle(None), 3)
+    memory = policy.init(policy.params, jax.random.key(0))
+    for step in range(5):
+        action, memory = policy.act(policy.params, memory, None, jax.random.key(step))
+        assert int(action) == STAY
+    assert int(memory.steps) == 5 and memory.labels.tolist() == [STAY] * 3 and memory.labeller is None
