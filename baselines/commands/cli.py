@@ -610,8 +610,8 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
 
     check_new_files(out, overwrite, RESULTS_BEGINS)
     stored = read_stored(results_file())
-    for run in runs:
-        stored = add_results(stored, run, about)
+    for folder in runs:
+        stored = add_results(stored, folder, about)
     if store:
         write_stored(results_file(), stored)
     for path in write_comparison(stored, out):

@@ -67,11 +67,12 @@ def test_the_state_carries_over_steps_and_calls():
     )
     params = METHOD.init(jax.random.key(0))
     start = jnp.zeros((3, 16))
-    output, end = METHOD.model.apply({"params": params}, steps, start)
+    found: Any = METHOD.model.apply({"params": params}, steps, start)
+    output, end = found
     half, state = METHOD.model.apply({"params": params}, jax.tree.map(lambda x: x[:3], steps), start)
     rest, last = METHOD.model.apply({"params": params}, jax.tree.map(lambda x: x[3:], steps), state)
     np.testing.assert_allclose(output.logits, jnp.concatenate([half.logits, rest.logits]), atol=1e-5)
-    np.testing.assert_allclose(end, last, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(end), np.asarray(last), atol=1e-5)
     memory = METHOD.start(0, True)
     for t in range(6):
         logits, memory = METHOD.act(params, jax.tree.map(lambda x, t=t: x[t, 1], steps), jnp.bool_(False), memory)

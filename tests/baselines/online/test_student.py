@@ -151,6 +151,6 @@ def test_memory_of_the_noise():
     policy = with_noise(idle(None), 3)
     memory = policy.init(policy.params, jax.random.key(0))
     for step in range(5):
-        action, memory = policy.act(policy.params, memory, None, jax.random.key(step))
+        action, memory = policy.act(policy.params, memory, jnp.zeros(0), jax.random.key(step))
         assert int(action) == STAY
     assert int(memory.steps) == 5 and memory.labels.tolist() == [STAY] * 3 and memory.labeller is None

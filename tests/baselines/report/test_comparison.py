@@ -1,0 +1,154 @@
+"""The page of results: what is stored, intervals, tables against hand-made numbers, and the committed page."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.commands.cli import cli
+from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.results import Result, write_result
+from baselines.report import comparison
+from baselines.report.comparison import (
+    FORGETS,
+    CellReturns,
+    StoredResults,
+    add_results,
+    cells_with_headroom,
+    gains_table,
+    layouts_above_paper,
+    normalised_interval,
+    read_stored,
+    render_page,
+    results_file,
+    rising_cells,
+    shown_agents,
+    summary_table,
+    write_stored,
+)
+from baselines.report.results import cell_of, published_cells, published_test_tasks
+from icrl4aht_data.benchmark.reference_returns import read_headroom
+from icrl4aht_data.errors import OptionError
+from tests.helpers.paths import ROOT
+
+
+def cell(mean: float, gain: float = 0.0) -> CellReturns:
+    values = np.full(15, mean)
+    return CellReturns(values, values - gain / 2, values + gain / 2)
+
+
+def everywhere(share: float, gain: float = 0.0) -> dict:
+    """Returns of an agent that has the same share of the headroom in every cell."""
+    egos = read_headroom("seeded")
+    return {
+        one: cell(egos[one]["stay"] + share * (egos[one]["oracle"] - egos[one]["stay"]), gain)
+        for one in cells_with_headroom("seeded")
+    }
+
+
+class TestNumbers:
+    def test_there_are_20_cells_with_headroom(self):
+        found = cells_with_headroom("seeded")
+        assert len(found) == 20 and ("coord_ring", "H2") in found and ("demo_simple", "H2") not in found
+
+    @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+    def test_normalised_return(self, share):
+        mean, low, high, count = normalised_interval(everywhere(share), "seeded")
+        assert (mean, low, high, count) == (pytest.approx(share), pytest.approx(share), pytest.approx(share), 20)
+
+    def test_the_interval_shrinks_with_the_spread(self):
+        wide = {
+            one: CellReturns(*[found.mean + 5 * np.linspace(-1, 1, 15)] * 3) for one, found in everywhere(0.5).items()
+        }
+        mean, low, high, _ = normalised_interval(wide, "seeded")
+        assert low < mean - 0.01 and high > mean + 0.01 and mean == pytest.approx(0.5)
+
+    def test_rising_cells(self):
+        cells = everywhere(0.5, gain=2.0)
+        cells["demo_wide", "H4"] = cell(20.0, gain=-1.0)
+        noisy = cell(20.0)
+        cells["demo_wide", "H3"] = noisy._replace(last=noisy.first + 20 * np.linspace(-1, 1.01, 15))
+        found = rising_cells(cells, "seeded")
+        assert len(found) == 18 and ("demo_wide", "H4") not in found and ("demo_wide", "H3") not in found
+
+    def test_layouts_above_the_paper(self):
+        best = {name: max(published_cells(agent)[name]["Average"][0] for agent in ("AD", "DPT"))
+                for name in ("demo_wide", "test_wide")}  # fmt: skip
+        cells = {(name, family): cell(best[name] + 1) for name in best for family in ("H1", "H2", "H3", "H4")}
+        assert layouts_above_paper(cells) == ["test_wide", "demo_wide"]
+        cells["demo_wide", "H1"] = cell(best["demo_wide"] - 4)
+        assert layouts_above_paper(cells) == ["test_wide"]
+        del cells["test_wide", "H2"]
+        assert layouts_above_paper(cells) == []
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Results of an agent in one cell: episode returns 0..99 plus the seed, in every task."""
+    protocol = get_protocol("seeded")
+    settings = {"agent": "ramp", "seeds": [0, 1], "protocol": asdict(protocol), "code_version": "0"}
+    settings |= {"details": {"trained_on": [{"layout": "demo_wide", "family": "H4"}]}}
+    for task in published_test_tasks().values():
+        if cell_of(task) == ("demo_wide", "H4"):
+            returns = [[float(seed + number) for number in range(100)] for seed in range(2)]
+            write_result(tmp_path / "ramp", Result(task.task_id, settings, returns))
+    return tmp_path / "ramp"
+
+
+class TestStoring:
+    def test_from_results_to_a_file_and_back(self, results, tmp_path):
+        stored = add_results(StoredResults({}, {}), results, "a ramp")
+        found = stored.cells["ramp", "seeded"]["demo_wide", "H4"]
+        assert found.mean.tolist() == [49.5, 50.5] * 5
+        assert found.first.tolist() == [9.5, 10.5] * 5 and found.last.tolist() == [89.5, 90.5] * 5
+        assert found.overlaps == ("family",)
+        write_stored(tmp_path / "results.json", stored)
+        again = read_stored(tmp_path / "results.json")
+        assert again.about == {"ramp": "a ramp"} and shown_agents(again) == ["ramp"]
+        for one, two in zip(found, again.cells["ramp", "seeded"]["demo_wide", "H4"], strict=True):
+            np.testing.assert_array_equal(one, two)
+        assert "9.5 to 89.5" not in gains_table(again, "seeded", ["ramp"])
+        assert "10.0 to 90.0, +80.0 (+80.0, +80.0)" in gains_table(again, "seeded", ["ramp"])
+
+    def test_no_file_and_damaged_files(self, tmp_path):
+        assert read_stored(tmp_path / "none.json").cells == {}
+        for content in ("{", "[]", '{"agents": {"a": {"seeded": {"demo_wide": {"H4": {}}}}}, "about": {}}'):
+            (tmp_path / "bad.json").write_text(content)
+            with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore the file"):
+                read_stored(tmp_path / "bad.json")
+
+    def test_short_evaluations_have_no_ends(self, results):
+        for path in (results / "tasks").iterdir():
+            content = json.loads(path.read_text())
+            content["returns"] = [row[:30] for row in content["returns"]]
+            path.write_text(json.dumps(content))
+        with pytest.raises(OptionError, match="30 episodes, expected at least 40; evaluate more"):
+            add_results(StoredResults({}, {}), results, "")
+
+    def test_the_command(self, results, tmp_path, monkeypatch):
+        target = tmp_path / "stored.json"
+        monkeypatch.setattr(comparison, "results_file", lambda: target)
+        arguments = ["results", str(results), "--about", "a ramp", "--out", str(tmp_path / "page"), "--store"]
+        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        page = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
+        assert "* `ramp`: a ramp" in page and "| `ramp` | 1.1" in page
+        assert (tmp_path / "page" / "results.png").stat().st_size > 10_000
+        assert read_stored(target).about == {"ramp": "a ramp"}
+
+
+def test_the_committed_page_is_that_of_the_stored_results():
+    stored = read_stored(results_file())
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    assert page == render_page(stored, shown_agents(stored))
+
+
+def test_agents_that_forget_are_in_the_table_of_gains_alone():
+    stored = StoredResults({("a", "seeded"): everywhere(0.5), (f"a{FORGETS}", "seeded"): everywhere(0.1)}, {})
+    page = render_page(stored, shown_agents(stored))
+    assert page.count(f"`a{FORGETS}`") == 2
+    assert "0.50 (0.50 to 0.50)" in summary_table(stored, "seeded")

@@ -1,0 +1,89 @@
+"""Reference models: their recipes, the steps that lead to them, and resuming."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from baselines import reference
+from baselines.commands.cli import cli
+from baselines.methods.options import ModelOptions
+from baselines.methods.registry import get_method
+from baselines.reference import HISTORIES, PROTOCOL_SEEDS, RECIPES, TRACK_VIEWS, make_reference
+from baselines.training.histories import read_trained
+from baselines.training.options import HistoryOptions, TrainOptions
+from generation.profiles.noise_config import NoiseConfig
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.errors import UnknownNameError
+
+TINY = {"steps": 2, "batch_size": 2, "context": 20}
+MODEL = {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp", "teammate_actions": True}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipes_are_valid_settings(name):
+    recipe = RECIPES[name]
+    get_method(recipe.method)
+    ModelOptions(**recipe.model)
+    TrainOptions(**recipe.train)
+    for track, view in TRACK_VIEWS.items():
+        HistoryOptions(TRACKS[track]["train"], **recipe.histories, **view)
+
+
+def test_every_history_has_episodes_without_noise():
+    assert HISTORIES.end == (0.0, 0.0) and HISTORIES.finish[1] < 1
+    assert PROTOCOL_SEEDS["seeded"] == 3
+
+
+def test_unknown_names(tmp_path):
+    with pytest.raises(UnknownNameError, match=r"unknown reference model 'ad-nois'.*Did you mean 'ad-noise'"):
+        make_reference("ad-nois", "teammate", tmp_path, print)
+    with pytest.raises(UnknownNameError, match="unknown track 'x'; valid: teammate, layout"):
+        make_reference("ad-noise", "x", tmp_path, print)
+    result = CliRunner().invoke(cli, ["reference", "--name", "ad-nois"])
+    assert result.exit_code == 2 and "ad-noise" in result.output
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path) -> Path:
+    """Recipes that take seconds, and the bundled release in place of the rebuilt one."""
+    for name, recipe in RECIPES.items():
+        sizes: dict[str, Any] = TINY if recipe.data != "tasks" else {"steps": 1, "batch_size": 8}
+        model = MODEL if recipe.data != "tasks" else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
+        monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
+    monkeypatch.setattr(reference, "HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
+    monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
+    (tmp_path / "noise").mkdir()
+    (tmp_path / "noise" / "lite").symlink_to(MINI)
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("compiled_quickly")
+def test_a_model_of_histories_of_rl2_and_of_its_own(small):
+    found = make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
+    assert found.run == small / "ad-student-layout" and found.results == {}
+    made = {path.name for path in small.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    assert made == {
+        "noise",
+        "rl2-layout",
+        "histories-layout",
+        "ad-student-layout-first",
+        "ad-student-layout-own",
+        "ad-student-layout-mixed",
+        "ad-student-layout",
+    }
+    trained = read_trained(found.run)
+    assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
+    assert {cell["source"] for cell in trained.trained_on} == {"student"}
+    own, mixed = (load_icrl4aht(small / f"ad-student-layout-{name}") for name in ("own", "mixed"))
+    assert len(mixed) == len(own) + len(load_icrl4aht(small / "histories-layout"))
+    times = {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")}
+    make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
+    assert {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")} == times
