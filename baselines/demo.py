@@ -63,6 +63,7 @@ class DemoSettings:
         sources: sources of the histories to train on; all if empty.
         labels: actions to learn: the labels of this kind, or None for those that were taken.
         tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
+        reference: bundled model to compare with; None for none.
         protocol, seeds: of the evaluation.
     """
 
@@ -72,6 +73,7 @@ class DemoSettings:
     sources: tuple[str, ...] = ("noise",)
     labels: Labels | None = "oracle"
     tasks: tuple[Task, ...] | None = None
+    reference: str | None = "ad-reference"
     protocol: Protocol = _PROTOCOL
     seeds: Sequence[int] = range(10)
 
@@ -121,7 +123,8 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
 
     tasks = _demo_tasks() if settings.tasks is None else settings.tasks
-    say(5, f"evaluating it and {', '.join(AGENTS)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
+    others = [*AGENTS, *([settings.reference] if settings.reference else [])]
+    say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
     compared = _evaluate_all(out, tasks, settings)
     write(lead_table(compared.families, compared.agent))
 
@@ -178,7 +181,8 @@ def _evaluate_all(out: Path, tasks: Sequence[Task], settings: DemoSettings) -> _
     protocol, seeds = settings.protocol, settings.seeds
     results: dict[str, list[Result]] = {}
     runs = []
-    for name in (*AGENTS, str(out / "ad")):
+    references = [settings.reference] if settings.reference else []
+    for name in (*AGENTS, *references, str(out / "ad")):
         agent = find_agent(name)
         folder = out / "results" / agent.name
         with bars(edges=True, unit="episodes") as show:
@@ -192,7 +196,7 @@ def _evaluate_all(out: Path, tasks: Sequence[Task], settings: DemoSettings) -> _
                 details=agent.details,
                 played=counted(show, agent.name, len(tasks) * len(seeds) * protocol.episodes),
             )
-        note_results(folder, Path(name) if agent.details else None, tasks)
+        note_results(folder, agent.run, tasks)
         runs.append(read_run(folder))
     return _Compared(runs[-1].agent, runs, family_returns(tasks, results))
 

@@ -15,23 +15,26 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from baselines.agents.bundled import MODEL_CARD, MODELS
 from baselines.agents.egos import AS_PUBLISHED, PlayMode, find_agent
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import get_protocol
 from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from baselines.online.prepare import prepare_play
 from baselines.online.student import collect_release, release_teammates
-from baselines.report.results import note_results, shipped_validation_tasks
+from baselines.report.comparison import FORGETS, cells_with_headroom
+from baselines.report.model_card import model_card
+from baselines.report.results import merge, note_results, read_run, shipped_validation_tasks
 from baselines.training.histories import prepare, read_trained
 from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.trainer import format_loss, train
 from generation.profiles.noise_config import NoiseConfig
-from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import MINI, load_icrl4aht
@@ -58,6 +61,8 @@ class Recipe:
         histories: values of `HistoryOptions`.
         rounds: number of further trainings, each with histories that the model plays and RL^2 labels.
         mode: way in which the model plays.
+        protocols: protocol of the evaluation on test tasks -> number of seeds.
+        forgets: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
     """
 
     method: str
@@ -67,6 +72,8 @@ class Recipe:
     histories: dict[str, Any] = field(default_factory=dict)
     rounds: int = 0
     mode: PlayMode = AS_PUBLISHED
+    protocols: Mapping[str, int] = field(default_factory=lambda: {"seeded": 3, "published": 1})
+    forgets: bool = False
 
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
@@ -74,7 +81,7 @@ _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "lear
 _TEACHER: dict[str, Any] = {**RL2_SETTINGS["train"], "steps": 1400}
 
 RECIPES = {
-    "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER),
+    "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER, mode=PlayMode(greedy=False)),
     "ad-noise": Recipe("ad", "noise", _TINY, _STEPS, {"labels": "oracle"}),
     "dpt-noise": Recipe("dpt", "noise", _TINY, _STEPS, {"labels": "oracle"}),
     "ad-ppo": Recipe("ad", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
@@ -83,7 +90,9 @@ RECIPES = {
     "dpt-both": Recipe("dpt", "both", _TINY, _STEPS, {"labels": "oracle"}),
     "ad-student": Recipe("ad", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
     "dpt-student": Recipe("dpt", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
-    "ad-rising": Recipe("ad", "student", _TINY, _STEPS | {"context": 500, "batch_size": 8}, {"every": 4}),
+    "ad-rising": Recipe(
+        "ad", "student", _TINY, _STEPS, {"every": 3}, mode=PlayMode(greedy=False), protocols={"seeded": 3}, forgets=True
+    ),
 }
 """Reference models by name."""
 
@@ -104,9 +113,6 @@ OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 OWN_SHARE = 0.5
 """Learning rate of a training on own histories, as a share of the first training's."""
 
-PROTOCOL_SEEDS = {"seeded": 3, "published": 1}
-"""Protocol of the evaluation on test tasks -> number of seeds."""
-
 
 class ReferenceOutcome(NamedTuple):
     """Outcome of one reference model on one track.
@@ -122,6 +128,20 @@ class ReferenceOutcome(NamedTuple):
     track: str
     run: Path
     results: dict[str, Path]
+
+
+def write_bundled_card(name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS) -> Path:
+    """Write the card of a bundled model, with its results on test tasks. Returns its path.
+
+    Args:
+        name: of the bundled model.
+        outcomes: of its tracks, evaluated.
+        folder: of the bundled models.
+    """
+    (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
+    path = folder / name / MODEL_CARD
+    path.write_text(model_card(run), encoding="utf-8")
+    return path
 
 
 Show = Callable[..., None]
@@ -252,15 +272,16 @@ class _Making:
 
     def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
         """Returns the folders of a model's results, by the kind of tasks."""
-        agent, found = find_agent(str(run), recipe.mode), {}
-        kinds = [("validation", "seeded", 1), *((f"test-{p}", p, seeds) for p, seeds in PROTOCOL_SEEDS.items())]
-        for kind, protocol, seeds in kinds:
+        found = {}
+        kinds = [("validation", "seeded", 1, False)]
+        kinds += [(f"test-{protocol}", protocol, seeds, False) for protocol, seeds in recipe.protocols.items()]
+        kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
+        for kind, protocol, seeds, forgets in kinds:
             tasks, folder = self._tasks(kind), self.out / "results" / f"{name}-{self.track}" / kind
-            if not tasks:
-                continue
+            agent = find_agent(str(run), recipe.mode._replace(forget=forgets))
             played = get_protocol(protocol)
             evaluate(
-                name,
+                name + FORGETS * forgets,
                 agent.make,
                 tasks,
                 played,
@@ -276,8 +297,8 @@ class _Making:
     def _tasks(self, kind: str) -> list[Task]:
         if kind == "validation":
             return [task for task in shipped_validation_tasks().values() if task.layout.name in self.layouts]
-        tested = {TESTED_ON[layout] for layout in self.layouts}
-        return [task for task in read_tasks(manifest_path(self.track, "test")) if task.layout.name in tested]
+        headroom = {layout for layout, _ in cells_with_headroom("seeded")}
+        return [task for task in read_tasks(manifest_path(self.track, "test")) if task.layout.name in headroom]
 
     def _progress(self, what: str, steps: int) -> Callable[[int, float | None], None]:
         return lambda step, loss: self.show(what, step, steps, format_loss(loss))

@@ -376,13 +376,14 @@ def train_command(
     Ctrl-C does not wait for it.
     """
     join_processes(coordinator, processes, process)
+    from baselines.methods.registry import PLAYING
     from baselines.training.histories import read_trained
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
     choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
     choice = replace_given(choice, histories)
-    folder, plays = out or Path("runs") / method, method == "rl2"
+    folder, plays = out or Path("runs") / method, method in PLAYING
     if plays:
         job, options, description = prepare_rl2(size, model, train, play, choice)
     else:
@@ -558,9 +559,11 @@ def _run_experiment(
 @click.option("--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model; repeat for several.")
 @click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of this track.")
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
-@click.option("--bundle", is_flag=True, help="Also replace the package's model of this name.")
+@click.option("--bundle", metavar="NAME", help="Also put it into the package, under this name; see `models`.")
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
-def reference_command(names: tuple[str, ...], track: tuple[str, ...], evaluates: bool, bundle: bool, out: Path) -> None:
+def reference_command(
+    names: tuple[str, ...], track: tuple[str, ...], evaluates: bool, bundle: str | None, out: Path
+) -> None:
     """Make reference models, with everything that they need.
 
     Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
@@ -569,16 +572,22 @@ def reference_command(names: tuple[str, ...], track: tuple[str, ...], evaluates:
     of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
     """
     from baselines.agents.bundled import bundle_run
-    from baselines.reference import make_reference
+    from baselines.reference import make_reference, write_bundled_card
 
+    if bundle and (len(names) > 1 or not evaluates):
+        raise click.UsageError("--bundle: expected one --name, and not --no-evaluate: its card states its results")
+    outcomes = []
     with bars(edges=True) as show:
         for name, of_track in product(names, track):
-            found = make_reference(name, of_track, out, show, evaluates)
-            _console.print(f"{name}, {of_track}: {found.run}", highlight=False)
-            for kind, folder in found.results.items():
-                _console.print(f"  {kind}: {folder}", highlight=False)
-            if bundle:
-                _console.print(f"  bundled: {bundle_run(found.run, name, of_track)}", highlight=False)
+            outcomes.append(make_reference(name, of_track, out, show, evaluates))
+    for found in outcomes:
+        _console.print(f"{found.name}, {found.track}: {found.run}", highlight=False)
+        for kind, folder in found.results.items():
+            _console.print(f"  {kind}: {folder}", highlight=False)
+    if bundle:
+        for found in outcomes:
+            _console.print(f"bundled: {bundle_run(found.run, bundle, found.track)}", highlight=False)
+        _console.print(f"card: {write_bundled_card(bundle, outcomes)}", highlight=False)
 
 
 @cli.command(

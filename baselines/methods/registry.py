@@ -30,6 +30,10 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
 """Methods: name -> function from (ModelOptions, World) to the method."""
 
 
+PLAYING = ("rl2",)
+"""Methods that are trained by playing."""
+
+
 def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     """Returns the function that makes a method from (ModelOptions, World).
 

@@ -71,10 +71,13 @@ def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
     trained = _trained(sources)
     histories = trained["config"]["histories"]
     instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
-    selection = (
-        f"{histories['sizes']['train']} of {', '.join(histories['layouts'])}; the release's manifest has SHA-256 "
-        f"`{trained['manifest_sha256']}`"
-    )
+    layouts = ", ".join(histories["layouts"])
+    if "groups" in histories:  # trained by playing
+        played = sum(histories["groups"].values())
+        selection = f"none: {played} tasks at a time, played with the teammates of the release's histories of {layouts}"
+    else:
+        selection = f"{histories['sizes']['train']} of {layouts}"
+    selection += f"; the release's manifest has SHA-256 `{trained['manifest_sha256']}`"
     values = [
         _layouts(sources),
         selection,

@@ -14,7 +14,7 @@ import numpy as np
 
 from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
-from baselines.methods.registry import get_method, overcooked_world
+from baselines.methods.registry import PLAYING, get_method, overcooked_world
 from baselines.methods.tokens import BatchView, plain_view
 from baselines.methods.view_change import changed_view, mirrored_action
 from baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
@@ -75,6 +75,8 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             differ in number, or if labels are asked for and the method uses none.
         LabelsMissingError: for histories without the labels.
     """
+    if name in PLAYING:
+        raise OptionError(f"{name} learns by playing, not from histories: `python -m baselines train {name}` trains it")
     dataset, validation = _load(histories)
     split = hold_out(dataset, histories.held_out, validation=validation)
     hidden = [get_layout(one).name for one in histories.hide_recipe]

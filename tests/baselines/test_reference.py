@@ -13,7 +13,7 @@ from baselines import reference
 from baselines.commands.cli import cli
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method
-from baselines.reference import HISTORIES, PROTOCOL_SEEDS, RECIPES, TRACK_VIEWS, make_reference
+from baselines.reference import HISTORIES, RECIPES, TRACK_VIEWS, make_reference
 from baselines.training.histories import read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
 from generation.profiles.noise_config import NoiseConfig
@@ -38,7 +38,7 @@ def test_recipes_are_valid_settings(name):
 
 def test_every_history_has_episodes_without_noise():
     assert HISTORIES.end == (0.0, 0.0) and HISTORIES.finish[1] < 1
-    assert PROTOCOL_SEEDS["seeded"] == 3
+    assert all(recipe.protocols["seeded"] == 3 for recipe in RECIPES.values())
 
 
 def test_unknown_names(tmp_path):

@@ -209,8 +209,8 @@ def test_wrong_imports_are_found(tmp_path):
         "generation/new.py": "from . import env",
         "generation/learners/a.py": "from generation.learners import b",
         "generation/learners/b.py": "def f():\n    from generation.learners.a import x",
-        "generation/profiles.py": "import generation.new, os",
-        "baselines/demo.py": "import numpy\nif TYPE_CHECKING:\n    import generation.profiles",
+        "generation/releases.py": "import generation.new, os",
+        "baselines/demo.py": "import numpy\nif TYPE_CHECKING:\n    import generation.releases",
         "benchmarks/bench.py": "import tests.conftest",
         "tests/conftest.py": "",
     }
@@ -223,12 +223,12 @@ def test_wrong_imports_are_found(tmp_path):
         downwards: [
             "benchmarks.bench imports tests.conftest: benchmarks comes before tests",
             "generation.env imports baselines.demo: generation comes before baselines",
-            "generation.profiles imports generation.new: new is not in the order of generation",
+            "generation.releases imports generation.new: new is not in the order of generation",
             "icrl4aht_data.reading.shard imports icrl4aht_data.dataset: reading comes before dataset in icrl4aht_data",
         ],
         acyclic: [cycle],
         at_the_top: [
-            f"baselines.demo imports generation.profiles under TYPE_CHECKING: {no_reason}",
+            f"baselines.demo imports generation.releases under TYPE_CHECKING: {no_reason}",
             f"generation.cli imports generation.env in a function: {no_reason}",
             f"generation.learners.b imports generation.learners.a in a function: {no_reason}",
         ],
@@ -236,7 +236,7 @@ def test_wrong_imports_are_found(tmp_path):
             "icrl4aht_data.interop imports flax in a function: the reader works without JAX",
             "icrl4aht_data.sampling.batches imports jax.numpy: the reader works without JAX",
         ],
-        narrow_use_of_generation: [f"baselines.demo imports generation.profiles under TYPE_CHECKING: {allowed}"],
+        narrow_use_of_generation: [f"baselines.demo imports generation.releases under TYPE_CHECKING: {allowed}"],
     }
 
 

@@ -49,7 +49,7 @@ MISUSED = """
 reader: lst | No such command 'lst'. Did you mean 'list'?
 reader: list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 reader: list --split tran | unknown split 'tran'; valid: train, validation, test, heldout. Did you mean 'train'?
-reader: list --source nois | unknown source 'nois'; valid: ppo, noise. Did you mean 'noise'?
+reader: list --source nois | unknown source 'nois'; valid: ppo, noise, student. Did you mean 'noise'?
 reader: verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 reader: verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid:
 reader: verify --deeep | No such option
@@ -76,7 +76,7 @@ generation: generate --out g --workers 2 | --address and --workers need --execut
 generation: plan --devices 0 | 0 is not in the range x>=1
 generation: speed --layout x | unknown layout 'x'; valid: coord_simple,
 generation: teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
-baselines: train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline.
+baselines: train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
 baselines: train ad --layout demo_wide --size smal | unknown size 'smal'; valid: tiny, small, medium, large.
 baselines: train ad --layout demo_wide --order rnd | 'rnd' is not one of 'contiguous', 'random'.
 baselines: train dpt --layout demo_wide --labels orcale | 'orcale' is not one of 'expert', 'oracle'.
@@ -85,6 +85,14 @@ baselines: train ad --layout demo_wide --learning-rate nan | nan is not a finite
 baselines: train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 baselines: train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
 baselines: train ad --layout demo_wide --coordinator a:1 --process 2 | --process 2: expected a number below 1
+baselines: train rl2 --layout demo_wide --context 5 | --context: not with rl2, which learns by playing
+baselines: train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
+baselines: collect --agent none --out c | A trained model is named by its folder
+baselines: collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
+baselines: collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<=x<=1
+baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, ad-noise,
+baselines: reference --name rl2 --no-evaluate --bundle x | its card states its results
+baselines: results empty | Missing option '--out'
 baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle. Did you mean
 baselines: evaluate --agent none --out e | A trained model is named by its folder
 baselines: evaluate --agent empty --out e | empty: no run: config.json is missing
@@ -120,6 +128,12 @@ generation: check none empty | none: no such folder
 generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 baselines: train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
+baselines: train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
+baselines: train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
+baselines: tracks --method rl2 --layout demo_wide | rl2 learns by playing, not from histories: `python -m baselines
+baselines: collect --agent stay --source student --out c | source = student: none of Dataset(
+baselines: collect --agent stay --out file | 'file' is a file
+baselines: results empty --out r | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
 baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here
