@@ -84,10 +84,12 @@ def find_lead(of_family: FamilyReturns, agent: str) -> Lead:
 def lead_table(families: Sequence[FamilyReturns], agent: str) -> str:
     """Returns text with a line per family: mean returns of all agents, and the lead of one of them."""
     names = list(families[0].returns)
-    lines = ["family" + "".join(f"{name:>9}" for name in names) + f"   {agent} - better of {' and '.join(FLOOR)}"]
+    wide = {name: max(9, len(name) + 2) for name in names}
+    head = "".join(f"{name:>{wide[name]}}" for name in names)
+    lines = [f"family{head}   {agent} - better of {' and '.join(FLOOR)}"]
     for of_family in families:
         lead = find_lead(of_family, agent)
-        means = "".join(f"{of_family.mean(name):>9.1f}" for name in names)
+        means = "".join(f"{of_family.mean(name):>{wide[name]}.1f}" for name in names)
         lines.append(
             f"{of_family.family:6}{means}   {lead.mean:+.1f} (95 % interval {lead.low:+.1f} to {lead.high:+.1f})"
         )

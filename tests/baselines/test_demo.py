@@ -31,6 +31,7 @@ SETTINGS = demo.DemoSettings(
     model=ModelOptions(layers=1, width=16, heads=2),
     training=TrainOptions(steps=2, batch_size=2, context=10),
     tasks=TASKS,
+    reference=None,
     protocol=get_protocol("seeded", 2),
     seeds=range(2),
 )
@@ -84,7 +85,7 @@ def test_every_step_is_taken(release, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_complete_demo(tmp_path):
-    text, page = run(tmp_path, replace(SETTINGS, sources=(), tasks=None))
+    text, page = run(tmp_path, replace(SETTINGS, sources=(), tasks=None, reference="ad-reference"))
     assert "transitions replayed" in text
     rows = {line.split()[0]: line.split() for line in text.splitlines() if "95 % interval" in line}
     assert len(rows) >= 2, "families of the validation tasks"
