@@ -21,16 +21,16 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from baselines.agents.bundled import MODEL_CARD, MODELS
-from baselines.agents.egos import AS_PUBLISHED, PlayMode, find_agent
+from baselines.agents.egos import AS_PUBLISHED, FORGETS, PlayMode, find_agent
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import get_protocol
 from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from baselines.online.prepare import prepare_play
 from baselines.online.student import collect_release, release_teammates
-from baselines.report.comparison import FORGETS, cells_with_headroom
+from baselines.report.comparison import cells_with_headroom
 from baselines.report.model_card import model_card
 from baselines.report.results import merge, note_results, read_run, shipped_validation_tasks
-from baselines.training.histories import prepare, read_trained
+from baselines.training.histories import prepare, read_trained, start_from
 from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.trainer import format_loss, train
 from generation.profiles.noise_config import NoiseConfig
@@ -105,7 +105,7 @@ than they are trained on, so they learn from mirrored games, too; asymm_right ha
 see, so that of asymm_both is hidden from them."""
 
 HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
-"""Histories of RL^2 with each teammate: half and more of a history is without noise."""
+"""Histories of RL^2 with each teammate: the last fifth of a history, or more, is without noise."""
 
 OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 """Histories that a model plays itself."""
@@ -160,7 +160,7 @@ def make_reference(name: str, track: str, out: Path, show: Show, evaluates: bool
 
     Raises:
         UnknownNameError: for an unknown recipe or track.
-        OptionError: if a folder holds something of other settings.
+        OptionError: if a run folder holds a run of other settings. Releases that are there are used as they are.
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
     if name not in RECIPES:
@@ -240,7 +240,7 @@ class _Making:
         return folder
 
     def _train_on_own(self, recipe: Recipe, root: Path, before: Path, target: Path, number: int) -> None:
-        """Train a model further, half of the time on histories that it plays itself and RL^2 labels."""
+        """Train a model further, on histories that it plays itself and RL^2 labels besides those of RL^2."""
         own, mixed = (target.with_name(f"{target.name}-{kind}") for kind in ("own", "mixed"))
         if not mixed.is_dir():
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
@@ -266,7 +266,7 @@ class _Making:
         params = None
         if before is not None:
             trained = read_trained(before)
-            params, job.about["init"] = trained.params, trained.hash
+            params = start_from(trained, job.about)
         done = self._progress(folder.name, options.steps)
         train(job.method, job.data, job.options, folder, job.about, params=params, done=done)
 

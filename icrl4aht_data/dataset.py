@@ -62,8 +62,8 @@ def load_icrl4aht(
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
         algorithm: the same as `teammate_kind`: the algorithm that trained the teammate, such as "fcp" or "comedi".
-        source: how the histories were made: "ppo" (an ego learned by PPO) or "noise" (the scripted oracle acted, and
-            random actions replaced its own ever less often); see docs/format.md.
+        source: how the histories were made: "ppo" (an ego learned by PPO), "noise" (the scripted oracle acted, and
+            random actions replaced its own ever less often) or "student" (a trained agent played); see docs/format.md.
         task_id: id of a task; a task is a layout, a teammate and a seed.
         learner: number of the learner, from 0, where a task has several independent ones; or several numbers.
         min_expert_return: only histories whose expert actions come from a policy that earned at least this much per

@@ -6,6 +6,7 @@ A bundled run has its settings, its card and its last parameters, without the op
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +14,11 @@ from typing import NamedTuple
 import jax
 
 from baselines.training.histories import read_trained
-from baselines.training.run_folder import CHECKPOINTS, CONFIG
+from baselines.training.run_folder import CHECKPOINTS, CONFIG, read_config
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.remote.remote_release import is_address
 
 MODELS = Path(__file__).parents[1] / "models"
 """Folder of the bundled models."""
@@ -80,9 +82,14 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
     """Copy a finished run into the bundled models, with its parameters alone; one that is there is replaced.
 
     Raises:
-        OptionError: if the run has no checkpoint, or its parameters are too large.
+        OptionError: if the name is not of small letters, digits and hyphens, or if the run is not finished or its
+            parameters are too large.
     """
-    trained = read_trained(run)
+    if not re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)+", name):
+        raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
+    trained, steps = read_trained(run), read_config(run)["train"]["steps"]
+    if trained.step < steps:
+        raise OptionError(f"{run}: at step {trained.step} of {steps}: continue the training with the same command")
     size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
     if size > _LARGEST:
         raise OptionError(f"{run}: parameters of {size:,} bytes, expected at most {_LARGEST:,}: bundle a smaller model")
@@ -90,7 +97,8 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     config = json.loads((run / CONFIG).read_text(encoding="utf-8"))
-    config["histories"]["root"] = Path(config["histories"]["root"]).name  # a path of the machine that trained it
+    if not is_address(config["histories"]["root"]):  # a path of the machine that trained it
+        config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
     return target

@@ -32,6 +32,10 @@ rest is computed again, so that it has between 4/5 K and K steps. The context of
 it is computed once for each episode and is that of `exact`."""
 
 
+FORGETS = " (forgets)"
+"""End of the name of an agent whose memory is cleared at the start of each episode."""
+
+
 class PlayMode(NamedTuple):
     """Way in which a trained model plays.
 
@@ -49,6 +53,11 @@ class PlayMode(NamedTuple):
     def from_details(cls, details: Mapping[str, Any]) -> PlayMode:
         """Returns the mode that the details of results state."""
         return cls(details.get("acting", "cached"), not details.get("sampled"), bool(details.get("forget")))
+
+    @property
+    def suffix(self) -> str:
+        """End of the name of an agent that plays in another way than the default one, which reports tell apart."""
+        return " (sampled)" * (not self.greedy) + FORGETS * self.forget
 
     @property
     def details(self) -> dict[str, Any]:
@@ -169,8 +178,11 @@ def find_agent(name: str, mode: PlayMode = AS_PUBLISHED) -> NamedEgo:
 
     Raises:
         UnknownNameError: if the name is none of these.
-        OptionError: if the run has another format or no checkpoint; from `make`, if the model does not fit the layout.
+        OptionError: if the run has another format or no checkpoint, or `mode` is no `PlayMode`; from `make`, if the
+            model does not fit the layout.
     """
+    if not isinstance(mode, PlayMode):
+        raise OptionError(f"mode = {mode!r}: expected a PlayMode, such as PlayMode(acting='exact')")
     if name in AGENTS:
         return NamedEgo(name, AGENTS[name])
     folder, bundled = Path(name), bundled_models()
@@ -180,7 +192,8 @@ def find_agent(name: str, mode: PlayMode = AS_PUBLISHED) -> NamedEgo:
         raise unknown("agent", name, [*AGENTS, *bundled])
     run = read_trained(folder)
     details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, **mode.details}
-    return NamedEgo(run.label, _maker(run, mode, folder), {**details, "trained_on": run.trained_on}, folder)
+    details["trained_on"] = run.trained_on
+    return NamedEgo(run.label + mode.suffix, _maker(run, mode, folder), details, folder)
 
 
 def _bundled_ego(model: BundledModel, mode: PlayMode) -> NamedEgo:
@@ -198,7 +211,7 @@ def _bundled_ego(model: BundledModel, mode: PlayMode) -> NamedEgo:
 
     details = {"model": model.name, "run": {track: run.hash for track, run in runs.items()}, **mode.details}
     cells = [cell for run in runs.values() for cell in run.trained_on]
-    return NamedEgo(model.name, make, {**details, "trained_on": cells})
+    return NamedEgo(model.name + mode.suffix, make, {**details, "trained_on": cells})
 
 
 def _maker(run: TrainedModel, mode: PlayMode, folder: Path) -> Callable[[Layout], Policy]:

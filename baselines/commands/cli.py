@@ -113,7 +113,12 @@ def cli() -> None:
         "python -m baselines evaluate --agent oracle --layout demo_wide --tasks 1 --episodes 5 --out runs/oracle",
     ),
 )
-@click.option("--agent", type=EGO_NAME, required=True, help="stay, random, oracle, or a folder that `train` made.")
+@click.option(
+    "--agent",
+    type=EGO_NAME,
+    required=True,
+    help="stay, random, oracle, a bundled model (see `models`), or a folder that `train` made.",
+)
 @acting_option
 @sampled_option
 @forget_option
@@ -377,13 +382,15 @@ def train_command(
     """
     join_processes(coordinator, processes, process)
     from baselines.methods.registry import PLAYING
-    from baselines.training.histories import read_trained
+    from baselines.training.histories import read_trained, start_from
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
     choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
     choice = replace_given(choice, histories)
     folder, plays = out or Path("runs") / method, method in PLAYING
+    if plays and processes > 1:
+        raise click.UsageError(f"--processes {processes}: {method} is trained by one process on one device")
     if plays:
         job, options, description = prepare_rl2(size, model, train, play, choice)
     else:
@@ -397,8 +404,7 @@ def train_command(
         watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
         watched |= {"trainer": job.trainer} if plays else {}
         if init is not None:
-            before = read_trained(init)
-            watched["params"], job.about["init"] = before.params, before.hash
+            watched["params"] = start_from(read_trained(init), job.about)
         run_training(job.method, job.data, options, folder, job.about, **watched)
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
@@ -413,7 +419,9 @@ def train_command(
         "python -m baselines collect --agent runs/ad --layout demo_wide --histories 2 --out build/student",
     ),
 )
-@click.option("--agent", type=EGO_NAME, required=True, help="A folder that `train` made, or a reference ego.")
+@click.option(
+    "--agent", type=EGO_NAME, required=True, help="A folder that `train` made, a bundled model, or a reference ego."
+)
 @sampled_option
 @root_option
 @click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
@@ -574,8 +582,8 @@ def reference_command(
     from baselines.agents.bundled import bundle_run
     from baselines.reference import make_reference, write_bundled_card
 
-    if bundle and (len(names) > 1 or not evaluates):
-        raise click.UsageError("--bundle: expected one --name, and not --no-evaluate: its card states its results")
+    if bundle and (len(names) > 1 or set(track) != set(TRACKS) or not evaluates):
+        raise click.UsageError("--bundle: expected one --name of all tracks, evaluated: its card states its results")
     outcomes = []
     with bars(edges=True) as show:
         for name, of_track in product(names, track):

@@ -253,6 +253,9 @@ def prepare_method(
     return job, options, f"{description}\n{training_summary(job.about['histories'])}"
 
 
+_RL2_MODEL = {"width", "recurrent_layers", "encoder", "teammate_actions", "reward_scale"}
+
+
 def prepare_rl2(
     size: str | None,
     model: Mapping[str, Any],
@@ -268,6 +271,7 @@ def prepare_rl2(
     from baselines.online.prepare import prepare_play
 
     unused = {"context", "accumulate", "weight_decay", "validate_every", "validation_batches"} & train.keys()
+    unused |= model.keys() - _RL2_MODEL
     if size or unused:
         raise click.UsageError(f"{_flags(unused or ['size'])}: not with rl2, which learns by playing")
     sized = ModelOptions(**RL2_SETTINGS["model"] | dict(model))

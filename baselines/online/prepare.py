@@ -6,10 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
-from baselines.online.rl2 import PlayTrainer, make_groups
+from baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_groups
 from baselines.training.histories import filter_histories, training_cells
 from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.trainer import TrainingData
@@ -23,8 +25,8 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.hashes import file_hash
 
-FEW = 0.3
-"""Share of the tasks on a layout where the ego matters with no teammate, where it matters with some: 1."""
+FLAT_SHARE = 0.3
+"""Number of tasks on a layout where the ego matters with no teammate, as a share of that on other layouts."""
 
 
 class PlayJob(NamedTuple):
@@ -65,7 +67,10 @@ def prepare_play(
     dataset = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    groups = make_groups(_teammates(dataset), options.batch_size, _shares(dataset), hidden)
+    teammates = _teammates(dataset)
+    policies = {key: list(found.values()) for key, found in teammates.items()}
+    groups = make_groups(policies, options.batch_size, _shares(dataset), hidden)
+    dataset = _played(dataset, teammates, groups)
     about = {
         "model": asdict(model),
         "play": asdict(play),
@@ -96,22 +101,33 @@ def _check_unused(name: str, histories: HistoryOptions) -> None:
         raise OptionError(f"channels = own: {name} takes canonical channels; leave it out")
 
 
-def _teammates(dataset: Dataset) -> dict[tuple[Layout, str], list[Policy]]:
-    """Returns the teammates of all tasks of a selection, by layout and family."""
-    found: dict[tuple[Layout, str], list[Policy]] = {}
+def _teammates(dataset: Dataset) -> dict[tuple[Layout, str], dict[str, Policy]]:
+    """Returns the teammates of all tasks of a selection: layout and family -> task id -> teammate."""
+    found: dict[tuple[Layout, str], dict[str, Policy]] = {}
     of_task = {str(task): int(number) for task, number in zip(dataset.column("task_id"), dataset.ids, strict=True)}
-    for history_id in of_task.values():
+    for task_id, history_id in of_task.items():
         entry = dataset.index.entry(history_id)
         key = get_layout(entry.layout), entry.teammate_kind
-        found.setdefault(key, []).append(recover_teammate(dataset, history_id))
+        found.setdefault(key, {})[task_id] = recover_teammate(dataset, history_id)
     return found
+
+
+def _played(
+    dataset: Dataset, teammates: dict[tuple[Layout, str], dict[str, Policy]], groups: list[TaskGroup]
+) -> Dataset:
+    """Returns the histories of the tasks whose teammates are played with; with few tasks not all are."""
+    played = set()
+    for group in groups:
+        names = list(teammates[group.layout, group.family])
+        played |= {names[number] for number in chosen_teammates(len(names), len(group.teammates))}
+    return dataset.select(np.isin(dataset.column("task_id"), sorted(played)))
 
 
 def _shares(dataset: Dataset) -> dict[str, float]:
     """Returns the share of the tasks on each layout of a selection, in units of those on layouts with headroom."""
     path = Path(dataset.root) / PROVENANCE
     provenance = read_provenance(path) if path.is_file() else {}
-    shares = dict.fromkeys((layout.name for layout in dataset.layouts), FEW if provenance else 1.0)
+    shares = dict.fromkeys((layout.name for layout in dataset.layouts), FLAT_SHARE if provenance else 1.0)
     for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
         made = provenance.get(str(task_id))
         if made is not None and (made.references is None or made.references.matters):

@@ -1,8 +1,8 @@
 """Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with the teammates of a release.
 
-A step plays one episode of every task, then learns from all of them. A task goes on after an episode, with the same
-teammate and the model's recurrent state, or ends by chance; its next episode is then the first of another task. Rewards
-of later episodes count, so that finding out something pays.
+A step plays one episode of every task, then learns from all of them. After an episode a task continues with the model's
+recurrent state, or ends by chance; a new task with the same teammate then begins. Returns include the rewards of later
+episodes, so the model is rewarded for exploration that helps later.
 
 Learning starts from imitation: the loss contains the cross-entropy of the scripted oracle's actions in the states that
 the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
@@ -37,13 +37,14 @@ from generation.learners.config import PPOConfig
 from generation.learners.ppo import PPO, Sequences, ppo_optimizer
 from generation.policy import Policy
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.channels import to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
 REWARD_SCALE = 0.05
-"""Unit of the values: a delivery, which earns 20 points."""
+"""Factor of rewards in returns and values; a delivery, which earns 20 points, becomes 1."""
 
 
 class PlayerMemory(NamedTuple):
@@ -52,10 +53,12 @@ class PlayerMemory(NamedTuple):
     Attributes:
         change: changes of its view, see `ViewChange`.
         state: float32 (S,), its recurrent state.
+        started: bool (), whether a step of the task was played; before it the outcome of the previous step is zero.
     """
 
     change: ViewChange
     state: Float[Array, " S"]
+    started: Bool[Array, ""]
 
 
 class PlayState(NamedTuple):
@@ -105,9 +108,9 @@ def make_groups(
     """Divides tasks among layouts by their shares, and equally among the families of each layout.
 
     Args:
-        teammates: layout and family -> training teammates, which take turns.
+        teammates: layout and family -> training teammates; see `chosen_teammates` for those of each task.
         tasks: number of all tasks; the result has a few fewer or more, at least one in each group.
-        shares: name of a layout -> its share.
+        shares: name of each of these layouts -> its share.
         hidden: names of layouts whose recipe indicators the model does not see.
     """
     families: dict[str, int] = defaultdict(int)
@@ -117,11 +120,19 @@ def make_groups(
     groups = []
     for (layout, family), policies in teammates.items():
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
-        # Another order than that of the manners, so that every teammate has several of them.
-        order = np.random.default_rng(0).permutation(np.arange(max(count, len(policies))) % len(policies))[:count]
-        chosen = with_manners([policies[number] for number in order], mixed_chances(count))
-        groups.append(TaskGroup(layout, family, chosen, layout.name in hidden))
+        chosen = [policies[number] for number in chosen_teammates(len(policies), count)]
+        groups.append(TaskGroup(layout, family, with_manners(chosen, mixed_chances(count)), layout.name in hidden))
     return groups
+
+
+def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:
+    """Returns the number of the teammate of each task of a group, int (tasks,).
+
+    Every teammate has as many tasks as the others, or one more. If there are fewer tasks than teammates, some teammates
+    have none. The order is random, because the manners of teammates follow the order of the tasks.
+    """
+    numbers = np.arange(max(tasks, teammates)) % teammates
+    return np.random.default_rng(0).permutation(numbers)[:tasks]
 
 
 class _Network(NamedTuple):
@@ -168,7 +179,7 @@ class _GroupPlayer:
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
         sequences = self._sequences(params, state, after, played, ended)
         begun = _select(ended, self._draw_change(change_key), after.ego.change)
-        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state))
+        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended)
         before = _select(ended, no_outcome(self.tasks), after.before)
         return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
 
@@ -185,7 +196,11 @@ class _GroupPlayer:
             prev_reward=jnp.concatenate([state.before.prev_reward[None], reward]),
             prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),
         )
-        seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps) if self._changes else steps
+        if self._changes:
+            started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
+            seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps, started)
+        else:
+            seen = steps
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
         own = change.at_each_step(len(record), 0)
         action = own.actions(taken)
@@ -206,13 +221,23 @@ class _GroupPlayer:
         )
 
 
-def seen_steps(change: ViewChange, steps: StepInput) -> StepInput:
-    """Returns steps as an ego sees them whose view is changed."""
+def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
+    """Returns steps as an ego sees them whose view is changed.
+
+    Args:
+        change: the changes (*B,).
+        steps: the steps (*B, ..).
+        started: whether a step precedes in the task; otherwise the previous actions are zeros that mean nothing.
+    """
+
+    def seen(actions: Array) -> Array:
+        return jnp.where(started, change.actions(actions), actions)
+
     mate = steps.prev_teammate_action
     return steps._replace(
         obs=change.observations(steps.obs),
-        prev_action=change.actions(steps.prev_action),
-        prev_teammate_action=None if mate is None else change.actions(mate),
+        prev_action=seen(steps.prev_action),
+        prev_teammate_action=None if mate is None else seen(mate),
     )
 
 
@@ -229,14 +254,14 @@ def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
     """Returns the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
 
     def init(params: Any, key: Array) -> PlayerMemory:
-        return PlayerMemory(no_change(), method.start(0, True))
+        return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
 
     def act(params: Any, memory: PlayerMemory, percept: Any, key: Array) -> tuple[Array, PlayerMemory]:
         step = percept_step(percept._replace(obs=to_canonical(layout, percept.obs)))
-        step = seen_steps(memory.change, step) if changes else step
+        step = seen_steps(memory.change, step, memory.started) if changes else step
         logits, state = method.act(params, step, percept.prev_done, memory.state)
         action = jax.random.categorical(key, logits).astype(jnp.int32)
-        return memory.change.actions(action), memory._replace(state=state)
+        return memory.change.actions(action), memory._replace(state=state, started=jnp.bool_(True))
 
     return Policy({}, init, act, "percept")
 
@@ -255,7 +280,7 @@ def _oracle_actions(layout: Layout, record: Array, taken: Int[Array, "T B"]) -> 
 
 
 class StepNumbers:
-    """The numbers of the steps, in place of batches."""
+    """Numbers of the training steps, with the interface of `Batches`."""
 
     waited = 0.0
 
@@ -283,6 +308,9 @@ class PlayTrainer:
         play: hyper-parameters of playing and learning.
         groups: the tasks.
         mirror: whether tasks are mirrored at random.
+
+    Raises:
+        OptionError: if there are fewer tasks than minibatches.
     """
 
     def __init__(
@@ -297,9 +325,15 @@ class PlayTrainer:
         self.players = [_GroupPlayer(group, method, play, mirror) for group in groups]
         self._mates = [player.rollout.teammate_params for player in self.players]
         self.tasks = sum(player.tasks for player in self.players)
+        if self.tasks < play.minibatches:
+            raise OptionError(
+                f"minibatches = {play.minibatches}: expected at most the {self.tasks} tasks that are played at once; "
+                f"give fewer --minibatches or a larger --batch-size"
+            )
+        learned = self.tasks - self.tasks % play.minibatches  # from so many tasks in each pass
         config = PPOConfig(
-            total_steps=options.steps * self.tasks * KEPT_STEPS,
-            environments=self.tasks - self.tasks % play.minibatches,
+            total_steps=options.steps * learned * KEPT_STEPS,
+            environments=learned,
             rollout=KEPT_STEPS,
             epochs=play.epochs,
             minibatches=play.minibatches,

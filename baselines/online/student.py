@@ -44,7 +44,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import atomic_folder, check_target
+from icrl4aht_data.writing.release_folder import check_target
 
 SOURCE = "student"
 
@@ -97,7 +97,9 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
         OptionError: if the labeller sees something else than the agent.
     """
     if labeller is not None and labeller.sees != policy.sees:
-        raise OptionError(f"the labeller sees a {labeller.sees}, expected a {policy.sees}, as the agent does")
+        raise OptionError(
+            f"the labeller sees a {labeller.sees}, expected a {policy.sees}, as the agent does: choose a trained model"
+        )
     params = policy.params, None if labeller is None else labeller.params
 
     def init(params: Any, key: Any) -> NoisyMemory:
@@ -156,6 +158,9 @@ def record_histories(
         suite: folder of learned teammates, if tasks have any.
         played: called with the number of episodes played since the last call.
         make_labeller: layout -> another agent that labels the histories.
+
+    Raises:
+        OptionError: if an agent does not fit the layout, or the labeller sees something else than the agent.
     """
     chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
     seeds = range(config.histories)
@@ -183,11 +188,13 @@ class Teammates(NamedTuple):
         tasks: one task for each teammate, numbered as a student task.
         references: task id -> returns of egos that do not learn, where the release states them.
         suite: folder of the checkpoints of learned teammates.
+        root: folder or address of the release.
     """
 
     tasks: list[Task]
     references: dict[str, ReferenceEgos]
     suite: Path
+    root: str | Path
 
 
 def release_teammates(dataset: Dataset, number: int = 0, unreliable: bool = False) -> Teammates:
@@ -197,13 +204,19 @@ def release_teammates(dataset: Dataset, number: int = 0, unreliable: bool = Fals
         dataset: the selection.
         number: number of the collection, from 0, which decides the tasks' seeds.
         unreliable: whether variants of the training heuristics are added that do little, see `UNRELIABLE`.
+
+    Raises:
+        OptionError: if the release does not describe the teammates of all of these histories.
     """
     path = Path(dataset.root) / PROVENANCE
     provenance = read_provenance(path) if path.is_file() else {}
     wanted = set(dataset.column("task_id").tolist())
     found: dict[tuple[str, str], Task] = {}
     references = {}
-    for task in read_tasks(Path(dataset.root) / TASKS):
+    listed = Path(dataset.root) / TASKS
+    known = read_tasks(listed) if listed.is_file() else []
+    described = {task.task_id for task in known}
+    for task in known:
         if task.task_id not in wanted or task.teammate_key in found:
             continue
         seed = FIRST_SEED + number * _SEEDS + len(found)
@@ -212,10 +225,17 @@ def release_teammates(dataset: Dataset, number: int = 0, unreliable: bool = Fals
         made = provenance.get(task.task_id)
         if made is not None and made.references is not None:
             references[student.task_id] = made.references
+    missing = wanted - described
+    if missing:
+        raise OptionError(
+            f"{dataset.root}: {TASKS} does not describe {len(missing)} of {len(wanted)} tasks, such as "
+            f"{min(missing)}: choose a release that was made with its tasks"
+        )
     tasks = list(found.values())
     if unreliable:
         tasks += _unreliable_tasks(tasks, FIRST_SEED + number * _SEEDS + len(tasks))
-    return Teammates(tasks, references, Path(dataset.root) / TEAMMATES)
+    suite = dataset.origin.below(TEAMMATES)
+    return Teammates(tasks, references, suite, str(dataset.origin) if dataset.origin.remote else dataset.root)
 
 
 def _unreliable_tasks(tasks: Sequence[Task], seed: int) -> list[Task]:
@@ -257,9 +277,13 @@ def collect_release(
         progress: called with (description, episodes played, episodes).
 
     Raises:
-        OptionError: if `out` may not be written, or the parts beside it are of other settings.
+        OptionError: if `out` may not be written, if an agent does not fit a layout or the labeller sees something else
+            than the agent, or if the parts beside `out` are of other settings.
     """
-    check_target(out, overwrite=overwrite)
+    out = out.resolve()
+    check_target(out, overwrite, [teammates.root])
+    for layout in dict.fromkeys(task.layout for task in teammates.tasks):
+        with_noise(agent.make(layout), KEPT_STEPS, None if labeller is None else labeller.make(layout))
     parts = out.with_name(f"{out.name}.parts")
     settings = {
         "agent": agent.name,
@@ -275,17 +299,13 @@ def collect_release(
     for task in teammates.tasks:
         groups[task.layout.name, task.teammate_kind].append(task)
     total = len(teammates.tasks) * config.histories * config.episodes
-    show = counted(progress, f"{agent.name}: episodes", total)
+    show, label = counted(progress, f"{agent.name}: episodes", total), labeller and labeller.make
     for (layout, kind), tasks in groups.items():
         folder = parts / f"{layout}-{kind}"
         if folder.is_dir():
             show(len(tasks) * config.histories * config.episodes)
-            continue
-        label = labeller and labeller.make
-        recorded = record_histories(agent.make, tasks, config, teammates.suite, show, label)
-        with atomic_folder(folder) as partial:
-            for name, array in recorded._asdict().items():
-                np.save(partial / f"{name}.npy", array)
+        else:
+            _save_part(folder, record_histories(agent.make, tasks, config, teammates.suite, show, label))
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
     labels = ExpertLabels(policy_sha256=None, action=by)
     new = [
@@ -293,9 +313,19 @@ def collect_release(
         for (layout, kind), tasks in groups.items()
         for number, task in enumerate(tasks)
     ]
-    write_release(out, "lite", new, data_version=data_version, overwrite=overwrite)
+    write_release(out, "lite", new, data_version=data_version, overwrite=overwrite, sources=[teammates.root])
     shutil.rmtree(parts)
     return out
+
+
+def _save_part(folder: Path, recorded: RecordedHistories) -> None:
+    """Write the arrays of a group of tasks into a folder, which appears when it is complete."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a killed process
+    partial.mkdir()
+    for name, array in recorded._asdict().items():
+        np.save(partial / f"{name}.npy", array)
+    partial.rename(folder)
 
 
 def _check_settings(path: Path, settings: dict[str, Any]) -> None:

@@ -19,18 +19,20 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from baselines.agents.egos import FORGETS
 from baselines.evaluate.results import read_result
 from baselines.report.overlap import OVERLAPS
 from baselines.report.results import (
-    OWN_TASKS,
+    PUBLISHED_PROTOCOL,
     EvaluationRun,
     cell_of,
     cell_order,
+    family_of,
+    group_of,
     normalized_return,
     published_cells,
-    published_test_tasks,
+    published_instances,
     read_run,
-    shipped_validation_tasks,
 )
 from baselines.report.summary import bootstrap_interval
 from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
@@ -42,9 +44,6 @@ from icrl4aht_data.utils.templates import card_file, fill_template, markdown_tab
 
 ENDS = 20
 """Episodes at each end of a task for the adaptation gain (paper, App. F)."""
-
-FORGETS = " (forgets)"
-"""End of the name of an agent whose memory is cleared at the start of each episode."""
 
 RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
 """Files of the page -> their first bytes, by which they are recognised before they are replaced."""
@@ -117,7 +116,7 @@ def read_stored(path: Path) -> StoredResults:
             for protocol, layouts in protocols.items()
         }
         return StoredResults(cells, dict(content["about"]))
-    except (IndexFormatError, KeyError, TypeError, AttributeError) as error:
+    except (IndexFormatError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise OptionError(f"{path}: not stored results: {error!r}; restore the file") from error
 
 
@@ -145,20 +144,24 @@ def add_results(stored: StoredResults, folder: Path, about: str) -> StoredResult
     Args:
         stored: the results so far.
         folder: the folder.
-        about: one sentence on how the agent was made.
+        about: one sentence on how the agent was made; empty to keep the stored one.
 
     Raises:
-        OptionError: if a task was played for fewer than 2 x `ENDS` episodes.
+        OptionError: if the folder has no results, or mixed ones, if a task was played for fewer than 2 x `ENDS`
+            episodes, or if nothing says how a new agent was made.
     """
     run = read_run(folder)
     found = _cell_returns(folder, run)
     key = run.agent, run.protocol
     cells = stored.cells | {key: stored.cells.get(key, {}) | found}
+    about = about or stored.about.get(run.agent, "")
+    if not about:
+        raise OptionError(f"{folder}: results of {run.agent}, a new agent: say how it was made by --about")
     return StoredResults(cells, stored.about | {run.agent: about})
 
 
 def _cell_returns(folder: Path, run: EvaluationRun) -> dict[Cell, CellReturns]:
-    tasks = published_test_tasks() | ({} if not (folder / OWN_TASKS).exists() else shipped_validation_tasks())
+    tasks = {task.task_id: task for source in run.sources for played in source.tasks.values() for task in played}
     parts: dict[Cell, list[np.ndarray]] = {}
     for path in sorted((folder / "tasks").glob("*.json")):
         result = read_result(path)
@@ -198,13 +201,20 @@ def normalised_interval(cells: Mapping[Cell, CellReturns], protocol: str) -> tup
 
 def rising_cells(cells: Mapping[Cell, CellReturns], protocol: str) -> list[Cell]:
     """Returns the cells with headroom whose gain is positive with its 95 % interval above 0."""
-    rng = np.random.default_rng(0)
     chosen = [cell for cell in cells_with_headroom(protocol) if cell in cells]
-    return [cell for cell in chosen if bootstrap_interval(cells[cell].gain, rng)[0] > 0]
+    return [cell for cell in chosen if gain_interval(cells[cell])[0] > 0]
+
+
+def gain_interval(found: CellReturns) -> tuple[float, float]:
+    """Returns the 95 % bootstrap interval of the mean gain in a cell, over the pairs of a task and a seed."""
+    return bootstrap_interval(found.gain, np.random.default_rng(0))
 
 
 def summary_table(stored: StoredResults, protocol: str) -> str:
-    """Returns a table with a row for each agent: normalised return, cells that rise, layouts above the paper's."""
+    """Returns a table with a row for each agent: normalised return, cells that rise.
+
+    Under the paper's protocol it also has the layouts where the agent earns more than the paper's methods.
+    """
     rows = []
     for agent in stored.agents(protocol):
         cells = stored.cells[agent, protocol]
@@ -216,11 +226,13 @@ def summary_table(stored: StoredResults, protocol: str) -> str:
                 f"{mean:.2f} ({low:.2f} to {high:.2f})",
                 str(count),
                 f"{len(rising)} of {count}",
-                ", ".join(layouts_above_paper(cells)) or "none",
             ]
         )
-    header = ["agent", "normalised return", "cells", "rising", "layouts above the paper's AD and DPT"]
-    return markdown_table(header, rows)
+        if protocol == PUBLISHED_PROTOCOL:
+            rows[-1].append(", ".join(layouts_above_paper(cells)) or "none")
+    header = ["agent", "normalised return", "cells", "rising"]
+    paper = ["layouts above the paper's AD and DPT"] if protocol == PUBLISHED_PROTOCOL else []
+    return markdown_table([*header, *paper], rows)
 
 
 def layouts_above_paper(cells: Mapping[Cell, CellReturns]) -> list[str]:
@@ -240,7 +252,7 @@ def cells_table(stored: StoredResults, protocol: str, track: str, agents: Sequen
     The paper's methods have columns under its own protocol only.
     """
     headroom = read_headroom(protocol)
-    paper = _PAPER if protocol == "published" else ()
+    paper = _PAPER if protocol == PUBLISHED_PROTOCOL else ()
     chosen = [cell for cell in cells_with_headroom(protocol) if cell[0] in TRACKS[track]["test"]]
     rows = []
     for cell in chosen:
@@ -260,9 +272,20 @@ def cells_table(stored: StoredResults, protocol: str, track: str, agents: Sequen
     return markdown_table(header, rows, right=len(header) - 2)
 
 
+def validation_table(stored: StoredResults, agents: Sequence[str]) -> str:
+    """Returns a table of mean returns with validation teammates, by which models are chosen."""
+    found = {agent: stored.cells.get((agent, "seeded"), {}) for agent in agents}
+    cells = {cell for of_agent in found.values() for cell in of_agent if group_of(cell) == "validation"}
+    rows = [
+        [cell[0], family_of(cell), *(_cell_text(found[agent].get(cell)) for agent in agents)]
+        for cell in sorted(cells, key=cell_order)
+    ]
+    return markdown_table(["layout", "family", *map(_code, agents)], rows, right=len(agents))
+
+
 def gains_table(stored: StoredResults, protocol: str, agents: Sequence[str]) -> str:
     """Returns a table of the first and the last episodes of each cell with headroom, and the interval of the gain."""
-    rng, rows = np.random.default_rng(0), []
+    rows = []
     for cell in cells_with_headroom(protocol):
         row = [*cell]
         for agent in agents:
@@ -270,7 +293,7 @@ def gains_table(stored: StoredResults, protocol: str, agents: Sequence[str]) -> 
             if found is None:
                 row.append("")
                 continue
-            low, high = bootstrap_interval(found.gain, rng)
+            low, high = gain_interval(found)
             ends = f"{found.first.mean():z.1f} to {found.last.mean():z.1f}"
             text = f"{ends}, {found.gain.mean():+.1f} ({low:+.1f}, {high:+.1f})"
             row.append(f"**{text}**" if low > 0 else text)
@@ -290,21 +313,22 @@ def _cell_text(found: CellReturns | None) -> str:
 
 
 def plot_comparison(stored: StoredResults, protocol: str, agents: Sequence[str], path: Path) -> None:
-    """Plot the returns of agents in the cells with headroom, a bar each from `stay`, with the oracle as a line."""
+    """Plot the mean returns of agents in the cells with headroom as bars, with `stay` and the oracle as marks."""
     headroom, chosen = read_headroom(protocol), cells_with_headroom(protocol)
     figure = Figure(figsize=(11, 4.2), layout="constrained")
-    axes, places = figure.subplots(), np.arange(len(chosen))
+    axes, numbers = figure.subplots(), np.arange(len(chosen))
     width = 0.8 / max(1, len(agents))
     for number, agent in enumerate(agents):
         cells = stored.cells.get((agent, protocol), {})
         heights = [cells[cell].mean.mean() if cell in cells else np.nan for cell in chosen]
-        axes.bar(places - 0.4 + (number + 0.5) * width, heights, width, label=agent)
+        axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=agent)
     for name, style in (("oracle", "k_"), ("stay", "rx")):
-        axes.plot(places, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
-    axes.set_xticks(places, [f"{layout}\n{family}" for layout, family in chosen], rotation=60, fontsize=8)
+        axes.plot(numbers, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
+    axes.set_xticks(numbers, [f"{layout}\n{family}" for layout, family in chosen], rotation=60, fontsize=8)
     axes.set_ylabel("mean return of an episode")
     axes.axhline(0, color="gray", linewidth=0.6)
-    axes.legend(ncols=len(agents) + 2, fontsize=8, loc="upper right")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=len(agents) + 2, fontsize=8, loc="outside lower center", frameon=False)
     axes.set_title(f"Test tasks with headroom, protocol {protocol}", fontsize=10)
     save_figure(figure, path)
 
@@ -328,9 +352,12 @@ def render_page(stored: StoredResults, agents: Sequence[str]) -> str:
         published_layout=cells_table(stored, "published", "layout", rising),
         published_summary=summary_table(stored, "published"),
         gains=gains_table(stored, "seeded", agents),
+        validation=validation_table(stored, rising),
         marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
         references=", ".join(map(_code, REFERENCES)),
         forgets=f"`NAME{FORGETS}`",
+        seeds=_seeds_text(stored),
+        cells=str(len(cells_with_headroom("seeded"))),
     )
 
 
@@ -348,6 +375,17 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
     paths[0].write_text(render_page(stored, agents), encoding="utf-8")
     plot_comparison(stored, "seeded", [agent for agent in agents if not agent.endswith(FORGETS)], paths[1])
     return paths
+
+
+def _seeds_text(stored: StoredResults) -> str:
+    """Returns how often each agent played a test task under each protocol, as text."""
+    texts = []
+    for (agent, protocol), cells in stored.cells.items():
+        played = {
+            len(found.mean) // published_instances(cell) for cell, found in cells.items() if published_instances(cell)
+        }
+        texts += [f"`{agent}`, {protocol} {' or '.join(map(str, sorted(played)))}"] if played else []
+    return "; ".join(texts)
 
 
 def shown_agents(stored: StoredResults) -> list[str]:

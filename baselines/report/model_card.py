@@ -111,8 +111,14 @@ def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
         channels = config["histories"].get("channels", "own")  # models of earlier versions have a layout's own
         made_by = sorted({cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell})
         data = {"sources of histories": ", ".join(made_by), "labels": config["histories"].get("labels")}
-        settings = {**config["model"], **config["train"], "channels": channels}
-        settings |= {name: value for name, value in data.items() if value}
+        histories = config["histories"]
+        changes = {name: histories.get(name) for name in ("every", "mirror") if histories.get(name) not in (None, 1)}
+        changes["hidden recipe indicators"] = ", ".join(histories.get("hide_recipe", ()))
+        changes["started from run"] = (
+            config.get("init", {}).get("run") if isinstance(config.get("init"), dict) else None
+        )
+        settings = {**config["model"], **config["train"], **config.get("play", {}), "channels": channels}
+        settings |= {name: value for name, value in (data | changes).items() if value}
         tested_on.setdefault(_bullets(settings), []).extend(sources)
     if len(tested_on) == 1:
         return next(iter(tested_on))

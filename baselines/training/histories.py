@@ -324,6 +324,9 @@ class MirroredBatches(LayoutNumbers):
             for name, values in batch._asdict().items()
             if values is not None and (name.endswith("actions") or name == "query_target")
         }
+        if hasattr(batch, "is_first"):  # no step precedes: the fillers stay 0, as they are when a model acts
+            filler = batch.is_first | ~batch.attention_mask
+            actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
         return batch._replace(**actions, layouts=batch.layouts + self._layouts * mirroring)
 
 
@@ -445,6 +448,18 @@ class TrainedModel(NamedTuple):
     hash: str
     trained_on: list[dict[str, Any]]
     hide_recipe: tuple[str, ...] = ()
+
+
+def start_from(before: TrainedModel, about: dict[str, Any]) -> Any:
+    """Returns the parameters of a model, to start another training from, and notes it in that training's settings.
+
+    Args:
+        before: the model.
+        about: settings of the other training; its record of training data gets that of the model, too.
+    """
+    about["init"] = {"run": before.hash, "step": before.step}
+    about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]
+    return before.params
 
 
 def read_trained(folder: Path) -> TrainedModel:

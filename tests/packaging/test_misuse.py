@@ -93,8 +93,8 @@ baselines: collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<
 baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, ad-noise,
 baselines: reference --name rl2 --no-evaluate --bundle x | its card states its results
 baselines: results empty | Missing option '--out'
-baselines: evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'?
-baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle, ad-reference, rl2-reference. Did you mean
+baselines: evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
+baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle, ad-reference,
 baselines: evaluate --agent none --out e | A trained model is named by its folder
 baselines: evaluate --agent empty --out e | empty: no run: config.json is missing
 baselines: evaluate --agent stay --out e --acting cach | unknown acting 'cach'; valid: cached, exact.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -81,6 +82,19 @@ def test_unknown_names(models):
         find_bundled("x", models)
 
 
+def test_names_and_unfinished_runs(run, tmp_path):
+    for name in ("../ad", "oracle", "AD-x", ""):
+        with pytest.raises(OptionError, match="expected words of small letters and digits with hyphens: ad-reference"):
+            bundle_run(run, name, "teammate", tmp_path)
+    config = json.loads((run / "config.json").read_text())
+    half = tmp_path / "half"
+    shutil.copytree(run, half)
+    (half / "config.json").write_text(json.dumps(config | {"train": config["train"] | {"steps": 9}}))
+    with pytest.raises(OptionError, match="half: at step 1 of 9: continue the training with the same command"):
+        bundle_run(half, "ad-tiny", "teammate", tmp_path / "models")
+    assert not (tmp_path / "models").exists()
+
+
 def test_large_models_are_refused(run, tmp_path, monkeypatch):
     monkeypatch.setattr(bundled, "_LARGEST", 1000)
     with pytest.raises(OptionError, match=r"parameters of [\d,]+ bytes, expected at most 1,000: bundle a smaller"):
@@ -89,6 +103,7 @@ def test_large_models_are_refused(run, tmp_path, monkeypatch):
 
 
 def test_the_package_bundles_models_that_play_and_have_cards():
+    assert set(bundled_models(MODELS)) == {"ad-reference", "rl2-reference"}
     for model in bundled_models(MODELS).values():
         assert (MODELS / model.name / MODEL_CARD).is_file()
         for track, folder in model.runs.items():
@@ -108,6 +123,13 @@ def test_models_command(models):
 
 
 class TestPlayMode:
+    def test_other_ways_have_other_names(self, run):
+        assert find_agent(str(run), PlayMode(greedy=False, forget=True)).name == "AD+mlp (sampled) (forgets)"
+        with pytest.raises(
+            OptionError, match=r"mode = 'exact': expected a PlayMode, such as PlayMode\(acting='exact'\)"
+        ):
+            find_agent(str(run), "exact")  # type: ignore[arg-type]
+
     def test_details_and_back(self):
         for mode in (PlayMode(), PlayMode("exact", False), PlayMode(forget=True)):
             assert PlayMode.from_details(mode.details) == mode

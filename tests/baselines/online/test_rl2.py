@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,15 @@ from baselines.evaluate.protocols import get_protocol
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import StepInput
-from baselines.online.rl2 import REWARD_SCALE, PlayTrainer, imitation_weight, make_groups
+from baselines.methods.view_change import ViewChange
+from baselines.online.rl2 import (
+    REWARD_SCALE,
+    PlayTrainer,
+    chosen_teammates,
+    imitation_weight,
+    make_groups,
+    seen_steps,
+)
 from baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
 from baselines.training.histories import read_trained
 from baselines.training.options import PlayOptions, TrainOptions
@@ -139,6 +148,24 @@ def test_a_stopped_training_resumes_to_the_same_bits(trainer, through, tmp_path)
     assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
 
 
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_first_step_is_not_mirrored(layers):
+    """Before a task's first step nothing was done: the zeros are no actions, and stay zeros in a mirrored view."""
+    flags = jnp.array([True, True])
+    change = ViewChange(~flags, flags, flags)
+    zero = jnp.zeros(2, jnp.int32)
+    steps = StepInput(jnp.zeros((2, 5, 5, 46), jnp.uint8), zero, jnp.zeros(2), zero)
+    seen = seen_steps(change, steps, jnp.array([False, True]))
+    assert seen.prev_action.tolist() == [0, 1]
+    assert seen.prev_teammate_action is not None and seen.prev_teammate_action.tolist() == [0, 1]
+    model = dataclasses.replace(MODEL, recurrent_layers=layers)
+    method = get_method("rl2")(model, overcooked_world([LAYOUT], "mlp", canonical=True))
+    params, state = method.init(jax.random.key(0)), jnp.zeros((2, 16 * layers))
+    both: Any = method.model.apply({"params": params}, jax.tree.map(lambda x: x[None], steps), state)
+    _, alone = method.act(params, jax.tree.map(lambda x: x[0], steps), jnp.bool_(False), method.start(0, True))
+    np.testing.assert_allclose(np.asarray(both[1][0]), np.asarray(alone), atol=1e-6)
+
+
 class TestGroups:
     def test_shares(self):
         wide = get_layout("demo_wide")
@@ -157,6 +184,16 @@ class TestGroups:
             theta = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(mate.params["script"]))
             found.setdefault(theta, set()).add(np.asarray(mate.params["chances"]).tobytes())
         assert all(len(manners) >= 3 for manners in found.values())
+
+    def test_teammates_of_tasks(self):
+        assert sorted(np.bincount(chosen_teammates(3, 8)).tolist()) == [2, 3, 3]
+        few = chosen_teammates(10, 4)
+        assert len(set(few.tolist())) == 4 and few.max() < 10
+
+    def test_fewer_tasks_than_minibatches(self):
+        groups = make_groups({(LAYOUT, "a"): teammates(1)}, 3, {LAYOUT.name: 1.0})
+        with pytest.raises(OptionError, match="minibatches = 4: expected at most the 3 tasks .* --minibatches"):
+            PlayTrainer(METHOD, OPTIONS, PlayOptions(minibatches=4), groups)
 
     def test_mixture(self):
         chances = mixed_chances(100)
@@ -235,6 +272,7 @@ class TestCommand:
         [
             (["rl2", "--context", "5"], "--context: not with rl2, which learns by playing"),
             (["rl2", "--size", "tiny"], "--size: not with rl2, which learns by playing"),
+            (["rl2", "--next-obs", "--layers", "2"], "--layers, --next-obs: not with rl2, which learns by playing"),
             (["ad", "--epochs", "2"], "--epochs: not with ad, only with rl2, which learns by playing"),
         ],
     )

@@ -127,7 +127,7 @@ class TestStoring:
             content["returns"] = [row[:30] for row in content["returns"]]
             path.write_text(json.dumps(content))
         with pytest.raises(OptionError, match="30 episodes, expected at least 40; evaluate more"):
-            add_results(StoredResults({}, {}), results, "")
+            add_results(StoredResults({}, {}), results, "short")
 
     def test_the_command(self, results, tmp_path, monkeypatch):
         target = tmp_path / "stored.json"
@@ -147,8 +147,17 @@ def test_the_committed_page_is_that_of_the_stored_results():
     assert page == render_page(stored, shown_agents(stored))
 
 
-def test_agents_that_forget_are_in_the_table_of_gains_alone():
+def test_agents_that_forget_have_no_columns_of_their_own_beside_the_others():
+    """They are in the summary and in the table of gains, since only the difference to their memory counts."""
     stored = StoredResults({("a", "seeded"): everywhere(0.5), (f"a{FORGETS}", "seeded"): everywhere(0.1)}, {})
-    page = render_page(stored, shown_agents(stored))
-    assert page.count(f"`a{FORGETS}`") == 2
-    assert "0.50 (0.50 to 0.50)" in summary_table(stored, "seeded")
+    parts = render_page(stored, shown_agents(stored)).split("\n## ")
+    named = {part.splitlines()[0] for part in parts if f"| `a{FORGETS}`" in part}
+    assert named == {"Summary", "First and last episodes, protocol `seeded`"}
+    assert "| `a` | 0.50 (0.50 to 0.50)" in summary_table(stored, "seeded")
+
+
+def test_a_new_agent_needs_a_sentence(results):
+    with pytest.raises(OptionError, match="results of ramp, a new agent: say how it was made by --about"):
+        add_results(StoredResults({}, {}), results, "")
+    known = add_results(StoredResults({}, {"ramp": "a ramp"}), results, "")
+    assert known.about == {"ramp": "a ramp"}
