@@ -104,7 +104,7 @@ TRACK_VIEWS: dict[str, dict[str, Any]] = {
 than they are trained on, so they learn from mirrored games, too; asymm_right has no recipe indicator that the ego could
 see, so that of asymm_both is hidden from them."""
 
-HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
+TEACHER_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
 """Histories of RL^2 with each teammate: the last fifth of a history, or more, is without noise."""
 
 OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
@@ -218,7 +218,7 @@ class _Making:
             agent = find_agent(str(self.play()), PlayMode(greedy=False))
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
             teammates = release_teammates(dataset, unreliable=True)
-            collect_release(agent, teammates, HISTORIES, folder, progress=self.show)
+            collect_release(agent, teammates, TEACHER_HISTORIES, folder, progress=self.show)
         return folder
 
     def root(self, recipe: Recipe) -> Path:

@@ -117,7 +117,7 @@ def cli() -> None:
     "--agent",
     type=EGO_NAME,
     required=True,
-    help="stay, random, oracle, a bundled model (see `models`), or a folder that `train` made.",
+    help="stay, random, oracle, a bundled model such as ad-reference, or a folder that `train` made.",
 )
 @acting_option
 @sampled_option
@@ -243,7 +243,9 @@ def report_command(
 @click.option(
     "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate: its family, H1 to H4, and number."
 )
-@click.option("--ego", type=EGO_NAME, default="random", help="stay, random, oracle, or a folder that `train` made.")
+@click.option(
+    "--ego", type=EGO_NAME, default="random", help="stay, random, oracle, a model such as ad-reference, or a run."
+)
 @protocol_option
 @click.option("--seed", type=SEED, default=0, help="Seed of the episode.")
 @click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
@@ -420,7 +422,10 @@ def train_command(
     ),
 )
 @click.option(
-    "--agent", type=EGO_NAME, required=True, help="A folder that `train` made, a bundled model, or a reference ego."
+    "--agent",
+    type=EGO_NAME,
+    required=True,
+    help="A folder that `train` made, a bundled model such as ad-reference, or a reference ego.",
 )
 @sampled_option
 @root_option
@@ -436,7 +441,9 @@ def train_command(
     metavar="START END",
     help="Chance of a random action in a history's first and in its last episode.",
 )
-@click.option("--labeller", type=EGO_NAME, help="Another agent, whose choices become the expert actions.")
+@click.option(
+    "--labeller", type=EGO_NAME, help="Another agent, such as rl2-reference, whose choices become the expert actions."
+)
 @click.option("--unreliable", is_flag=True, help="Also play with heuristics that do nothing, hesitate or err.")
 @click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
@@ -564,10 +571,14 @@ def _run_experiment(
         "python -m baselines reference --name rl2 --track teammate --out runs/reference",
     ),
 )
-@click.option("--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model; repeat for several.")
-@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of this track.")
+@click.option(
+    "--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model, such as ad-student; repeat."
+)
+@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
-@click.option("--bundle", metavar="NAME", help="Also put it into the package, under this name; see `models`.")
+@click.option(
+    "--bundle-as", "bundle", metavar="NAME", help="Also put it into the package, under this name; see `models`."
+)
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
     names: tuple[str, ...], track: tuple[str, ...], evaluates: bool, bundle: str | None, out: Path
@@ -583,7 +594,7 @@ def reference_command(
     from baselines.reference import make_reference, write_bundled_card
 
     if bundle and (len(names) > 1 or set(track) != set(TRACKS) or not evaluates):
-        raise click.UsageError("--bundle: expected one --name of all tracks, evaluated: its card states its results")
+        raise click.UsageError("--bundle-as: expected one --name of all tracks, evaluated: its card states its results")
     outcomes = []
     with bars(edges=True) as show:
         for name, of_track in product(names, track):

@@ -78,6 +78,8 @@ EGO_NAME = EgoName("agent", _ego_names)
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
 _EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
+_HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
+_playing = lazy_attribute("baselines.methods.registry", "PLAYING")
 REFERENCE_NAME = Names("reference model", lazy_attribute("baselines.reference", "RECIPES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
@@ -336,7 +338,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         click.option(
             "--method",
             "methods",
-            type=METHOD_NAME,
+            type=_HISTORY_METHOD,
             multiple=True,
             default=("ad", "dpt"),
             help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",

@@ -43,7 +43,7 @@ from icrl4aht_data.overcooked.channels import to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
-REWARD_SCALE = 0.05
+PLAY_REWARD_SCALE = 0.05
 """Factor of rewards in returns and values; a delivery, which earns 20 points, becomes 1."""
 
 
@@ -211,7 +211,7 @@ class _GroupPlayer:
             action=action,
             log_prob=log_prob,
             value=value[:-1],
-            reward=REWARD_SCALE * reward,
+            reward=PLAY_REWARD_SCALE * reward,
             done=jnp.zeros(reward.shape, bool).at[-1].set(ended),
             hidden=state.ego.state[None],
             partner=jnp.zeros((1, self.tasks), jnp.int32),

@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from baselines import experiments
+from baselines.agents.egos import PlayMode
 from baselines.commands.cli import cli
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.results import read_result
@@ -124,8 +125,8 @@ def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_p
     chosen = []
     monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
 
-    def find_agent(folder: str, acting: str) -> None:
-        chosen.append(acting)
+    def find_agent(folder: str, mode: PlayMode) -> None:
+        chosen.append(mode.acting)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(experiments, "find_agent", find_agent)

@@ -13,7 +13,7 @@ from baselines import reference
 from baselines.commands.cli import cli
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method
-from baselines.reference import HISTORIES, RECIPES, TRACK_VIEWS, make_reference
+from baselines.reference import RECIPES, TEACHER_HISTORIES, TRACK_VIEWS, make_reference
 from baselines.training.histories import read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
 from generation.profiles.noise_config import NoiseConfig
@@ -37,7 +37,7 @@ def test_recipes_are_valid_settings(name):
 
 
 def test_every_history_has_episodes_without_noise():
-    assert HISTORIES.end == (0.0, 0.0) and HISTORIES.finish[1] < 1
+    assert TEACHER_HISTORIES.end == (0.0, 0.0) and TEACHER_HISTORIES.finish[1] < 1
     assert all(recipe.protocols["seeded"] == 3 for recipe in RECIPES.values())
 
 
@@ -57,7 +57,7 @@ def small(monkeypatch, tmp_path) -> Path:
         sizes: dict[str, Any] = TINY if recipe.data != "tasks" else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data != "tasks" else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
         monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
-    monkeypatch.setattr(reference, "HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
+    monkeypatch.setattr(reference, "TEACHER_HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     (tmp_path / "noise").mkdir()
     (tmp_path / "noise" / "lite").symlink_to(MINI)

@@ -69,7 +69,8 @@ def rows(page: str, heading: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(page, marks=pytest.mark.slow if page in COMPILING else ()) for page in PAGES]
+    "page",
+    [pytest.param(page, marks=pytest.mark.slow if page in COMPILING else ()) for page in PAGES if page != "results"],
 )
 @mock.patch.dict(METHODS)
 def test_snippets(page, tmp_path, monkeypatch):

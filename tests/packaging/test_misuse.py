@@ -91,8 +91,10 @@ baselines: collect --agent none --out c | A trained model is named by its folder
 baselines: collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
 baselines: collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<=x<=1
 baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, ad-noise,
-baselines: reference --name rl2 --no-evaluate --bundle x | its card states its results
+baselines: reference --name rl2 --no-evaluate --bundle-as x | its card states its results
 baselines: results empty | Missing option '--out'
+baselines: collect --agent stay --out file | 'file' is a file
+baselines: tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 baselines: evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle, ad-reference,
 baselines: evaluate --agent none --out e | A trained model is named by its folder
@@ -131,9 +133,7 @@ baselines: train ad --layout asymm_right | no history has split='train', layout=
 baselines: train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
 baselines: train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
 baselines: train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
-baselines: tracks --method rl2 --layout demo_wide | rl2 learns by playing, not from histories: `python -m baselines
 baselines: collect --agent stay --source student --out c | source = student: none of Dataset(
-baselines: collect --agent stay --out file | 'file' is a file
 baselines: results empty --out r | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
 baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(

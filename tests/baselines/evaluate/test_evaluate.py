@@ -298,7 +298,7 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "baselines.commands.cli.manifest_path", lambda track, split: tmp_path / f"{track}_{split}.jsonl"
     )
-    monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, acting: NamedEgo(name, get_agent(name)))
+    monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name)))
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
 
     def write_results(name, ego, tasks, protocol, *, out, **options):

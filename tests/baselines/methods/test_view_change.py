@@ -46,7 +46,7 @@ def change(rows: bool, columns: bool, hidden: bool = False) -> ViewChange:
 
 @pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
 def test_a_mirrored_view_is_that_of_the_mirrored_layout_at_every_step(rows, columns):
-    """The same play on both layouts, with mirrored actions on the mirrored one."""
+    """Both layouts are played from the same start, the mirrored one with mirrored actions."""
     rng, other = np.random.default_rng(0), mirrored_layout(LAYOUT, rows, columns)
     free = np.flatnonzero(LAYOUT.walkable)
     positions = rng.choice(free, (64, 2)).astype(np.uint8)

@@ -262,7 +262,7 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
 
 def test_egos_that_cannot_be_made_again_say_why(tmp_path):
     source = evaluated_run("AD").sources[0]
-    with pytest.raises(OptionError, match="AD is neither a reference ego nor of a run folder"):
+    with pytest.raises(OptionError, match="AD is neither a reference ego, nor a bundled model, nor of a run folder"):
         restore_ego(source)
     with pytest.raises(OptionError, match=r"its run folder .*/gone is missing"):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))

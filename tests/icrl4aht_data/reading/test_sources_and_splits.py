@@ -36,7 +36,9 @@ def test_a_source_that_a_release_does_not_have(lite, two_sources):
         load_icrl4aht(lite[0], source="noise")
     with pytest.raises(EmptySelectionError, match=r"split='validation', source='ppo'\..*; sources: ppo, noise$"):
         load_icrl4aht(two_sources[0], split="validation", source="ppo")
-    with pytest.raises(UnknownNameError, match=r"unknown source 'nois'; valid: ppo, noise\. Did you mean 'noise'"):
+    with pytest.raises(
+        UnknownNameError, match=r"unknown source 'nois'; valid: ppo, noise, student\. Did you mean 'noise'"
+    ):
         load_icrl4aht(lite[0], source="nois")
 
 
