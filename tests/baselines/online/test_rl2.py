@@ -122,13 +122,28 @@ def test_the_first_step_of_a_task_knows_nothing_of_the_one_before(trainer):
     raise AssertionError("no task ended")
 
 
-def test_imitation_teaches_what_the_oracle_does(through):
+def test_the_log(through):
     lines = [json.loads(line) for line in (through[0] / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == list(range(1, 13))
     assert [line["imitation_weight"] for line in lines] == pytest.approx(1 - np.arange(12) / 12)
-    losses = [line["imitation_loss"] for line in lines]
-    assert np.mean(losses[-3:]) < np.mean(losses[:3]) - 0.05
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
+
+
+def test_imitation_teaches_what_the_oracle_does(trainer):
+    """On one and the same episode, the oracle's actions become likelier with a weight of imitation only."""
+    state = trainer.init()
+    _, played, _ = trainer.players[0].episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
+    fallen = {}
+    for weight in (0.0, 5.0):
+        params, optimizer = jax.tree.map(jnp.copy, (state.params, state.optimizer))
+        losses = []
+        for _ in range(10):
+            learned = trainer._learn(params, optimizer, (played,), jax.random.key(1), jnp.float32(weight))
+            params, optimizer, log = learned
+            losses.append(float(log["imitation_loss"]))
+        fallen[weight] = losses[0] - losses[-1]
+    assert fallen[5.0] > 0.1
+    assert fallen[0.0] < fallen[5.0] / 4
 
 
 def test_the_weight_of_imitation_falls_to_nothing():
