@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import sys
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
+from baselines.commands.model_commands import MODEL_COMMANDS
 from baselines.commands.options import (
     EGO_NAME,
     METHOD_NAME,
     PROTOCOL_NAME,
-    REFERENCE_NAME,
     TRAINING_LAYOUT,
     acting_option,
     default_batch_size,
@@ -49,10 +48,9 @@ from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
-from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options, replace_given
+from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
-    COUNT_OR_NONE,
     LAYOUT,
     SEED,
     SETTINGS,
@@ -68,7 +66,6 @@ from icrl4aht_data.commands.options import (
     run,
     version_option,
 )
-from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
@@ -415,77 +412,6 @@ def train_command(
 
 
 @cli.command(
-    "collect",
-    epilog=examples(
-        "python -m baselines collect --agent runs/rl2 --root build/noise/lite --out build/student",
-        "python -m baselines collect --agent runs/ad --layout demo_wide --histories 2 --out build/student",
-    ),
-)
-@click.option(
-    "--agent",
-    type=EGO_NAME,
-    required=True,
-    help="A folder that `train` made, a bundled model such as ad-reference, or a reference ego.",
-)
-@sampled_option
-@root_option
-@click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
-@history_filters
-@click.option("--histories", type=COUNT, default=8, help="Histories with each teammate.")
-@click.option("--episodes", type=click.IntRange(min=10), default=60, help="Episodes of each history, of 100 steps.")
-@click.option(
-    "--noise",
-    nargs=2,
-    type=FiniteRange(min=0, max=1),
-    default=(0.0, 0.0),
-    metavar="START END",
-    help="Chance of a random action in a history's first and in its last episode.",
-)
-@click.option(
-    "--labeller", type=EGO_NAME, help="Another agent, such as rl2-reference, whose choices become the expert actions."
-)
-@click.option("--unreliable", is_flag=True, help="Also play with heuristics that do nothing, hesitate or err.")
-@click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
-@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
-@overwrite_option
-def collect_command(
-    agent: str,
-    sampled: bool,
-    root: Any,
-    layouts: tuple[str, ...],
-    filters: dict[str, Any],
-    histories: int,
-    episodes: int,
-    noise: tuple[float, float],
-    labeller: str | None,
-    unreliable: bool,
-    number: int,
-    out: Path,
-    overwrite: bool,
-) -> None:
-    """Record histories of an agent with the teammates of a release.
-
-    Writes a release of source student: what the agent did, what it would have done without the noise (expert actions),
-    and what the scripted oracle would have done (oracle actions). Validation teammates are played, too.
-    """
-    from baselines.online.student import collect_release, release_teammates
-    from baselines.training.histories import filter_histories
-    from generation.profiles.noise_config import NoiseConfig
-
-    start, end = noise
-    config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
-    ego = find_ego("--agent", agent, greedy=not sampled)
-    other = find_ego("--labeller", labeller) if labeller else None
-    names = [get_layout(name).name for name in layouts] or None
-    dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
-    teammates = release_teammates(dataset, number, unreliable)
-    with bars(edges=True, unit="episodes") as show:
-        options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
-        collect_release(ego, teammates, config, out, **options)
-    _console.print(f"wrote {out}; `icrl4aht-data show {out}` describes it")
-
-
-@cli.command(
     "sweep",
     epilog=examples(
         "python -m baselines sweep size --layout demo_wide",
@@ -564,102 +490,6 @@ def _run_experiment(
         click.echo(f"wrote {path}")
 
 
-@cli.command(
-    "reference",
-    epilog=examples(
-        "python -m baselines reference --name ad-student",
-        "python -m baselines reference --name rl2 --track teammate --out runs/reference",
-    ),
-)
-@click.option(
-    "--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model, such as ad-student; repeat."
-)
-@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
-@click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
-@click.option(
-    "--bundle-as", "bundle", metavar="NAME", help="Also put it into the package, under this name; see `models`."
-)
-@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
-def reference_command(
-    names: tuple[str, ...], track: tuple[str, ...], evaluates: bool, bundle: str | None, out: Path
-) -> None:
-    """Make reference models, with everything that they need.
-
-    Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
-    and evaluates. One model for each track. The same command resumes a stopped one. `rl2` is trained by playing with
-    training teammates; ad and dpt learn from histories: -noise of the scripted oracle whose noise falls, -ppo and -both
-    of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
-    """
-    from baselines.agents.bundled import bundle_run
-    from baselines.reference import make_reference, write_bundled_card
-
-    if bundle and (len(names) > 1 or set(track) != set(TRACKS) or not evaluates):
-        raise click.UsageError("--bundle-as: expected one --name of all tracks, evaluated: its card states its results")
-    outcomes = []
-    with bars(edges=True) as show:
-        for name, of_track in product(names, track):
-            outcomes.append(make_reference(name, of_track, out, show, evaluates))
-    for found in outcomes:
-        _console.print(f"{found.name}, {found.track}: {found.run}", highlight=False)
-        for kind, folder in found.results.items():
-            _console.print(f"  {kind}: {folder}", highlight=False)
-    if bundle:
-        for found in outcomes:
-            _console.print(f"bundled: {bundle_run(found.run, bundle, found.track)}", highlight=False)
-        _console.print(f"card: {write_bundled_card(bundle, outcomes)}", highlight=False)
-
-
-@cli.command(
-    "results",
-    epilog=examples(
-        "python -m baselines results --out build/results",
-        "python -m baselines results runs/ad-results --about 'AD on noise histories' --out build/results",
-    ),
-)
-@click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
-@click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
-@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
-@click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
-@overwrite_option
-def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, overwrite: bool) -> None:
-    """Compare reference models with the paper's numbers.
-
-    Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
-    `evaluate` made, are added.
-    """
-    from baselines.report.comparison import (
-        RESULTS_BEGINS,
-        add_results,
-        read_stored,
-        results_file,
-        write_comparison,
-        write_stored,
-    )
-
-    check_new_files(out, overwrite, RESULTS_BEGINS)
-    stored = read_stored(results_file())
-    for folder in runs:
-        stored = add_results(stored, folder, about)
-    if store:
-        write_stored(results_file(), stored)
-    for path in write_comparison(stored, out):
-        _console.print(f"wrote {path}")
-
-
-@cli.command("models")
-def models_command() -> None:
-    """List the bundled models.
-
-    Their names are agents of `evaluate`, `watch` and `collect`. One line per model and track: method, parameters,
-    context, training layouts and sources.
-    """
-    from baselines.agents.bundled import bundled_models, describe_model
-
-    for model in bundled_models().values():
-        for line in describe_model(model):
-            click.echo(line)
-
-
 @cli.command("control")
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/control", help="Write the runs here.")
 def control_command(out: Path) -> None:
@@ -693,6 +523,10 @@ def demo_command(out: Path) -> None:
     from baselines.demo import run_demo
 
     run_demo(out, _console)
+
+
+for _command in MODEL_COMMANDS:
+    cli.add_command(_command)
 
 
 def main() -> None:
