@@ -210,8 +210,8 @@ def _bundled_ego(model: BundledModel, mode: PlayMode) -> NamedEgo:
         return _maker(runs[track], mode, model.runs[track])(layout)
 
     details = {"model": model.name, "run": {track: run.hash for track, run in runs.items()}, **mode.details}
-    cells = [cell for run in runs.values() for cell in run.trained_on]
-    return NamedEgo(model.name + mode.suffix, make, {**details, "trained_on": cells})
+    trained_on = {track: run.trained_on for track, run in runs.items()}
+    return NamedEgo(model.name + mode.suffix, make, {**details, "trained_on": trained_on})
 
 
 def _maker(run: TrainedModel, mode: PlayMode, folder: Path) -> Callable[[Layout], Policy]:

@@ -22,7 +22,7 @@ from baselines.evaluate.results import Result, read_result
 from baselines.report.overlap import OVERLAPS, find_overlaps
 from baselines.training.run_folder import read_config
 from baselines.training.seen import TRAINED_ON, SeenInTraining, read_trained_on
-from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LAYOUT_NAMES, TRACKS
+from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LAYOUT_NAMES, TRACKS, track_of
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -253,19 +253,36 @@ def as_run(
     arrays = {cell: np.array(cells[cell]) for cell in sorted(cells, key=cell_order)}
     layouts = tuple(dict.fromkeys(layout for layout, _ in arrays))
     of_cell = {cell: tuple(found) for cell, found in played.items()}
-    source = ResultSource(where, layouts, settings, trained, of_cell, _find_seen(settings, trained, where))
-    return EvaluationRun(settings["agent"], settings["protocol"]["name"], arrays, variant, sources=(source,))
+    seen = _find_seen(settings, trained, where)
+    sources = [ResultSource(where, layouts, settings, trained, of_cell, seen.get(""))]
+    if "" not in seen:  # a model for each track
+        sources = [
+            ResultSource(
+                where, tuple(dict.fromkeys(layout for layout, _ in own)), settings, trained, own, seen.get(track)
+            )
+            for track in TRACKS
+            if (own := {cell: found for cell, found in of_cell.items() if track_of(cell[0]) == track})
+        ]
+    return EvaluationRun(settings["agent"], settings["protocol"]["name"], arrays, variant, sources=tuple(sources))
 
 
-def _find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> SeenInTraining | None:
-    """Returns what an agent was trained on: nothing for reference egos, None if the results do not say."""
+def _find_seen(
+    settings: dict[str, Any], trained: dict[str, Any] | None, where: str
+) -> dict[str, SeenInTraining | None]:
+    """Returns what an agent was trained on: nothing for reference egos, None if the results do not say.
+
+    The key is empty, or the track for an agent with a model for each track.
+    """
     details = settings.get("details", {})
     config = (trained or {}).get("config", {})
     for record in (details, config):
+        entries = record.get(TRAINED_ON)
+        if isinstance(entries, dict) and entries.keys() <= TRACKS.keys():
+            return {track: read_trained_on(of_track, where) for track, of_track in entries.items()}
         if TRAINED_ON in record:
-            return read_trained_on(record[TRAINED_ON], where)
+            return {"": read_trained_on(entries, where)}
     is_reference = settings["agent"] in REFERENCES and not details and trained is None
-    return SeenInTraining() if is_reference else None
+    return {"": SeenInTraining() if is_reference else None}
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import jax
@@ -17,7 +18,9 @@ from baselines.agents.egos import PlayMode, find_agent
 from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.results import Result
 from baselines.methods.options import ModelOptions
+from baselines.report.results import as_run
 from baselines.training.histories import prepare, read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.trainer import train
@@ -66,7 +69,22 @@ def test_it_plays_as_the_run_does(run, models, tmp_path):
     assert [result.settings["agent"] for result in found] == ["AD+mlp", "ad-tiny"]
     assert found[0].returns == found[1].returns
     assert found[1].settings["details"]["model"] == "ad-tiny"
-    assert found[1].settings["details"]["trained_on"] == read_trained(run).trained_on
+    assert found[1].settings["details"]["trained_on"] == {"teammate": read_trained(run).trained_on}
+
+
+def test_marks_are_those_of_the_model_of_the_track():
+    """The model of one track was trained with H2, that of the other was not."""
+    entries = {
+        "teammate": [{"layout": "demo_wide", "family": "H1"}],
+        "layout": [{"layout": "cramped_up", "family": "H2"}],
+    }
+    settings = {"agent": "two", "seeds": [0], "protocol": asdict(get_protocol("seeded")), "code_version": "0"}
+    settings |= {"details": {"model": "two", "trained_on": entries}}
+    tasks = [published_task(layout, "H2/t0") for layout in ("demo_wide", "cramped_down")]
+    run = as_run([Result(task.task_id, settings, [[0.0] * 100]) for task in tasks])
+    assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]
+    assert run.overlaps([("demo_wide", "H2")]) == ()
+    assert run.overlaps([("cramped_down", "H2")]) == ("family",)
 
 
 def test_layouts_of_other_tracks(models):
