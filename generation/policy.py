@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key
 
+from icrl4aht_data.overcooked.actions import ACTIONS
+
 Noise = Literal["fixed", "seeded"]
 """Source of a heuristic teammate's randomness: "fixed", the published PRNGKey(slot) in every episode, for results that
 compare with the paper's; or "seeded", a new key in every episode."""
@@ -31,6 +33,13 @@ class Policy(NamedTuple):
     init: Callable[[Any, Key[Array, ""]], Any]
     act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]
     sees: Literal["state", "observation", "percept"]
+
+
+def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:
+    """Returns an action, or with a chance one that is drawn uniformly from the six actions."""
+    whether, which = jax.random.split(key)
+    drawn = jax.random.randint(which, (), 0, len(ACTIONS))
+    return jnp.where(jax.random.uniform(whether) < chance, drawn, action)
 
 
 def stacked(trees: Iterable[Any]) -> Any:

@@ -32,7 +32,7 @@ from baselines.methods.tokens import StepInput, percept_step
 from baselines.methods.view_change import ViewChange, no_change
 from baselines.online.teammates import mixed_chances, with_manners
 from baselines.training.options import PlayOptions, TrainOptions
-from generation.experts.oracle import oracle
+from generation.collection.curate import follow_oracle
 from generation.learners.config import PPOConfig
 from generation.learners.ppo import PPO, Sequences, ppo_optimizer
 from generation.policy import Policy
@@ -217,7 +217,7 @@ class _GroupPlayer:
             partner=jnp.zeros((1, self.tasks), jnp.int32),
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
-            expert=own.actions(_oracle_actions(layout, record, taken)),
+            expert=own.actions(follow_oracle(layout, record, taken)),
         )
 
 
@@ -264,19 +264,6 @@ def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
         return memory.change.actions(action), memory._replace(state=state, started=jnp.bool_(True))
 
     return Policy({}, init, act, "percept")
-
-
-def _oracle_actions(layout: Layout, record: Array, taken: Int[Array, "T B"]) -> Int[Array, "T B"]:
-    """Returns what the scripted oracle would do in each state of an episode in which others acted."""
-    script, key = oracle(layout), jax.random.key(0)  # which draws nothing
-    act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
-
-    def step(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
-        wanted, memory = act((), memory, now[0], key)
-        return memory._replace(action=now[1].astype(jnp.int32)), wanted
-
-    memory = jax.vmap(lambda _: script.init((), key))(taken[0])
-    return jax.lax.scan(step, memory, (record, taken))[1]
 
 
 class StepNumbers:

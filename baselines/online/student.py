@@ -30,7 +30,7 @@ from baselines.evaluate.protocols import get_protocol
 from generation.collection.curate import oracle_labels
 from generation.collection.noise_rollout import noise_schedules
 from generation.learners.resume import differing_settings, xla_threads
-from generation.policy import Policy
+from generation.policy import Policy, sometimes_random
 from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks
@@ -40,7 +40,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, episode_ends
-from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -112,9 +112,7 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
         label, other = clean, None
         if labeller is not None:
             label, other = labeller.act(params[1], memory.labeller, view, jax.random.fold_in(key, 2))
-        whether, which = jax.random.split(jax.random.fold_in(key, 1))
-        drawn = jax.random.randint(which, (), 0, len(ACTIONS))
-        action = jnp.where(jax.random.uniform(whether) < memory.chance, drawn, clean).astype(jnp.int32)
+        action = sometimes_random(jax.random.fold_in(key, 1), memory.chance, clean).astype(jnp.int32)
         labels = memory.labels.at[memory.steps % length].set(label.astype(jnp.int8))
         return action, NoisyMemory(own, memory.chance, memory.steps + 1, labels, other)
 
@@ -263,8 +261,8 @@ def collect_release(
 ) -> Path:
     """Play histories with every teammate, and write them as a release of source `student`.
 
-    Finished groups of tasks are kept in a folder beside `out` until the release is complete, so that the same call
-    resumes a stopped one.
+    Until the release is complete, finished groups of tasks are kept in the folder `out` with the ending `.parts`, from
+    which the same call resumes.
 
     Args:
         agent: the agent.
@@ -278,7 +276,7 @@ def collect_release(
 
     Raises:
         OptionError: if `out` may not be written, if an agent does not fit a layout or the labeller sees something else
-            than the agent, or if the parts beside `out` are of other settings.
+            than the agent, or if the saved parts are of other settings.
     """
     out = out.resolve()
     check_target(out, overwrite, [teammates.root])

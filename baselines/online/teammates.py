@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from generation.policy import Policy
-from icrl4aht_data.overcooked.actions import ACTIONS, STAY
+from generation.policy import Policy, sometimes_random
+from icrl4aht_data.overcooked.actions import STAY
 
 MANNERS = ("script", "stay", "random", "noisy")
 """Manners of a teammate, in the order of its chances."""
@@ -64,9 +64,7 @@ def _with_manners(policy: Policy) -> Policy:
     def act(params: Any, memory: tuple[jax.Array, Any], view: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         manner, script = memory
         action, script = policy.act(params["script"], script, view, key)
-        whether, which = jax.random.split(jax.random.fold_in(key, 1))
-        drawn = jax.random.randint(which, (), 0, len(ACTIONS))
-        action = jnp.where(jax.random.uniform(whether) < noise[manner], drawn, action)
+        action = sometimes_random(jax.random.fold_in(key, 1), noise[manner], action)
         return jnp.where(manner == MANNERS.index("stay"), STAY, action).astype(jnp.int32), (manner, script)
 
     return Policy({}, init, act, policy.sees)

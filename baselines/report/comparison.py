@@ -1,4 +1,4 @@
-"""docs/results.md: reference models beside the reference egos and the paper's numbers, from stored results.
+"""The page docs/results.md, which compares reference models with the reference egos and the paper's numbers.
 
 `cards/results.json` has, for each agent and protocol, what each test task and seed earned: the mean return, and those
 of the first and the last 20 episodes. The page is computed from it, from the returns of the reference egos and from the

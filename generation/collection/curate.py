@@ -160,17 +160,27 @@ def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array
 @lru_cache(maxsize=8)
 def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """A function of records (100, E, S) and the ego's actions (100, E) to the oracle's actions, int8 (100, E)."""
+    return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
+
+
+def follow_oracle(layout: Layout, records: jax.Array, taken: jax.Array) -> jax.Array:
+    """Returns what the scripted oracle would do in each state of episodes in which another ego acted.
+
+    Args:
+        layout: the layout.
+        records: uint8 (T, E, S), state records of E episodes.
+        taken: int (T, E), the ego's actions.
+
+    Returns:
+        int32 (T, E).
+    """
     script, key = oracle(layout), jax.random.key(0)  # which draws nothing
     act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
 
-    @jax.jit
-    def follow(records: jax.Array, taken: jax.Array) -> jax.Array:
-        def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
-            record, action = now
-            wanted, memory = act((), memory, record, key)
-            return memory._replace(action=action.astype(jnp.int32)), wanted.astype(jnp.int8)
+    def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+        record, action = now
+        wanted, memory = act((), memory, record, key)
+        return memory._replace(action=action.astype(jnp.int32)), wanted
 
-        memory = jax.vmap(lambda _: script.init((), key))(jnp.arange(records.shape[1]))
-        return jax.lax.scan(step, memory, (records, taken))[1]
-
-    return follow
+    memory = jax.vmap(lambda _: script.init((), key))(jnp.arange(records.shape[1]))
+    return jax.lax.scan(step, memory, (records, taken))[1]

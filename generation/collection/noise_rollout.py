@@ -21,10 +21,10 @@ from jaxtyping import Array, Float, Int, Int8, Key, UInt8
 from generation.env import Environment, EnvState
 from generation.experts.oracle import oracle
 from generation.learners.rollout import Player, init_rollout, policy_player, roll_out
-from generation.policy import Policy
+from generation.policy import Policy, sometimes_random
 from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
 EPISODES_AT_ONCE = 256
@@ -143,15 +143,10 @@ def _noisy_oracle(env: Environment, chance: Float[Array, " M"]) -> Player:
     """
     script, fold = policy_player(env, oracle(env.layout), (), EGO, chance.shape[0]), jax.vmap(jax.random.fold_in)
 
-    def draw(key: Key[Array, ""], chance: Float[Array, ""], clean: Int[Array, ""]) -> Int[Array, ""]:
-        whether, which = jax.random.split(key)
-        drawn = jax.random.randint(which, (), 0, len(ACTIONS))
-        return jnp.where(jax.random.uniform(whether) < chance, drawn, clean)
-
     def act(memory: Any, state: EnvState, key: Key[Array, ""]) -> Any:
         choice, memory = script.act(memory, state, key)
         own = fold(env.episode_key(state), jnp.full_like(state.clock, _NOISE))
-        action = jax.vmap(draw)(fold(own, state.clock), chance, choice.action)
+        action = jax.vmap(sometimes_random)(fold(own, state.clock), chance, choice.action)
         return NoisyChoice(action, choice.action), memory._replace(action=action)
 
     return script._replace(act=act)

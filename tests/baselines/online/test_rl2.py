@@ -91,10 +91,10 @@ def test_the_state_carries_over_steps_and_calls():
 
 
 def test_episodes_for_learning(trainer):
-    """What is learned from is what the model saw and did: its recomputed policy is the one that played."""
+    """The sequences to learn from contain the observations, actions and rewards of the episode that was played."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
-    for number in range(3):  # the second and third episodes go on with the tasks that did not end
+    for number in range(3):  # tasks that did not end continue in the next episode
         after, played, returns = player.episode(state.params, trainer._mates[0], tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (100, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
