@@ -20,18 +20,19 @@ from typing import Any, NamedTuple
 
 from baselines.agents.egos import Acting, PlayMode, find_agent
 from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import EVALUATION_SPLITS, get_protocol, limit_tasks
+from baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
 from baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from baselines.methods.registry import get_method
 from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import REPORT_BEGINS, write_report
+from baselines.training.ablations import ABLATIONS, ExperimentEntry
 from baselines.training.histories import TrainingTask, filter_histories, prepare
 from baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
-from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
@@ -44,23 +45,6 @@ CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""
 
 
-@dataclass(frozen=True)
-class ExperimentEntry:
-    """One model of an experiment: the differences from the default settings.
-
-    Attributes:
-        name: of its folder, without the method.
-        model: values of `ModelOptions`.
-        train: values of `TrainOptions`.
-        variant: of a sweep: the varied quantity and its value.
-    """
-
-    name: str
-    model: dict[str, Any] = field(default_factory=dict)
-    train: dict[str, Any] = field(default_factory=dict)
-    variant: dict[str, Any] | None = None
-
-
 class Experiment(NamedTuple):
     """Entries of an experiment, and the layouts that the paper runs them on.
 
@@ -71,6 +55,7 @@ class Experiment(NamedTuple):
         varies: options that distinguish the entries and can therefore not be set for all of them.
         held_out: whether to evaluate with learned teammates held out of training, on the training layouts.
         acting: way of acting of the trained models; see `agents.egos.ACTING`.
+        methods: the methods that it is about.
     """
 
     title: str
@@ -79,6 +64,7 @@ class Experiment(NamedTuple):
     varies: tuple[str, ...] = ()
     held_out: bool = False
     acting: Acting = "cached"
+    methods: tuple[str, ...] = ("ad", "dpt")
 
 
 def _size_entry(name: str) -> ExperimentEntry:
@@ -112,6 +98,16 @@ EXPERIMENTS = {
         ("test_wide", "demo_wide", "cramped_up"),
         varies=("teammate_actions", "next_obs"),
     ),
+    **{
+        name: Experiment(
+            ablation.title,
+            ablation.entries,
+            ("demo_wide",),
+            varies=("context", "teammate_actions", "next_obs", "positions", "label_smoothing", "reward_scale"),
+            methods=(ablation.method,),
+        )
+        for name, ablation in ABLATIONS.items()
+    },
     "heldout-rl": Experiment(
         "Held-out learned teammates", (ExperimentEntry("plain"),), tuple(TESTED_ON), held_out=True
     ),
@@ -124,7 +120,7 @@ class ExperimentPlan:
     """Settings of an experiment's run; the defaults are the paper's.
 
     Attributes:
-        methods: to train.
+        methods: to train; those of the experiment by default.
         layouts: to train on, one model each; by default those of the experiment that the release has. `ALL_LAYOUTS`
             alone for one model of all layouts that the release has, which is tested on the layouts of all of them.
         channels: channels of the models' observations, see `HistoryOptions`.
@@ -135,7 +131,8 @@ class ExperimentPlan:
         model: values of `ModelOptions` for all entries.
         filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
         values: names of the entries to run; all by default.
-        split: split of the tasks to evaluate on: "test", the default, or "validation", on the training layouts.
+        split: which tasks to evaluate on, see `EVALUATION_SPLITS`: "test", the default, or others, on the training
+            layouts.
         families: teammate families to evaluate with; all by default.
         tasks: tasks of each teammate kind and layout, at most.
         episodes: of a task; the protocol's by default.
@@ -147,7 +144,7 @@ class ExperimentPlan:
         save_minutes: most minutes between checkpoints of a training.
     """
 
-    methods: tuple[str, ...] = ("ad", "dpt")
+    methods: tuple[str, ...] = ()
     layouts: tuple[str, ...] = ()
     channels: Channels | None = None
     root: str | None = None
@@ -211,7 +208,7 @@ def run_experiment(
     entries = _chosen_entries(name, plan)
     layouts, notes = _training_layouts(experiment, plan)
     tasks = {layout: _test_tasks(experiment, plan, layout) for layout in layouts}
-    models = list(product(plan.methods, entries, layouts))
+    models = list(product(plan.methods or experiment.methods, entries, layouts))
     chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
     if any(histories["channels"] == "canonical" for histories in chosen):
         notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
@@ -219,8 +216,9 @@ def run_experiment(
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
-        _train_entry(method, entry, layout, plan, folder / "run", progress)
-        _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
+        run = out / f"{method}-{entry.run_of or entry.name}" / layout / "run"
+        _train_entry(method, entry, layout, plan, run, progress)
+        _evaluate_entry(experiment, entry, tasks[layout], plan, run, folder / "results", progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
     check_new_files(out / "report", overwrite=True, begins={card_name(run): CARD_BEGINS for run in runs})
@@ -237,6 +235,8 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
     experiment = EXPERIMENTS[name]
     for method in plan.methods:
         get_method(method)
+        if method not in EXPERIMENTS[name].methods and len(EXPERIMENTS[name].methods) == 1:
+            raise unknown(f"method of {name}", method, EXPERIMENTS[name].methods)
     names = [entry.name for entry in experiment.entries]
     for value in plan.values:
         if value not in names:
@@ -314,11 +314,8 @@ def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> li
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
         split = plan.split or "test"
-        if split not in EVALUATION_SPLITS:
-            raise unknown("split to evaluate on", split, EVALUATION_SPLITS)
         played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
-        tasks = read_tasks(manifest_path(track_of(played_on), split))
-        tasks = [task for task in tasks if task.layout.name == played_on]
+        tasks = [task for task in bundled_tasks(track_of(played_on), split) if task.layout.name == played_on]
         if not tasks:
             raise EmptySelectionError(f"no {split} tasks on {played_on}: choose another --layout, or --split test")
     available = dict.fromkeys(task.teammate_family for task in tasks)
@@ -377,7 +374,7 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
     size = SIZES[plan.size]
     options = TrainOptions(**{**size.train, **entry.train, **plan.train})
     model = ModelOptions(**{**size.model, **entry.model, **plan.model})
-    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters)
+    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters, **entry.histories)
     try:
         return prepare(method, model, options, histories)
     except (EmptySelectionError, LabelsMissingError, OptionError) as error:
@@ -416,10 +413,11 @@ def _evaluate_entry(
     entry: ExperimentEntry,
     tasks: Sequence[Task],
     plan: ExperimentPlan,
+    run: Path,
     folder: Path,
     progress: ExperimentProgress,
 ) -> None:
-    agent = find_agent(str(folder / "run"), PlayMode(plan.acting or experiment.acting))
+    agent = find_agent(str(run), PlayMode(plan.acting or experiment.acting, greedy=not entry.sampled))
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
     names = list(dict.fromkeys(task.layout.name for task in tasks))
     what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"
@@ -431,9 +429,9 @@ def _evaluate_entry(
         protocol,
         seeds=range(plan.seeds),
         suite=plan.suite,
-        out=folder / "results",
+        out=folder,
         details=details,
         played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
     )
-    own = experiment.held_out or plan.split == "validation"
-    note_results(folder / "results", folder / "run", tasks if own else ())
+    own = experiment.held_out or plan.split in ("validation", "diverse")
+    note_results(folder, run, tasks if own else ())

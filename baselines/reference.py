@@ -23,13 +23,13 @@ from typing import Any, Literal, NamedTuple
 from baselines.agents.bundled import MODEL_CARD, MODELS
 from baselines.agents.egos import AS_PUBLISHED, FORGETS, PlayMode, find_agent
 from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.protocols import bundled_tasks, get_protocol
 from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from baselines.online.prepare import prepare_play
 from baselines.online.student import collect_release, release_teammates
 from baselines.report.comparison import cells_with_headroom
 from baselines.report.model_card import model_card
-from baselines.report.results import merge, note_results, read_run, shipped_validation_tasks
+from baselines.report.results import merge, note_results, read_run
 from baselines.training.histories import prepare, read_trained, start_from
 from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.trainer import format_loss, train
@@ -78,7 +78,7 @@ class Recipe:
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
-_TEACHER: dict[str, Any] = {**RL2_SETTINGS["train"], "steps": 1400}
+_TEACHER: dict[str, Any] = {**RL2_SETTINGS["train"], "steps": 1600}
 
 RECIPES = {
     "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER, mode=PlayMode(greedy=False)),
@@ -103,6 +103,12 @@ TRACK_VIEWS: dict[str, dict[str, Any]] = {
 """Track -> values of `HistoryOptions` for all of its models. Models of the layout track are tested on other layouts
 than they are trained on, so they learn from mirrored games, too; asymm_right has no recipe indicator that the ego could
 see, so that of asymm_both is hidden from them."""
+
+TRACK_PLAY: dict[str, dict[str, Any]] = {
+    "teammate": {},
+    "layout": {"rearranged": 6, "four_recipes": True},
+}
+"""Track -> values of `PlayOptions` for its models that learn by playing."""
 
 TEACHER_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
 """Histories of RL^2 with each teammate: the last fifth of a history, or more, is without noise."""
@@ -185,6 +191,10 @@ class _Making:
     def layouts(self) -> tuple[str, ...]:
         return TRACKS[self.track]["train"]
 
+    def diverse(self, split: str) -> list[Task]:
+        """Returns the tasks with diverse teammates, of split "train" or "validation"."""
+        return read_tasks(manifest_path(self.track, split, "diverse"))
+
     def noise_release(self) -> Path:
         """Returns the release of noise histories, which is made if it is missing."""
         folder = self.out / "noise"
@@ -199,7 +209,8 @@ class _Making:
         recipe, folder = RECIPES[name], self.out / f"{name}-{self.track}"
         options = TrainOptions(**recipe.train)
         choice = HistoryOptions(self.layouts, str(self.noise_release()), **TRACK_VIEWS[self.track])
-        job = prepare_play(recipe.method, ModelOptions(**recipe.model), options, PlayOptions(), choice)
+        play, tasks = PlayOptions(**TRACK_PLAY[self.track]), self.diverse("train")
+        job = prepare_play(recipe.method, ModelOptions(**recipe.model), options, play, choice, tasks)
         train(
             job.method,
             job.data,
@@ -217,7 +228,7 @@ class _Making:
         if not folder.is_dir():
             agent = find_agent(str(self.play()), PlayMode(greedy=False))
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
-            teammates = release_teammates(dataset, unreliable=True)
+            teammates = release_teammates(dataset, tasks=self.diverse("train"))
             collect_release(agent, teammates, TEACHER_HISTORIES, folder, progress=self.show)
         return folder
 
@@ -245,7 +256,7 @@ class _Making:
         if not mixed.is_dir():
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
             labeller = find_agent(str(self.play()))
-            teammates = release_teammates(dataset, number, unreliable=True)
+            teammates = release_teammates(dataset, number, self.diverse("train"))
             agent = find_agent(str(before), PlayMode(greedy=False))
             if not own.is_dir():
                 collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
@@ -273,7 +284,7 @@ class _Making:
     def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
         """Returns the folders of a model's results, by the kind of tasks."""
         found = {}
-        kinds = [("validation", "seeded", 1, False)]
+        kinds = [("validation", "seeded", 1, False), ("diverse", "seeded", 1, False)]
         kinds += [(f"test-{protocol}", protocol, seeds, False) for protocol, seeds in recipe.protocols.items()]
         kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
         for kind, protocol, seeds, forgets in kinds:
@@ -290,15 +301,15 @@ class _Making:
                 details=agent.details,
                 played=counted(self.show, f"{name}, {kind}", len(tasks) * seeds * played.episodes),
             )
-            note_results(folder, run, tasks if kind == "validation" else ())
+            note_results(folder, run, () if kind.startswith("test") else tasks)
             found[kind] = folder
         return found
 
     def _tasks(self, kind: str) -> list[Task]:
-        if kind == "validation":
-            return [task for task in shipped_validation_tasks().values() if task.layout.name in self.layouts]
+        if kind in ("validation", "diverse"):
+            return bundled_tasks(self.track, kind)
         headroom = {layout for layout, _ in cells_with_headroom("seeded")}
-        return [task for task in read_tasks(manifest_path(self.track, "test")) if task.layout.name in headroom]
+        return [task for task in bundled_tasks(self.track, "test") if task.layout.name in headroom]
 
     def _progress(self, what: str, steps: int) -> Callable[[int, float | None], None]:
         return lambda step, loss: self.show(what, step, steps, format_loss(loss))

@@ -253,16 +253,21 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of the test and validation tasks.
+    """Write the manifests of the test and validation tasks, and of tasks with diverse teammates.
 
-    Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl from the drawn teammates that
-    `draws` measured. Files that have these tasks are kept.
+    Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
+    TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured. Files that have these tasks are kept.
     """
-    from generation.teammates.draws import validation_tasks
+    from generation.teammates.draws import diverse_tasks, validation_tasks
 
-    made = {"test": published_tasks, "validation": validation_tasks}
-    for track, split in [(track, split) for split in made for track in TRACKS]:
-        path, tasks = manifest_path(track, split), made[split](track)
+    made = [(manifest_path(track, "test"), published_tasks(track)) for track in TRACKS]
+    made += [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
+    made += [
+        (manifest_path(track, split, "diverse"), diverse_tasks(track, split))
+        for track in TRACKS
+        for split in ("train", "validation")
+    ]
+    for path, tasks in made:
         path = out / path.name if out else path
         if check or path.is_file():
             different = read_tasks(path) != tasks
@@ -291,9 +296,9 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
 def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
     """Measure the heuristic teammates that tasks may draw.
 
-    Draws parameters from the training ranges, 32 for training and 8 for validation of each family on each layout, and
-    writes for each draw which test instance acts most like it, and what the egos stay, random and oracle earn with it.
-    Layouts that the table has are kept, so that a stopped command resumes.
+    Draws parameters from the training ranges and diverse ones, of each 32 for training and 8 for validation of each
+    family on each layout. Writes for each draw which test instance acts most like it, and what the egos stay, random
+    and oracle earn with it. Layouts that the table has are kept, so that a stopped command resumes.
     """
     from generation.teammates.draws import DRAWS_TABLE
     from generation.teammates.measuring import fill_draws_table

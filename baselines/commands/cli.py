@@ -26,6 +26,7 @@ from baselines.commands.options import (
     hide_recipe_option,
     history_filters,
     join_processes,
+    manifests_option,
     model_options,
     play_options,
     prepare_method,
@@ -47,7 +48,7 @@ from baselines.training.options import HistoryOptions
 from baselines.training.stopping import TrainingStopped
 from generation.teammates.instances import INSTANCES, published_task
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
-from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     COUNT,
@@ -156,22 +157,23 @@ def evaluate_command(
 
     Plays 100 episodes of each task and writes one JSON file per task into OUT/tasks. Finished tasks are kept. Choose
     models by the validation tasks: their layouts are in training, their teammates are in neither training nor test.
+    Split diverse has validation tasks with more kinds of teammates than the published training ranges.
     """
     from baselines.evaluate.evaluator import evaluate
-    from baselines.evaluate.protocols import get_protocol, limit_tasks
+    from baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
     from baselines.report.results import note_results
 
     if manifest and split:
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
-    paths = [manifest] if manifest else [manifest_path(name, split or "test") for name in track]
+    split = split or "test"
+    given = read_tasks(manifest) if manifest else [task for name in track for task in bundled_tasks(name, split)]
     ego = find_ego("--agent", agent, acting=acting, greedy=not sampled, forget=forget)
     names = {get_layout(name).name for name in layout}
-    chosen = limit_tasks(
-        [task for path in paths for task in read_tasks(path) if not names or task.layout.name in names], tasks
-    )
+    chosen = limit_tasks([task for task in given if not names or task.layout.name in names], tasks)
     if not chosen:
         raise EmptySelectionError(
-            f"no task on {', '.join(sorted(names))} in {', '.join(map(str, paths))}: choose another --layout, or none"
+            f"no task on {', '.join(sorted(names))} in {manifest or f'the {split} tasks'}: choose another --layout, or "
+            f"none"
         )
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
@@ -188,7 +190,7 @@ def evaluate_command(
             details=ego.details,
             played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
         )
-    note_results(out, ego.run, chosen if manifest or split == "validation" else ())
+    note_results(out, ego.run, chosen if manifest or split != "test" else ())
     noun = "result" if len(chosen) == 1 else "results"
     _console.print(f"{len(chosen)} {noun} in {out}; `python -m baselines report {out}` shows them")
 
@@ -350,6 +352,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @hide_recipe_option
 @history_filters
 @play_options
+@manifests_option
 @save_minutes_option
 @tensorboard_option
 @process_options
@@ -366,6 +369,7 @@ def train_command(
     hide_recipe: tuple[str, ...],
     filters: dict[str, Any],
     play: dict[str, Any],
+    manifests: tuple[Path, ...],
     save_minutes: float,
     tensorboard: bool,
     coordinator: str | None,
@@ -375,7 +379,7 @@ def train_command(
     """Train a model on learning histories.
 
     METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories;
-    --epochs to --imitation-end are its own. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
+    --epochs to --manifest are its own. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
     the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second
     Ctrl-C does not wait for it.
     """
@@ -391,9 +395,9 @@ def train_command(
     if plays and processes > 1:
         raise click.UsageError(f"--processes {processes}: {method} is trained by one process on one device")
     if plays:
-        job, options, description = prepare_rl2(size, model, train, play, choice)
+        job, options, description = prepare_rl2(size, model, train, play, choice, manifests)
     else:
-        job, options, description = prepare_method(method, size, model, train, play, choice)
+        job, options, description = prepare_method(method, size, model, train, play, choice, manifests)
     _console.print(description, highlight=False)
     with bars(edges=True, unit="steps") as show:
 
@@ -434,7 +438,8 @@ def sweep_command(what: str, **options: Any) -> None:
 def ablate_command(what: str, **options: Any) -> None:
     """Train and evaluate with and without parts.
 
-    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
+    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both; or windows (of AD) or contexts (of DPT):
+    length, episodes, labels and inputs, one difference each. Writes runs, results and OUT/report.
     """
     _run_experiment(f"ablate {what}", **options)
 

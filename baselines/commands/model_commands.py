@@ -9,8 +9,17 @@ from typing import Any
 import click
 from rich.console import Console
 
-from baselines.commands.options import EGO_NAME, REFERENCE_NAME, find_ego, history_filters, root_option, sampled_option
+from baselines.commands.options import (
+    EGO_NAME,
+    REFERENCE_NAME,
+    find_ego,
+    history_filters,
+    manifests_option,
+    root_option,
+    sampled_option,
+)
 from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import FiniteRange
 from icrl4aht_data.commands.options import (
     COUNT,
@@ -59,7 +68,7 @@ _console = Console(soft_wrap=True)
 @click.option(
     "--labeller", type=EGO_NAME, help="Another agent, such as rl2-reference, whose choices become the expert actions."
 )
-@click.option("--unreliable", is_flag=True, help="Also play with heuristics that do nothing, hesitate or err.")
+@manifests_option
 @click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
@@ -73,7 +82,7 @@ def collect_command(
     episodes: int,
     noise: tuple[float, float],
     labeller: str | None,
-    unreliable: bool,
+    manifests: tuple[Path, ...],
     number: int,
     out: Path,
     overwrite: bool,
@@ -93,7 +102,8 @@ def collect_command(
     other = find_ego("--labeller", labeller) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
-    teammates = release_teammates(dataset, number, unreliable)
+    tasks = [task for manifest in manifests for task in read_tasks(manifest)]
+    teammates = release_teammates(dataset, number, tasks)
     with bars(edges=True, unit="episodes") as show:
         options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
         collect_release(ego, teammates, config, out, **options)
@@ -153,11 +163,16 @@ def reference_command(
     ),
 )
 @click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
+@click.option(
+    "--ablation", type=Folder(), metavar="FOLDER", help="Also add results of `ablate windows` or `ablate contexts`."
+)
 @click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
 @click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
 @overwrite_option
-def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, overwrite: bool) -> None:
+def results_command(
+    runs: tuple[Path, ...], ablation: Path | None, about: str, out: Path, store: bool, overwrite: bool
+) -> None:
     """Compare reference models with the paper's numbers.
 
     Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
@@ -165,6 +180,7 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
     """
     from baselines.report.comparison import (
         RESULTS_BEGINS,
+        add_ablation,
         add_results,
         read_stored,
         results_file,
@@ -176,6 +192,8 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
     stored = read_stored(results_file())
     for folder in runs:
         stored = add_results(stored, folder, about)
+    if ablation:
+        stored = add_ablation(stored, ablation)
     if store:
         write_stored(results_file(), stored)
     for path in write_comparison(stored, out):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import click
 from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES
+from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
@@ -104,7 +105,7 @@ experiment_acting_option = click.option(
 evaluation_split_option = click.option(
     "--split",
     type=_EVALUATION_SPLIT,
-    help="Tasks of this split: test, or validation, by which models are chosen.",
+    help="Which tasks: test, or validation and diverse, by which models are chosen.",
     show_default="test",
 )
 tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
@@ -162,6 +163,14 @@ def history_filters(command: Any) -> Any:
     return decorated
 
 
+manifests_option = click.option(
+    "--manifest",
+    "manifests",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    multiple=True,
+    help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
+)
 hide_recipe_option = click.option(
     "--hide-recipe",
     type=LAYOUT,
@@ -240,14 +249,26 @@ def prepare_method(
     train: Mapping[str, Any],
     play: Mapping[str, Any],
     histories: HistoryOptions,
+    manifests: Sequence[Path] = (),
 ) -> tuple[Any, TrainOptions, str]:
     """Returns the training of a method on histories, its options, and text that describes it.
+
+    Args:
+        method: its name.
+        size: name of the model's size, see `sized_settings`.
+        model: given values of `ModelOptions`.
+        train: given values of `TrainOptions`.
+        play: given values of `PlayOptions`; expected to be empty.
+        histories: to train on.
+        manifests: files of tasks to play; expected to be empty.
 
     Raises:
         click.UsageError: for options of methods that learn by playing.
     """
     from baselines.training.histories import prepare
 
+    if manifests:
+        raise click.UsageError(f"--manifest: not with {method}, only with rl2, which learns by playing")
     if play:
         raise click.UsageError(f"{_flags(play)}: not with {method}, only with rl2, which learns by playing")
     sized, options, description = sized_settings(size, model, train)
@@ -264,8 +285,17 @@ def prepare_rl2(
     train: Mapping[str, Any],
     play: Mapping[str, Any],
     histories: HistoryOptions,
+    manifests: Sequence[Path] = (),
 ) -> tuple[Any, TrainOptions, str]:
     """Returns the training of RL^2, its options, and text that describes it.
+
+    Args:
+        size: expected to be None.
+        model: given values of `ModelOptions`.
+        train: given values of `TrainOptions`.
+        play: given values of `PlayOptions`.
+        histories: with whose teammates to play.
+        manifests: files of tasks with whose teammates to play as well.
 
     Raises:
         click.UsageError: for options that only methods trained on histories have.
@@ -277,8 +307,9 @@ def prepare_rl2(
     if size or unused:
         raise click.UsageError(f"{_flags(unused or ['size'])}: not with rl2, which learns by playing")
     sized = ModelOptions(**RL2_SETTINGS["model"] | dict(model))
+    tasks = [task for manifest in manifests for task in read_tasks(manifest)]
     options = TrainOptions(**RL2_SETTINGS["train"] | dict(train))
-    job = prepare_play("rl2", sized, options, PlayOptions(**dict(play)), histories)
+    job = prepare_play("rl2", sized, options, PlayOptions(**dict(play)), histories, tasks)
     played = job.about["histories"]
     text = (
         f"rl2: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps {options.steps}, "
@@ -329,7 +360,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "held_out", "obs", "labels", "every", "mirror")
+_NOT_IN_EXPERIMENTS = ("order", "held_out", "obs", "labels", "every", "weights", "curriculum", "mirror")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:
@@ -340,8 +371,8 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             "methods",
             type=_HISTORY_METHOD,
             multiple=True,
-            default=("ad", "dpt"),
             help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",
+            show_default="ad and dpt; ad for `ablate windows`, dpt for `ablate contexts`",
         ),
         click.option(
             "--layout",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from generation.policy import Noise
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError, unknown
 
 
@@ -32,8 +32,29 @@ class Protocol:
     steps: int = KEPT_STEPS
 
 
-EVALUATION_SPLITS = ("test", "validation")
-"""Splits whose tasks are in the package: the published test tasks, and validation tasks, by which models are chosen."""
+FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
+"""Recipes of the published numbers on the layout track; a layout's own are the first and the last."""
+
+EVALUATION_SPLITS = ("test", "validation", "diverse")
+"""Tasks in the package: the published test tasks, and two sets of validation tasks, by which models are chosen. Their
+teammates are of the published training ranges, or diverse, see `generation.teammates.draws`."""
+
+
+def bundled_tasks(track: str, split: str) -> list[Task]:
+    """Returns the tasks of a track that are in the package.
+
+    Args:
+        track: the track.
+        split: one of `EVALUATION_SPLITS`.
+
+    Raises:
+        UnknownNameError: for an unknown track or split.
+    """
+    if split not in EVALUATION_SPLITS:
+        raise unknown("split to evaluate on", split, EVALUATION_SPLITS)
+    diverse = split == "diverse"
+    return read_tasks(manifest_path(track, "validation", "diverse") if diverse else manifest_path(track, split))
+
 
 PROTOCOLS = {
     "published": Protocol("published", noise="fixed", four_recipes=True),

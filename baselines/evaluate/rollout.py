@@ -17,14 +17,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from baselines.agents.host import HostPolicy, Percept
-from baselines.evaluate.protocols import Protocol
+from baselines.evaluate.protocols import FOUR_RECIPES, Protocol
 from generation.env import Environment, EnvState
 from generation.policy import Policy, stacked
 from icrl4aht_data.benchmark.facts import track_of
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
-_FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 _EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # streams of keys within an episode, next to those of the agents' slots
 
 
@@ -78,7 +77,7 @@ class EvaluationRollout:
     def env(self) -> Environment:
         """The environment of the layout under the protocol."""
         four = self.protocol.four_recipes and track_of(self.layout.name) == "layout"
-        recipes = np.array([self.layout.recipe_item(r) for r in _FOUR_RECIPES], np.uint8) if four else None
+        recipes = np.array([self.layout.recipe_item(r) for r in FOUR_RECIPES], np.uint8) if four else None
         return Environment(self.layout, self.protocol.steps, recipes)
 
     @property

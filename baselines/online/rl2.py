@@ -14,7 +14,7 @@ Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import TracebackType
@@ -103,7 +103,7 @@ def make_groups(
     teammates: Mapping[tuple[Layout, str], Sequence[Policy]],
     tasks: int,
     shares: Mapping[str, float],
-    hidden: Sequence[str] = (),
+    hidden: Collection[str] = (),
 ) -> list[TaskGroup]:
     """Divides tasks among layouts by their shares, and equally among the families of each layout.
 

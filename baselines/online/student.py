@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int, Int8
 from baselines.agents.egos import NamedEgo
 from baselines.evaluate.evaluator import prepare_rollout
 from baselines.evaluate.protocols import get_protocol
+from baselines.online.teammates import check_heuristics
 from generation.collection.curate import oracle_labels
 from generation.collection.noise_rollout import noise_schedules
 from generation.learners.resume import differing_settings, xla_threads
@@ -53,18 +54,6 @@ FIRST_SEED = 3_000_000
 
 _SEEDS = 100_000
 """Student tasks of one collection have seeds from a range of this size."""
-
-
-UNRELIABLE: dict[str, tuple[dict[str, float], ...]] = {
-    "recipe_aware_button": ({"idle_prob": 1.0}, {"idle_prob": 0.5}),
-    "territory": ({"behavior_mode": 3, "action_probability": 0.3},),
-    "assembly_line": ({"hesitation_prob": 1.0}, {"hesitation_prob": 0.5}, {"wrong_action_prob": 0.5}),
-}
-"""Kind of heuristic -> changes of its parameters that make a teammate which does nothing, hesitates or errs. A student
-learns to do without help only if some of its training teammates give none."""
-
-_VARIANT_IDS = 1000
-"""Numbers of the variants, above those of all draws."""
 
 
 class NoisyMemory(NamedTuple):
@@ -195,27 +184,35 @@ class Teammates(NamedTuple):
     root: str | Path
 
 
-def release_teammates(dataset: Dataset, number: int = 0, unreliable: bool = False) -> Teammates:
-    """Returns student tasks with the teammates of a selection's histories, each once, whatever the source.
+def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] = ()) -> Teammates:
+    """Returns student tasks with the teammates of a selection's histories and of other tasks, each once.
 
     Args:
         dataset: the selection.
         number: number of the collection, from 0, which decides the tasks' seeds.
-        unreliable: whether variants of the training heuristics are added that do little, see `UNRELIABLE`.
+        tasks: tasks with more teammates, heuristics; those on layouts that the selection has not are left out.
 
     Raises:
-        OptionError: if the release does not describe the teammates of all of these histories.
+        OptionError: if the release does not describe the teammates of all of these histories, or for tasks with learned
+            teammates.
     """
     path = Path(dataset.root) / PROVENANCE
     provenance = read_provenance(path) if path.is_file() else {}
     wanted = set(dataset.column("task_id").tolist())
+    listed = Path(dataset.root) / TASKS
+    known = [task for task in (read_tasks(listed) if listed.is_file() else []) if task.task_id in wanted]
+    missing = wanted - {task.task_id for task in known}
+    if missing:
+        raise OptionError(
+            f"{dataset.root}: {TASKS} does not describe {len(missing)} of {len(wanted)} tasks, such as "
+            f"{min(missing)}: choose a release that was made with its tasks"
+        )
+    check_heuristics(tasks)
+    layouts = {layout.name for layout in dataset.layouts}
     found: dict[tuple[str, str], Task] = {}
     references = {}
-    listed = Path(dataset.root) / TASKS
-    known = read_tasks(listed) if listed.is_file() else []
-    described = {task.task_id for task in known}
-    for task in known:
-        if task.task_id not in wanted or task.teammate_key in found:
+    for task in known + [task for task in tasks if task.layout.name in layouts]:
+        if task.teammate_key in found:
             continue
         seed = FIRST_SEED + number * _SEEDS + len(found)
         student = make_task(task.track, task.split, task.layout.name, task.teammate, seed)
@@ -223,29 +220,9 @@ def release_teammates(dataset: Dataset, number: int = 0, unreliable: bool = Fals
         made = provenance.get(task.task_id)
         if made is not None and made.references is not None:
             references[student.task_id] = made.references
-    missing = wanted - described
-    if missing:
-        raise OptionError(
-            f"{dataset.root}: {TASKS} does not describe {len(missing)} of {len(wanted)} tasks, such as "
-            f"{min(missing)}: choose a release that was made with its tasks"
-        )
-    tasks = list(found.values())
-    if unreliable:
-        tasks += _unreliable_tasks(tasks, FIRST_SEED + number * _SEEDS + len(tasks))
     suite = dataset.origin.below(TEAMMATES)
-    return Teammates(tasks, references, suite, str(dataset.origin) if dataset.origin.remote else dataset.root)
-
-
-def _unreliable_tasks(tasks: Sequence[Task], seed: int) -> list[Task]:
-    """Returns tasks with variants of the first training heuristic of each layout and kind, with seeds from `seed`."""
-    variants = []
-    first = {(task.layout.name, task.teammate_kind): task for task in reversed(tasks) if task.split == "train"}
-    for task in reversed(first.values()):
-        for changes in UNRELIABLE.get(task.teammate_kind, ()):
-            theta = task.teammate["theta"] | changes
-            teammate = task.teammate | {"theta": theta, "theta_id": _VARIANT_IDS + len(variants)}
-            variants.append(make_task(task.track, task.split, task.layout.name, teammate, seed + len(variants)))
-    return variants
+    root = str(dataset.origin) if dataset.origin.remote else dataset.root
+    return Teammates(list(found.values()), references, suite, root)
 
 
 def collect_release(

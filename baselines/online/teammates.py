@@ -7,7 +7,7 @@ one with several switches between episodes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from generation.policy import Policy, sometimes_random
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
 
 MANNERS = ("script", "stay", "random", "noisy")
@@ -31,6 +33,20 @@ MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
     (0.10, (0.25, 0.25, 0.25, 0.25)),
 )
 """Share of the tasks -> chances of `MANNERS` of their teammates."""
+
+
+def check_heuristics(tasks: Iterable[Task]) -> None:
+    """Check that all tasks have heuristic teammates.
+
+    Raises:
+        OptionError: names the first one that has not.
+    """
+    for task in tasks:
+        if task.teammate["kind"] != "heuristic":
+            raise OptionError(
+                f"task {task.task_id}: its teammate is learned; expected heuristics, which need no checkpoints: leave "
+                f"these tasks out of the manifest"
+            )
 
 
 def mixed_chances(tasks: int) -> np.ndarray:

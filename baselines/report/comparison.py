@@ -35,6 +35,7 @@ from baselines.report.results import (
     read_run,
 )
 from baselines.report.summary import bootstrap_interval
+from baselines.training.ablations import ABLATIONS
 from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
 from icrl4aht_data.errors import IndexFormatError, OptionError
@@ -79,7 +80,8 @@ class StoredResults:
     """Results of several agents.
 
     Attributes:
-        cells: (agent, protocol) -> cell -> returns.
+        cells: (agent, protocol) -> cell -> returns. Entries of ablations are stored like agents, with the experiment's
+            name instead of a protocol.
         about: agent -> one sentence on how it was made.
     """
 
@@ -272,10 +274,16 @@ def cells_table(stored: StoredResults, protocol: str, track: str, agents: Sequen
     return markdown_table(header, rows, right=len(header) - 2)
 
 
-def validation_table(stored: StoredResults, agents: Sequence[str]) -> str:
-    """Returns a table of mean returns with validation teammates, by which models are chosen."""
+def validation_table(stored: StoredResults, agents: Sequence[str], group: str) -> str:
+    """Returns a table of mean returns with validation teammates, by which models are chosen.
+
+    Args:
+        stored: the results.
+        agents: the agents of the columns.
+        group: "validation" for teammates of the published training ranges, or "diverse".
+    """
     found = {agent: stored.cells.get((agent, "seeded"), {}) for agent in agents}
-    cells = {cell for of_agent in found.values() for cell in of_agent if group_of(cell) == "validation"}
+    cells = {cell for of_agent in found.values() for cell in of_agent if group_of(cell) == group}
     rows = [
         [cell[0], family_of(cell), *(_cell_text(found[agent].get(cell)) for agent in agents)]
         for cell in sorted(cells, key=cell_order)
@@ -299,6 +307,55 @@ def gains_table(stored: StoredResults, protocol: str, agents: Sequence[str]) -> 
             row.append(f"**{text}**" if low > 0 else text)
         rows.append(row)
     return markdown_table(["layout", "family", *map(_code, agents)], rows)
+
+
+def add_ablation(stored: StoredResults, folder: Path) -> StoredResults:
+    """Returns stored results with those of an experiment `ablate windows` or `ablate contexts`.
+
+    Args:
+        stored: the results so far; the experiment's are replaced.
+        folder: the experiment's.
+
+    Raises:
+        OptionError: if the folder has results of no entry, or results of fewer episodes than `add_results` needs.
+    """
+    cells = dict(stored.cells)
+    for name, ablation in ABLATIONS.items():
+        for entry in ablation.entries:
+            found: dict[Cell, CellReturns] = {}
+            for results in sorted(folder.glob(f"{ablation.method}-{entry.name}/*/results")):
+                found |= _cell_returns(results, read_run(results))
+            if found:
+                cells[entry.name, name] = found
+    if cells.keys() == stored.cells.keys() and not any(folder.glob("*/*/results")):
+        raise OptionError(f"{folder}: no results of an ablation; expected a folder that `ablate windows` made")
+    return StoredResults(cells, stored.about)
+
+
+def ablation_table(stored: StoredResults, name: str) -> str:
+    """Returns a table with a row for each entry of an ablation.
+
+    Returns, their differences to the first entry, and gains are means over tasks and seeds, with 95 % bootstrap
+    intervals.
+    """
+    rows = []
+    first: Float[np.ndarray, " U"] | None = None
+    for entry in ABLATIONS[name].entries:
+        cells = stored.cells.get((entry.name, name))
+        if cells is None:
+            continue
+        mean = np.concatenate([cells[cell].mean for cell in sorted(cells, key=cell_order)])
+        gain = np.concatenate([cells[cell].gain for cell in sorted(cells, key=cell_order)])
+        first = mean if first is None else first
+        paired = mean - first if mean.shape == first.shape else None
+        difference = "" if paired is None or not paired.any() else _with_interval(paired, "+")
+        rows.append([_code(entry.name), entry.about, _with_interval(mean), difference, _with_interval(gain, "+")])
+    return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], rows)
+
+
+def _with_interval(values: Float[np.ndarray, " U"], sign: str = "") -> str:
+    low, high = bootstrap_interval(values, np.random.default_rng(0))
+    return f"{values.mean():{sign}z.1f} ({low:{sign}z.1f} to {high:{sign}z.1f})"
 
 
 def _code(name: str) -> str:
@@ -352,7 +409,10 @@ def render_page(stored: StoredResults, agents: Sequence[str]) -> str:
         published_layout=cells_table(stored, "published", "layout", rising),
         published_summary=summary_table(stored, "published"),
         gains=gains_table(stored, "seeded", agents),
-        validation=validation_table(stored, rising),
+        validation=validation_table(stored, rising, "validation"),
+        diverse=validation_table(stored, rising, "diverse"),
+        windows=ablation_table(stored, "ablate windows"),
+        contexts=ablation_table(stored, "ablate contexts"),
         marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
         references=", ".join(map(_code, REFERENCES)),
         forgets=f"`NAME{FORGETS}`",
@@ -381,6 +441,8 @@ def _seeds_text(stored: StoredResults) -> str:
     """Returns how often each agent played a test task under each protocol, as text."""
     texts = []
     for (agent, protocol), cells in stored.cells.items():
+        if protocol in ABLATIONS:
+            continue
         played = {
             len(found.mean) // published_instances(cell) for cell, found in cells.items() if published_instances(cell)
         }
@@ -390,4 +452,4 @@ def _seeds_text(stored: StoredResults) -> str:
 
 def shown_agents(stored: StoredResults) -> list[str]:
     """Returns the agents that have results, in the order in which they were stored."""
-    return list(dict.fromkeys(agent for agent, _ in stored.cells))
+    return list(dict.fromkeys(agent for agent, protocol in stored.cells if protocol not in ABLATIONS))

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from baselines.evaluate.protocols import bundled_tasks
 from baselines.evaluate.results import Result, read_result
 from baselines.report.overlap import OVERLAPS, find_overlaps
 from baselines.training.run_folder import read_config
 from baselines.training.seen import TRAINED_ON, SeenInTraining, read_trained_on
 from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LAYOUT_NAMES, TRACKS, track_of
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom
-from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, write_tasks
+from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.templates import card_file
@@ -45,6 +46,8 @@ GROUP_TEXTS = {
     "validation": "Validation tasks (split validation): training layouts with teammates that are drawn from the "
     "training ranges and are in no training history. They are for choosing models, so the returns of a model that was "
     "chosen by them are too high, and they are no test results.",
+    "diverse": "Validation tasks with diverse teammates: training layouts with drawn teammates that vary in more than "
+    "the published training ranges, and act unlike all test teammates. They are for choosing models, too.",
     "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
     "Their returns do not show generalisation.",
     "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
@@ -237,7 +240,7 @@ def as_run(
         raise OptionError(f"{where}: results of different settings in one run")
     known = published_test_tasks() | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
-        known = shipped_validation_tasks() | known
+        known = shipped_validation_tasks() | _diverse_tasks() | known
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
     played: dict[Cell, list[Task]] = defaultdict(list)
     for result in results:
@@ -288,13 +291,19 @@ def _find_seen(
 @cache
 def published_test_tasks() -> dict[str, Task]:
     """Returns the 160 published test tasks by id."""
-    return {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))}
+    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, "test")}
 
 
 @cache
 def shipped_validation_tasks() -> dict[str, Task]:
-    """Returns the package's validation tasks by id."""
-    return {task.task_id: task for track in TRACKS for task in read_tasks(manifest_path(track, "validation"))}
+    """Returns the package's validation tasks with teammates of the published training ranges, by id."""
+    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, "validation")}
+
+
+@cache
+def _diverse_tasks() -> dict[str, Task]:
+    """Returns the package's validation tasks with diverse teammates, by id."""
+    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, "diverse")}
 
 
 @cache
@@ -309,8 +318,10 @@ def published_instances(cell: Cell) -> int:
 
 def cell_of(task: Task) -> Cell:
     """Returns the cell of a task, see the module's docstring."""
-    published = task.task_id in published_test_tasks()
-    return task.layout.name, task.teammate_family + ("" if published else f" ({_GROUPS[task.split]})")
+    if task.task_id in published_test_tasks():
+        return task.layout.name, task.teammate_family
+    group = "diverse" if task.task_id in _diverse_tasks() else _GROUPS[task.split]
+    return task.layout.name, f"{task.teammate_family} ({group})"
 
 
 def count_text(number: int, noun: str) -> str:

@@ -29,6 +29,7 @@ from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
+from icrl4aht_data.sampling.draws import Curriculum
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
 
@@ -96,16 +97,13 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     about = {
         "model": asdict(model),
         "histories": asdict(histories)
+        | history_settings(dataset)
         | {
-            "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
-            "manifest_sha256": file_hash(dataset.root / MANIFEST),
-            "layouts": [layout.name for layout in dataset.layouts],
             "hide_recipe": hidden,
             "obs": dataset.obs,
             "channels": dataset.channels,
             "labels": labels,
             "obs_shape": list(dataset.obs_shape),
-            "data_version": dataset.info.data_version,
             "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
             "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
             "teammates_split": None if split.teammates is None else " and ".join(split.teammates.counts("split")),
@@ -113,6 +111,16 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
         TRAINED_ON: training_cells(split.train, labels),
     }
     return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
+
+
+def history_settings(dataset: Dataset) -> dict[str, Any]:
+    """Returns what a run's settings say of the release: root, hash of its manifest, data version, and layouts."""
+    return {
+        "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
+        "manifest_sha256": file_hash(dataset.root / MANIFEST),
+        "data_version": dataset.info.data_version,
+        "layouts": [layout.name for layout in dataset.layouts],
+    }
 
 
 def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
@@ -250,6 +258,10 @@ def _sampler(
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
     }
+    if histories.weights == "improvement":
+        shared["weights"] = _improvements(dataset)
+    if histories.curriculum:
+        shared["curriculum"] = Curriculum(max(1, round(histories.curriculum * options.steps)))
     if method.data == "ad":
         _check_thinned(dataset, options.context, every)
         return dataset.ad(length=options.context, every=every, labels=labels, **shared)
@@ -257,6 +269,11 @@ def _sampler(
         raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
     assert labels is not None
     return dataset.dpt(context=options.context, order=histories.order, labels=labels, **shared)
+
+
+def _improvements(dataset: Dataset) -> np.ndarray:
+    """Returns how much the return of each history rises; at least 1, a twentieth of a delivery."""
+    return np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
 
 
 def _check_thinned(dataset: Dataset, context: int, every: int) -> None:

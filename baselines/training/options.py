@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import Channels
@@ -54,6 +55,12 @@ class PlayOptions:
     entropy: float = option_field(0.01, "Weight of the entropy bonus.", at_least=0)
     task_end: float = option_field(1 / 16, "Chance that a task ends after an episode.", above=0, at_most=1)
     imitation: float = option_field(1.0, "Weight of imitating the oracle at the start.", at_least=0)
+    rearranged: int = option_field(
+        0, "Also play on so many versions of each layout whose piles, pots and counters changed places.", at_least=0
+    )
+    four_recipes: bool = option_field(
+        False, "Also play on each layout with the four recipes that the layout track has under the protocol published."
+    )
     imitation_end: float = option_field(0.5, "Share of the steps at which that weight has fallen to 0.", above=0)
 
     def __post_init__(self) -> None:
@@ -99,6 +106,15 @@ class HistoryOptions:
     )
     every: int = option_field(
         1, "Windows hold every n-th episode of a history, so that they span more of its learning.", at_least=1
+    )
+    weights: Literal["uniform", "improvement"] = option_field(
+        "uniform", "Draw histories uniformly, or by how much their returns rise (improvement)."
+    )
+    curriculum: float = option_field(
+        0.0,
+        "Share of the steps in which windows move from a history's first quarter to all of it.",
+        at_least=0,
+        at_most=1,
     )
     held_out: float = option_field(
         0.1,

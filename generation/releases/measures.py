@@ -18,7 +18,7 @@ import msgspec
 from generation.learners.resume import software_versions
 from generation.populations.headroom import learned_headroom
 from generation.teammates.distances import nearest_test
-from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, read_draws
+from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, ranges_of, read_draws
 from generation.teammates.references import REFERENCE_EPISODES, reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
@@ -127,7 +127,7 @@ def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
 
 @cache
 def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
-    return sample_teammate(family, theta_id, "train", base_seed)
+    return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
 
 
 def _facts_of_draw(draw: Draw) -> TeammateFacts:

@@ -1,9 +1,12 @@
-"""Heuristic teammates drawn from the published training ranges: which ones training and validation tasks may have.
+"""Drawn heuristic teammates: which ones training and validation tasks may have.
 
 `draws.jsonl` has one line per draw, measured by `python -m generation draws`, so that tasks are known without any
-simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws act alike,
-and on some layouts all draws of a family act like one of its test instances. Those are not admissible: no task has
-them.
+simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws from the
+published training ranges act alike, and on some layouts all draws of a family act like one of its test instances. Those
+are not admissible: no task has them.
+
+Diverse draws vary all of these parameters (`Heuristic.diverse`), for models that learn by playing. They must be
+farther from every test instance.
 """
 
 from __future__ import annotations
@@ -25,21 +28,37 @@ from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
 DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
 """Table of all draws."""
 
-DRAWS_PER_SEED = {0: 32, 1: 8}
-"""base_seed -> number of draws in the table, for each layout and family: 0 for training, 1 for validation."""
+DRAWS_PER_SEED = {0: 32, 1: 8, 2: 32, 3: 8}
+"""base_seed -> number of draws in the table, for each layout and family: 0 and 1 from the published training ranges,
+for training and validation; 2 and 3 diverse ones, for training and validation."""
 
-_OF_SEED = {0: "drawn training", 1: "drawn validation"}
+_OF_SEED = {0: "drawn training", 1: "drawn validation", 2: "diverse training", 3: "diverse validation"}
 
 _VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
 
+_DIVERSE_SEEDS = {"train": 2, "validation": 3}
+
+_DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # of each layout and family, at most
+
+_DIVERSE_DISTANCE = 0.1  # least distance of a diverse draw to every test instance, of all families
+
+
+def ranges_of(base_seed: int) -> str:
+    """Returns which ranges the draws of a seed come from: "train" or "diverse", see `sample_teammate`."""
+    return "diverse" if base_seed in _DIVERSE_SEEDS.values() else "train"
+
+
+def _least_distance(base_seed: int) -> float:
+    return _DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
+
 
 class Draw(NamedTuple):
-    """One draw on one layout: `sample_teammate(family, theta_id, "train", base_seed)`.
+    """One draw on one layout: `sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)`.
 
     Attributes:
         layout: short name of a training layout.
         family: kind of the heuristic, such as "utility_greedy".
-        base_seed: 0 for training, 1 for validation.
+        base_seed: see `DRAWS_PER_SEED`.
         theta_id: number of the draw, from 0.
         nearest: test instance of its family that acts most like it, such as "H3/t1".
         distance: Hamming distance to that instance, 0..1; see `generation.teammates.distances`.
@@ -47,8 +66,8 @@ class Draw(NamedTuple):
         stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
         random: mean return of the ego `random`.
         oracle: mean return of the ego `oracle`.
-        other: test instance of the other families that acts most like it. It excludes no draw, but such draws are
-            chosen last.
+        other: test instance of the other families that acts most like it. It excludes no draw of the published ranges,
+            but such draws are chosen last.
         other_distance: Hamming distance to that instance.
     """
 
@@ -67,8 +86,22 @@ class Draw(NamedTuple):
 
     @property
     def admissible(self) -> bool:
-        """Whether it acts unlike every test instance of its family."""
-        return self.distance >= SAME_BEHAVIOUR
+        """Whether it acts unlike every test instance of its family; if it is diverse, of all families, and more so."""
+        return self.counted_distance >= _least_distance(self.base_seed)
+
+    @property
+    def counted_distance(self) -> float:
+        """Distance to the test instances that decides whether it is admissible."""
+        return self.other_distance if self._other_counts else self.distance
+
+    @property
+    def nearest_counted(self) -> str:
+        """Test instance at that distance."""
+        return self.other if self._other_counts else self.nearest
+
+    @property
+    def _other_counts(self) -> bool:
+        return self.base_seed in _DIVERSE_SEEDS.values() and self.other_distance < self.distance
 
     @property
     def like_another_family(self) -> bool:
@@ -116,7 +149,7 @@ def drawn_teammates(
         layout: a training layout.
         families: kinds of heuristics, in the order of their turns.
         count: number of teammates.
-        base_seed: 0 for training, 1 for validation.
+        base_seed: see `DRAWS_PER_SEED`.
 
     Returns:
         Teammate entries, as `sample_teammate` returns them, with their draws.
@@ -138,7 +171,8 @@ def drawn_teammates(
             f"only {available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
-    return [(sample_teammate(draw.family, draw.theta_id, "train", base_seed), draw) for draw in turns[:count]]
+    ranges = ranges_of(base_seed)
+    return [(sample_teammate(draw.family, draw.theta_id, ranges, base_seed), draw) for draw in turns[:count]]
 
 
 def validation_tasks(track: str) -> list[Task]:
@@ -152,6 +186,25 @@ def validation_tasks(track: str) -> list[Task]:
         count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
         chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)
         tasks += [make_task(track, "validation", layout, teammate, seed=0) for teammate, _ in chosen]
+    return tasks
+
+
+def diverse_tasks(track: str, split: str) -> list[Task]:
+    """Tasks with diverse teammates on the training layouts of a track, for models that learn by playing.
+
+    Up to twelve of each layout and family for training, three for validation, each of another behaviour.
+
+    Args:
+        track: the track.
+        split: "train" or "validation".
+    """
+    seed, most = _DIVERSE_SEEDS[split], _DIVERSE_TEAMMATES[split]
+    tasks = []
+    for layout in (layout for layout in TRACKS[track]["train"] if layout in TESTED_ON):
+        for family in hosted_families(layout, seed):
+            behaviours = {draw.behaviour for draw in _usable(layout, family, seed)}
+            chosen = drawn_teammates(layout, [family], min(most, len(behaviours)), seed)
+            tasks += [make_task(track, split, layout, teammate, seed=0) for teammate, _ in chosen]
     return tasks
 
 
@@ -197,10 +250,11 @@ def _reason(layout: str, family: str, base_seed: int) -> str:
     if not draws:
         return "it has no draws there; `python -m generation draws` measures them"
     if not any(draw.admissible for draw in draws):
-        farthest = max(draws, key=lambda draw: draw.distance)
+        farthest = max(draws, key=lambda draw: draw.counted_distance)
         return (
-            f"all {len(draws)} draws act like a test instance (Hamming distance at most {farthest.distance:.3f}, to "
-            f"{farthest.nearest}; expected at least {SAME_BEHAVIOUR})"
+            f"all {len(draws)} draws act like a test instance (Hamming distance at most "
+            f"{farthest.counted_distance:.3f}, to {farthest.nearest_counted}; expected at least "
+            f"{_least_distance(base_seed)})"
         )
     return f"the ego matters with none of its admissible draws (returns differ by less than {LEAST_HEADROOM:g})"
 

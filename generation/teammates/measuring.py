@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
-from generation.teammates.draws import DRAWS_PER_SEED, Draw, read_draws_table, write_draws_table
+from generation.teammates.draws import DRAWS_PER_SEED, Draw, ranges_of, read_draws_table, write_draws_table
 from generation.teammates.instances import INSTANCES, TESTED_FAMILIES
 from generation.teammates.references import reference_returns
 from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
@@ -57,7 +57,8 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         numbers: family, base_seed and theta_id of each draw.
     """
     policies = [
-        build_teammate(layout, sample_teammate(family, theta_id, "train", seed)) for family, seed, theta_id in numbers
+        build_teammate(layout, sample_teammate(family, theta_id, ranges_of(seed), seed))
+        for family, seed, theta_id in numbers
     ]
     common = common_states(layout)
     actions = act_along(layout, policies, common.records)

@@ -52,7 +52,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     Args:
         family: a heuristic's name.
         theta_id: any number that distinguishes the draws.
-        split: "train" or "test", which have ranges of their own.
+        split: "train" or "test", which have ranges of their own, or "diverse", see `Heuristic.diverse`.
         base_seed: shared by the draws of one run.
 
     Returns:
@@ -62,7 +62,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
         UnknownNameError: for a family or split that does not exist.
     """
     heuristic = _family(family)
-    samplings = {"train": heuristic.train, "test": heuristic.test}
+    samplings = {"train": heuristic.train, "test": heuristic.test, "diverse": heuristic.diverse}
     if split not in samplings:
         raise unknown("split", split, samplings)
     presets, ranges = samplings[split]

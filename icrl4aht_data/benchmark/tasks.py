@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS, SPLITS, TRACKS, check_membership
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
@@ -122,8 +122,13 @@ def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], 
     return f"{track}_{split}_{layout_name}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{seed}_{digest}"
 
 
-def manifest_path(track: str, split: str) -> Path:
+def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = "") -> Path:
     """Path of the bundled manifest of a track's tasks.
+
+    Args:
+        track: the track.
+        split: "test" or "validation", or "train" for diverse teammates.
+        teammates: "diverse" for tasks with teammates that vary more than the published ranges, for training by playing.
 
     Raises:
         UnknownNameError: for an unknown track or split.
@@ -132,7 +137,7 @@ def manifest_path(track: str, split: str) -> Path:
         raise unknown("track", track, TRACKS)
     if split not in SPLITS:
         raise unknown("split", split, SPLITS)
-    return Path(__file__).parent.parent / "manifests" / f"{track}_{split}.jsonl"
+    return Path(__file__).parent.parent / "manifests" / f"{'_'.join(filter(None, (track, teammates, split)))}.jsonl"
 
 
 def read_tasks(path: Path) -> list[Task]:

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from baselines import experiments
 from baselines.agents.egos import PlayMode
 from baselines.commands.cli import cli
+from baselines.evaluate import protocols
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.results import read_result
 from baselines.experiments import (
@@ -102,8 +103,8 @@ def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, t
     entry = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 7, "base_seed": 1, "theta": {}}
     tasks = {track: [make_task(track, "validation", name, entry, 0) for name in names] for track, names in (
         ("teammate", ("demo_wide", "demo_simple")), ("layout", ("cramped_up",)))}  # fmt: skip
-    monkeypatch.setattr(experiments, "manifest_path", lambda track, split: (track, split))
-    monkeypatch.setattr(experiments, "read_tasks", lambda path: tasks[path[0]] if path[1] == "validation" else [])
+    monkeypatch.setattr(protocols, "manifest_path", lambda track, split: (track, split))
+    monkeypatch.setattr(protocols, "read_tasks", lambda path: tasks[path[0]] if path[1] == "validation" else [])
     monkeypatch.setattr(experiments, "_train_entry", lambda *arguments: None)
     played = []
     monkeypatch.setattr(experiments, "_evaluate_entry", lambda experiment, entry, tasks, *others: played.append(tasks))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
 from generation.paths import Rule, Scene, is_ingredient
-from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, extra_split
+from generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 
 RUNNER, PLATER, FLEX = range(3)
@@ -191,6 +191,19 @@ ASSEMBLY_LINE = Heuristic(
     test=Sampling(
         ("plater_deliverer",),
         {"role_mode": [1], "plate_urgency": (0.6, 1.0), "prestage_bias": (0.0, 0.3)},
+    ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "role_mode": [RUNNER, PLATER, FLEX],
+            "handoff_style": [0, 1, 2],
+            "plate_urgency": (0.0, 1.0),
+            "hesitation_prob": SHARES,
+            "wrong_action_prob": SHARES,
+            "task_abandon_prob": SHARES,
+            "stubbornness": SHARES,
+            "timing_mismatch": SHARES,
+        },
     ),
     spans={
         "plate_urgency": (0.0, 1.0),

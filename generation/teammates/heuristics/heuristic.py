@@ -18,17 +18,20 @@ from generation.policy import Noise, Policy
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
+SHARES = [0.0, 0.0, 0.25, 0.5, 0.75]
+"""Values of a chance of not doing one's part, for `Heuristic.diverse`: none for two teammates in five."""
+
 
 class Sampling(NamedTuple):
     """Distribution of a split's parameters, for teammates that are not published.
 
     Attributes:
         presets: names of presets, of which one is drawn.
-        ranges: parameter -> (low, high) of a uniform draw, or a list of values.
+        ranges: parameter -> (low, high) of a uniform draw, or a list of values of which one is drawn.
     """
 
     presets: tuple[str, ...]
-    ranges: dict[str, tuple[float, float] | list[int]]
+    ranges: dict[str, tuple[float, float] | list[float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,8 @@ class Heuristic:
         presets: preset -> parameters that differ from the defaults.
         train: distribution of sampled parameters for training tasks (paper, App. B.2).
         test: the one for test tasks.
+        diverse: one over all parameters that decide how a teammate acts, most of which the published ranges leave at
+            their defaults. It is not the paper's.
         spans: parameter -> full range; sampling moves these by up to a fifth of their range from the preset.
         choices: parameter -> n, for parameters that are one of 0..n-1.
         unbounded: parameters without an upper limit; all others are in 0..1, or choices.
@@ -55,6 +60,7 @@ class Heuristic:
     presets: dict[str, dict[str, float]]
     train: Sampling
     test: Sampling
+    diverse: Sampling
     spans: dict[str, tuple[float, float]]
     choices: dict[str, int] = field(default_factory=dict)
     unbounded: frozenset[str] = frozenset()

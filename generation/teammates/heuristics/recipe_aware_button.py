@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
 from generation.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
-from generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, extra_split
+from generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import GOAL, INDICATOR, PLATE, PLATES, POT, Layout
 from icrl4aht_data.overcooked.state import POT_STEPS
@@ -338,6 +338,20 @@ RECIPE_AWARE_BUTTON = Heuristic(
             "cost_sensitivity": (0.4, 0.9),
             "strict_recipe": (0.2, 0.6),
             "refresh_interval": [100, 150, 200],
+        },
+    ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "press_L_when_unknown": (0.0, 1.0),
+            "cost_sensitivity": (0.0, 1.0),
+            "strict_recipe": (0.0, 1.0),
+            "refresh_interval": [50, 100, 200],
+            "plate_timing": (0.0, 1.0),
+            "task_specialization": [0.0, 0.0, 1.0],
+            "wrong_ingredient_prob": SHARES,
+            "idle_prob": SHARES,
+            "path_blocking": SHARES,
         },
     ),
     spans={

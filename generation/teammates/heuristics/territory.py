@@ -218,6 +218,18 @@ TERRITORY = Heuristic(
         ("flexible", "object_stations"),
         {"split_mode": [1, 2], "strictness": (0.0, 0.3), "shared_margin": [1, 2, 3], "rescue_threshold": (0.2, 0.4)},
     ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "split_mode": [VERTICAL, HORIZONTAL, STATIONS],
+            "strictness": (0.0, 1.0),
+            "shared_margin": [0, 1, 2, 3],
+            "rescue_threshold": (0.0, 1.0),
+            "yield_bias": (0.0, 1.0),
+            "behavior_mode": [NORMAL, BLOCKER, HOARDER, LAZY, COUNTER, INVADER],
+            "action_probability": [1.0, 1.0, 0.75, 0.5, 0.25],
+        },
+    ),
     spans={
         "strictness": (0.0, 1.0),
         "rescue_threshold": (0.0, 1.0),

@@ -190,6 +190,21 @@ UTILITY_GREEDY = Heuristic(
             "inertia": (0.5, 0.9),
         },
     ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "w_deliver": (5.0, 20.0),
+            "w_pickup_cooked": (3.0, 15.0),
+            "w_get_plate": (2.0, 10.0),
+            "w_add_ingredient": (3.0, 12.0),
+            "w_fetch_ingredient": (2.0, 10.0),
+            "w_stage_on_counter": (0.5, 5.0),
+            "w_press_L": (0.0, 8.0),
+            "dist_weight": (0.1, 1.5),
+            "inertia": (0.0, 1.0),
+            "counter_preference": (0.0, 1.0),
+        },
+    ),
     spans={
         "w_deliver": (5.0, 20.0),
         "w_pickup_cooked": (3.0, 15.0),

@@ -296,7 +296,7 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     write_tasks(tmp_path / "teammate_validation.jsonl", tasks)
     write_tasks(tmp_path / "teammate_test.jsonl", SIMPLE)
     monkeypatch.setattr(
-        "baselines.commands.cli.manifest_path", lambda track, split: tmp_path / f"{track}_{split}.jsonl"
+        "baselines.evaluate.protocols.manifest_path", lambda track, split: tmp_path / f"{track}_{split}.jsonl"
     )
     monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name)))
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,16 @@ from click.testing import CliRunner
 from baselines.agents.egos import AGENTS, NamedEgo, stay
 from baselines.commands.cli import cli
 from baselines.online import student
-from baselines.online.student import UNRELIABLE, collect_release, record_histories, release_teammates, with_noise
+from baselines.online.student import collect_release, record_histories, release_teammates, with_noise
 from generation.policy import Policy
 from generation.profiles.noise_config import NoiseConfig
-from generation.teammates.registry import build_teammate
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
+from tests.helpers.evaluated import TEST_TASKS
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
@@ -99,19 +102,22 @@ def test_another_agent_labels(dataset):
         with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 
-def test_unreliable_teammates_are_training_tasks_that_can_be_built(dataset):
-    plain, more = release_teammates(dataset), release_teammates(dataset, number=1, unreliable=True)
+def test_teammates_of_other_tasks_are_played_as_well(dataset):
+    tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "train", "diverse"))]
+    plain, more = release_teammates(dataset), release_teammates(dataset, number=1, tasks=tasks)
     added = more.tasks[len(plain.tasks) :]
-    assert len(added) == len(UNRELIABLE["assembly_line"])
-    assert {task.split for task in added} == {"train"}
+    here = [task for task in tasks if task.layout.name == "cramped_up"]
+    assert [task.teammate for task in added] == [task.teammate for task in here] and len(here) > 30
+    assert {task.layout.name for task in added} == {"cramped_up"}  # those on other layouts are left out
     assert len({task.task_id for task in plain.tasks + more.tasks}) == len(plain.tasks) + len(more.tasks)
-    acted = []
-    for task, changes in zip(added, UNRELIABLE["assembly_line"], strict=True):
-        assert changes.items() <= task.teammate["theta"].items()
-        build_teammate(task.layout, task.teammate)
-        acted.append(record_histories(idle, [task], NoiseConfig(1, 10, start=(0.0, 0.0))).teammate_actions)
-    assert (acted[0] == STAY).all()  # hesitates always
-    assert 0 < (acted[1] != STAY).mean() < (acted[2] != STAY).mean()
+    again = release_teammates(dataset, tasks=[*plain.tasks, *here[:1]])
+    assert len(again.tasks) == len(plain.tasks) + 1  # each teammate once
+
+
+def test_learned_teammates_of_other_tasks_are_refused(dataset):
+    learned = replace(TEST_TASKS[0], teammate={"kind": "rl", "family": "fcp", "theta": {}})
+    with pytest.raises(OptionError, match="its teammate is learned; expected heuristics, which need no checkpoints"):
+        release_teammates(dataset, tasks=[learned])
 
 
 def test_a_stopped_collection_resumes(release, dataset, tmp_path, monkeypatch):

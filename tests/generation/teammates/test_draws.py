@@ -14,8 +14,10 @@ from generation.teammates.draws import (
     DRAWS_PER_SEED,
     DRAWS_TABLE,
     Draw,
+    diverse_tasks,
     drawn_teammates,
     hosted_families,
+    ranges_of,
     read_draws,
     read_draws_table,
     validation_tasks,
@@ -72,7 +74,8 @@ def test_numbers_of_the_table_are_possible():
     for found in read_draws_table(DRAWS_TABLE):
         assert found.nearest.split("/")[0] == HEURISTIC_KINDS[found.family] != found.other.split("/")[0]
         assert 0 <= found.distance <= 1 >= found.other_distance >= 0
-        assert min(found.stay, found.random, found.oracle) >= -20
+        # Diverse teammates may cook and deliver wrong dishes by themselves, which costs 20 points each.
+        assert min(found.stay, found.random, found.oracle) >= (-20 if ranges_of(found.base_seed) == "train" else -60)
 
 
 @pytest.mark.parametrize("layout", TESTED_ON)
@@ -87,7 +90,7 @@ def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
         with pytest.raises(OptionError, match="distinct draws"):
             drawn_teammates(layout, families, len(teammates) + 1, seed)
         for family in {*HEURISTIC_FAMILIES} - {*families}:
-            with pytest.raises(OptionError, match=rf"{layout} cannot host drawn \w+ teammates of {family}: "):
+            with pytest.raises(OptionError, match=rf"{layout} cannot host (drawn|diverse) \w+ teammates of {family}: "):
                 drawn_teammates(layout, [family], 1, seed)
 
 
@@ -95,7 +98,7 @@ def test_entries_are_those_of_the_sampler():
     family = hosted_families("demo_wide")[0]
     for base_seed in DRAWS_PER_SEED:
         for entry, found in drawn_teammates("demo_wide", [family], 2, base_seed):
-            assert entry == sample_teammate(family, found.theta_id, "train", base_seed)
+            assert entry == sample_teammate(family, found.theta_id, ranges_of(base_seed), base_seed)
             assert (entry["base_seed"], found.base_seed) == (base_seed, base_seed)
 
 
@@ -118,6 +121,39 @@ def test_validation_tasks_are_four_a_layout_where_draws_allow_it():
         families = Counter(task.teammate["family"] for task in tasks if task.layout.name == layout)
         assert {*families} == {*hosted_families(layout, 1)[:4]}
     assert len({task.task_id for task in tasks}) == len(tasks)
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_diverse_tasks_act_unlike_every_test_instance_and_each_other(track):
+    thetas = []
+    for split, base_seed, most in (("train", 2, 12), ("validation", 3, 3)):
+        tasks = diverse_tasks(track, split)
+        counts = Counter((task.layout.name, task.teammate["family"]) for task in tasks)
+        assert max(counts.values()) <= most and {task.split for task in tasks} == {split}
+        assert {layout for layout, _ in counts} == set(TRACKS[track]["train"])
+        for task in tasks:
+            family, entry = task.teammate["family"], task.teammate
+            (found,) = [
+                one for one in read_draws(task.layout.name, family, base_seed) if one.theta_id == entry["theta_id"]
+            ]
+            assert entry == sample_teammate(family, found.theta_id, "diverse", base_seed)
+            assert min(found.distance, found.other_distance) >= 0.1
+            thetas.append((task.layout.name, family, tuple(entry["theta"].items())))
+    assert len(set(thetas)) == len(thetas)  # none is in both splits
+
+
+def test_diverse_teammates_vary_what_the_published_ranges_do_not():
+    for family in ("recipe_aware_button", "territory", "assembly_line"):
+        defaults = HEURISTIC_FAMILIES[family].defaults
+        drawn = [sample_teammate(family, number, "diverse", 2)["theta"] for number in range(30)]
+        published = [sample_teammate(family, number, "train")["theta"] for number in range(30)]
+        newly = {
+            name
+            for name in defaults
+            if len({theta[name] for theta in drawn}) > 1 == len({theta[name] for theta in published})
+        }
+        assert newly, family
+        assert all(HEURISTIC_FAMILIES[family].is_valid(name, theta[name]) for theta in drawn for name in defaults)
 
 
 # Which draws, in which order.
@@ -189,8 +225,8 @@ def test_wrong_names():
         read_draws("asymm_right", H1)
     with pytest.raises(UnknownNameError, match="unknown layout 'demo'"):
         drawn_teammates("demo", [H1], 1)
-    with pytest.raises(UnknownNameError, match="unknown base_seed of draws 2; valid: 0, 1"):
-        read_draws("demo_wide", H1, 2)
+    with pytest.raises(UnknownNameError, match="unknown base_seed of draws 4; valid: 0, 1"):
+        read_draws("demo_wide", H1, 4)
 
 
 def test_a_damaged_table_is_named_with_its_line(tmp_path):

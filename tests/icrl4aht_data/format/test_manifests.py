@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from generation.cli import cli
-from generation.teammates.draws import validation_tasks
+from generation.teammates.draws import diverse_tasks, validation_tasks
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -74,11 +74,19 @@ def test_bundled_manifests_are_the_validation_tasks(track):
     assert {task.layout.name for task in tasks} <= {*TRACKS[track]["validation"]}
 
 
+@pytest.mark.parametrize("split", ["train", "validation"])
+@pytest.mark.parametrize("track", TRACKS)
+def test_bundled_manifests_are_the_diverse_tasks(track, split):
+    tasks = read_tasks(manifest_path(track, split, "diverse"))
+    assert tasks == diverse_tasks(track, split)
+    assert {task.layout.name for task in tasks} == {*TRACKS[track]["train"]}
+
+
 def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
     assert CliRunner().invoke(cli, ["manifests", "--check"]).exit_code == 0
-    monkeypatch.setattr("generation.cli.manifest_path", lambda track, split: short)
+    monkeypatch.setattr("generation.cli.manifest_path", lambda track, split, teammates="": short)
     result = CliRunner().invoke(cli, ["manifests", "--check"])
     assert result.exit_code == 1
     assert "differs from the parameter sets or draws" in str(result.exception)

@@ -1,0 +1,81 @@
+"""Layouts to play on that are no layouts of the benchmark, so that a model learns the game rather than one map."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+
+from baselines.evaluate.protocols import FOUR_RECIPES
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import EMPTY, STEP, Layout, get_layout
+
+
+def with_four_recipes(layout: Layout) -> Layout:
+    """Returns a layout with the four recipes that the protocol `published` has on the layout track.
+
+    Raises:
+        OptionError: if the layout lacks an ingredient of theirs.
+    """
+    missing = {i for recipe in FOUR_RECIPES for i in recipe} - set(layout.ingredients)
+    if missing:
+        raise OptionError(f"{layout.name}: it has no pile of ingredient {min(missing)}, which the four recipes need")
+    return replace(layout, name=f"{layout.name} four recipes", alias=layout.alias, recipes=FOUR_RECIPES)
+
+
+def rearranged_layouts(layout: Layout, count: int, seed: int = 0) -> list[Layout]:
+    """Returns layouts with the same rooms, whose counters, piles, pots and other fixtures have changed places.
+
+    Fixtures change places only among cells that the same agents reach, so that the same work is possible. None of the
+    layouts is one of the benchmark, mirrored ones included.
+
+    Args:
+        layout: the layout; every second result has the four recipes of `with_four_recipes`.
+        count: number of different layouts.
+        seed: of the places.
+
+    Raises:
+        OptionError: if there are not so many different ones.
+    """
+    rng = np.random.default_rng([seed, *map(ord, layout.name)])
+    known = {mirrored for name in LAYOUT_NAMES for mirrored in _mirrored(get_layout(name).rows)}
+    found: list[Layout] = []
+    for _ in range(100 * count):
+        rows = _rearranged(layout, rng)
+        if rows not in known and len(found) < count:
+            known |= set(_mirrored(rows))
+            one = replace(layout, name=f"{layout.name} rearranged {len(found)}", rows=rows)
+            found.append(replace(one, recipes=FOUR_RECIPES) if len(found) % 2 else one)
+    if len(found) < count:
+        raise OptionError(f"{layout.name}: its fixtures have {len(found)} other arrangements, expected {count}")
+    return found
+
+
+def _rearranged(layout: Layout, rng: np.random.Generator) -> tuple[str, ...]:
+    letters = list("".join(layout.rows))
+    reached_by: dict[frozenset[int], list[int]] = defaultdict(list)
+    for cell in range(layout.cells):
+        agents = frozenset(agent for agent, room in enumerate(layout.rooms) if _touches(layout, cell, room))
+        if layout.kinds[cell] != EMPTY and agents:
+            reached_by[agents].append(cell)
+    for cells in reached_by.values():
+        moved = [letters[cell] for cell in rng.permutation(cells)]
+        for cell, letter in zip(cells, moved, strict=True):
+            letters[cell] = letter
+    text = "".join(letters)
+    return tuple(text[start : start + layout.width] for start in range(0, layout.cells, layout.width))
+
+
+def _touches(layout: Layout, cell: int, room: np.ndarray) -> bool:
+    """Whether an agent in a room can face a cell."""
+    x, y = cell % layout.width, cell // layout.width
+    beside = {(y + dy) * layout.width + x + dx for dx, dy in STEP.values() if 0 <= x + dx < layout.width}
+    return not beside.isdisjoint(room.tolist())
+
+
+def _mirrored(rows: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Returns a map and its mirror images."""
+    flipped = [rows, rows[::-1]]
+    return flipped + [tuple(row[::-1] for row in one) for one in flipped]

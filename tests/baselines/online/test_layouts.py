@@ -1,0 +1,70 @@
+"""Layouts to train on by playing: four recipes, and fixtures in other places."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from baselines.online.layouts import rearranged_layouts, with_four_recipes
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+
+TRAINING = TRACKS["layout"]["train"]
+
+
+def mirrored(rows):
+    return {tuple(row[::sideways] for row in rows[::upside]) for upside in (1, -1) for sideways in (1, -1)}
+
+
+def reached(layout):
+    """The letters that each set of agents can face."""
+    found = Counter()
+    for cell, letter in enumerate("".join(layout.rows)):
+        x, y = cell % layout.width, cell // layout.width
+        around = {(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)}
+        cells = {b * layout.width + a for a, b in around if 0 <= a < layout.width and 0 <= b < layout.height}
+        agents = tuple(agent for agent, room in enumerate(layout.rooms) if cells & set(room.tolist()))
+        found[agents, letter] += 1
+    return found
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_fixtures_change_places_among_cells_that_the_same_agents_reach(name):
+    layout = get_layout(name)
+    others = rearranged_layouts(layout, 6)
+    assert len(others) == 6
+    for other in others:
+        assert reached(other) == reached(layout)
+        assert [room.tolist() for room in other.rooms] == [room.tolist() for room in layout.rooms]
+    assert [len(other.recipes) for other in others] == [2, 4, 2, 4, 2, 4]
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_no_layout_of_the_benchmark_and_none_twice_even_mirrored(name):
+    known = [get_layout(one).rows for one in LAYOUT_NAMES]
+    for other in rearranged_layouts(get_layout(name), 100):
+        assert not mirrored(other.rows) & set(known)
+        known.append(other.rows)
+
+
+def test_the_same_seed_gives_the_same_layouts():
+    layout = get_layout("cramped_up")
+    rows = [[other.rows for other in rearranged_layouts(layout, 3, seed)] for seed in (0, 0, 1)]
+    assert rows[0] == rows[1] != rows[2]
+
+
+def test_more_layouts_than_there_are():
+    layout = get_layout("test_wide")
+    few = type(layout)("few", "few", ("WWWWW", "W0A1W", "WWBWW", "WXAPW", "WWWWW"))
+    with pytest.raises(OptionError, match=r"few: its fixtures have \d+ other arrangements, expected 999"):
+        rearranged_layouts(few, 999)
+
+
+def test_four_recipes():
+    layout = with_four_recipes(get_layout("asymm_both"))
+    assert layout.rows == get_layout("asymm_both").rows and len(layout.recipes) == 4
+    lacking = type(layout)("one", "one", ("WWWWW", "W0A0W", "WPBXW", "W0A W", "WWWWW"), recipes=((0, 0, 0),))
+    with pytest.raises(OptionError, match="one: it has no pile of ingredient 1, which the four recipes need"):
+        with_four_recipes(lacking)
