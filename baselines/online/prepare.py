@@ -94,7 +94,7 @@ def prepare_play(
             tasks with learned teammates.
     """
     _check_unused(name, histories)
-    dataset, layouts = _chosen_histories(histories, tasks)
+    release, dataset, layouts = _chosen_histories(histories, tasks)
     tasks = _tasks_on(layouts, tasks)
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
@@ -106,13 +106,12 @@ def prepare_play(
     hides = {layout.name for layout, _ in everywhere if layout.name.split()[0] in hidden}
     groups = make_groups(policies, options.batch_size, shares, hides)
     played = _played(teammates, groups)
-    dataset = dataset.select(np.isin(dataset.column("task_id"), sorted(played)))
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
         "play": asdict(play),
         "histories": asdict(histories)
-        | history_settings(dataset)
+        | history_settings(release)
         | {
             "layouts": [layout.name for layout in layouts],
             "hide_recipe": hidden,
@@ -120,24 +119,28 @@ def prepare_play(
             "obs_shape": list(observation_shape(layouts[0], True)),
             "groups": {group.name: len(group.teammates) for group in groups},
         },
-        "trained_on": training_cells(dataset, labels) + _task_cells([t for t in tasks if t.task_id in played], labels),
+        "trained_on": _played_cells(dataset, tasks, played, labels),
     }
     trainer = PlayTrainer(method, options, play, groups, histories.mirror)
     return PlayJob(method, trainer, TrainingData(None, {}), about)
 
 
-def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, list[Layout]]:
-    """Returns the histories on the chosen layouts, and these layouts; only with tasks may they have no histories."""
+def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, Dataset | None, list[Layout]]:
+    """Returns the release, the histories on the chosen layouts, and these layouts.
+
+    Where tasks are played as well, layouts need no histories.
+    """
     release = load_icrl4aht(histories.root)
     if ALL_LAYOUTS in histories.layouts:
         dataset = filter_histories(release.filter(split=histories.split), histories.filters)
-        return dataset, list(dataset.layouts)
+        return release, dataset, list(dataset.layouts)
     layouts = list(dict.fromkeys(get_layout(one) for one in histories.layouts))
     stored = {get_layout(layout.name) for layout in release.layouts}
     names = [layout.name for layout in layouts if not tasks or layout in stored]
     if not names:
-        return release.select(np.zeros(len(release), bool)), layouts
-    return filter_histories(release.filter(split=histories.split, layout=names), histories.filters), layouts
+        return release, None, layouts
+    dataset = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
+    return release, dataset, layouts
 
 
 def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
@@ -160,11 +163,11 @@ def _check_unused(name: str, histories: HistoryOptions) -> None:
         raise OptionError(f"channels = own: {name} takes canonical channels; leave it out")
 
 
-def _teammates(dataset: Dataset, tasks: Sequence[Task]) -> _Teammates:
+def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
     """Returns the teammates of all tasks of a selection of histories, and of some more."""
     found: _Teammates = {}
-    of_task = {str(task): int(number) for task, number in zip(dataset.column("task_id"), dataset.ids, strict=True)}
-    for task_id, history_id in of_task.items():
+    for task_id, history_id in _history_of_task(dataset).items():
+        assert dataset is not None
         entry = dataset.index.entry(history_id)
         key = get_layout(entry.layout), entry.teammate_kind
         mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
@@ -173,6 +176,13 @@ def _teammates(dataset: Dataset, tasks: Sequence[Task]) -> _Teammates:
         mate = _Teammate(task.teammate, build_teammate(task.layout, task.teammate))
         found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
     return found
+
+
+def _history_of_task(dataset: Dataset | None) -> dict[str, int]:
+    """Returns a history of each task of a selection."""
+    if dataset is None:
+        return {}
+    return {str(task): int(number) for task, number in zip(dataset.column("task_id"), dataset.ids, strict=True)}
 
 
 def _on_other_layouts(teammates: _Teammates, play: PlayOptions) -> _Teammates:
@@ -207,16 +217,30 @@ def _played(teammates: _Teammates, groups: Sequence[TaskGroup]) -> set[str]:
     return played
 
 
-def _shares(dataset: Dataset, tasks: Sequence[Task]) -> dict[str, float]:
+def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     """Returns the share of the tasks on each layout, in units of those on layouts where the ego matters."""
+    shares = {task.layout.name: 1.0 for task in tasks}
+    if dataset is None:
+        return shares
     path = Path(dataset.root) / PROVENANCE
     provenance = read_provenance(path) if path.is_file() else {}
-    shares = {layout.name: FLAT_SHARE if provenance else 1.0 for layout in dataset.layouts} if len(dataset) else {}
+    shares |= {layout.name: FLAT_SHARE if provenance else 1.0 for layout in dataset.layouts}
     for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
         made = provenance.get(str(task_id))
         if made is not None and (made.references is None or made.references.matters):
             shares[str(layout)] = 1.0
-    return {task.layout.name: 1.0 for task in tasks} | shares
+    return shares
+
+
+def _played_cells(
+    dataset: Dataset | None, tasks: Sequence[Task], played: set[str], labels: Labels | None
+) -> list[dict[str, Any]]:
+    """Returns the record of training data of the tasks that are played, see `training_cells`."""
+    cells = []
+    if dataset is not None:
+        of_played = np.isin(dataset.column("task_id"), sorted(played))
+        cells = training_cells(dataset.select(of_played), labels) if of_played.any() else []
+    return cells + _task_cells([task for task in tasks if task.task_id in played], labels)
 
 
 def _task_cells(tasks: Sequence[Task], labels: Labels | None) -> list[dict[str, Any]]:

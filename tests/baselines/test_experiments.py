@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from baselines import experiments
-from baselines.agents.egos import PlayMode
+from baselines.agents.egos import NamedEgo, PlayMode, stay
 from baselines.commands.cli import cli
 from baselines.evaluate import protocols
 from baselines.evaluate.protocols import PROTOCOLS
@@ -30,6 +30,7 @@ from baselines.experiments import (
 )
 from baselines.report.episode_gifs import family_gifs
 from baselines.report.results import TEST_LAYOUTS, read_run
+from baselines.training.histories import TrainingTask
 from baselines.training.run_folder import CHECKPOINTS
 from generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
 from generation.learners.config import Widths
@@ -119,6 +120,33 @@ def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, t
         run_experiment("tracks", dataclasses.replace(plan, split="heldout"), tmp_path)
     with pytest.raises(OptionError, match="split = validation: this experiment has tasks of its own"):
         run_experiment("heldout-rl", plan, tmp_path)
+
+
+def test_an_ablation_trains_one_method_and_shares_runs(release, tmp_path, monkeypatch):
+    trained, played, modes = [], [], []
+    monkeypatch.setattr(experiments, "prepare", lambda method, *others: trained.append(others) or 1 / 0)
+    plan = dataclasses.replace(SMALL, root=str(release), methods=(), layouts=("demo_wide",), values=("every3",))
+    with pytest.raises(ZeroDivisionError):
+        run_experiment("ablate windows", plan, tmp_path)
+    ((model, _, histories),) = trained
+    assert (histories.every, histories.labels, model.teammate_actions) == (3, "expert", True)
+    with pytest.raises(UnknownNameError, match="unknown method of ablate windows 'dpt'; valid: ad"):
+        run_experiment("ablate windows", dataclasses.replace(plan, methods=("dpt",)), tmp_path)
+    with pytest.raises(OptionError, match="context = 8: `ablate windows` varies it; choose by --only, such as plain"):
+        run_experiment("ablate windows", dataclasses.replace(plan, train=TRAIN | {"context": 8}), tmp_path)
+    fake = TrainingTask(None, None, None, {"histories": {"channels": "own"}})  # type: ignore[arg-type]
+    monkeypatch.setattr(experiments, "prepare", lambda *arguments: fake)
+    monkeypatch.setattr(experiments, "_train_entry", lambda *arguments: None)
+    monkeypatch.setattr(experiments, "find_agent", lambda run, mode: modes.append(mode) or NamedEgo("AD", stay, {}))
+    monkeypatch.setattr(experiments, "evaluate", lambda *arguments, out, **options: played.append(out))
+    monkeypatch.setattr(experiments, "note_results", lambda folder, run, tasks: played.append(run))
+    monkeypatch.setattr(experiments, "read_run", lambda folder: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_experiment("ablate windows", dataclasses.replace(plan, values=("plain", "sampled")), tmp_path)
+    names = [str(path.relative_to(tmp_path)) for path in played]
+    run = "ad-plain/demo_wide/run"
+    assert names == ["ad-plain/demo_wide/results", run, "ad-sampled/demo_wide/results", run]
+    assert [mode.greedy for mode in modes] == [True, False]
 
 
 def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_path, monkeypatch):

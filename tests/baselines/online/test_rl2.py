@@ -17,10 +17,11 @@ from baselines.agents.egos import PlayMode, find_agent
 from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import prepare_rollout
 from baselines.evaluate.protocols import get_protocol
-from baselines.methods.options import ModelOptions
+from baselines.methods.options import RL2_SETTINGS, ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import StepInput
 from baselines.methods.view_change import ViewChange
+from baselines.online.prepare import prepare_play
 from baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
@@ -31,11 +32,13 @@ from baselines.online.rl2 import (
 )
 from baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
 from baselines.training.histories import read_trained
-from baselines.training.options import PlayOptions, TrainOptions
+from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
+from baselines.training.seen import read_trained_on, teammate_id
 from baselines.training.trainer import TrainingData, train
 from generation.teammates.instances import published_task
 from generation.teammates.registry import build_teammate, sample_teammate
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import start
@@ -242,6 +245,53 @@ def played_actions(mate: Any) -> np.ndarray:
         action, memory = act(mate.params, memory, record, jax.random.fold_in(jax.random.key(1), t))
         found.append(int(action))
     return np.array(found)
+
+
+class TestPreparing:
+    """Teammates of histories, of other tasks, and on other layouts."""
+
+    MODEL = dataclasses.replace(ModelOptions(**RL2_SETTINGS["model"]), width=8)
+    CHOICE = HistoryOptions(("cramped_up",), source=("noise",), hide_recipe=("cramped_up",))
+
+    def prepare(self, play: PlayOptions, tasks: Any = (), choice: HistoryOptions = CHOICE, batch: int = 64) -> Any:
+        return prepare_play("rl2", self.MODEL, TrainOptions(steps=1, batch_size=batch), play, choice, tasks)
+
+    def test_tasks_add_teammates_and_are_on_record(self):
+        tasks = read_tasks(manifest_path("layout", "train", "diverse"))
+        plain, job = self.prepare(PlayOptions()), self.prepare(PlayOptions(), tasks)
+        assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] == "noise"]
+        added = {cell["algorithm"]: cell for cell in job.about["trained_on"] if cell["source"] == "tasks"}
+        here = [task for task in tasks if task.layout.name == "cramped_up"]  # those on asymm_both are left out
+        assert sum(cell["tasks"] for cell in added.values()) == len(here)
+        assert {cell["layout"] for cell in added.values()} == {"cramped_up"}
+        ids = {teammate_id(task.teammate) for task in here}
+        assert {one for cell in added.values() for one in cell["teammates"]} == ids
+        seen = read_trained_on(job.about["trained_on"], "here")
+        assert seen.layouts == ("cramped_up",) and set(seen.teammates) >= set(added)
+        assert sum(job.about["histories"]["groups"].values()) == job.trainer.tasks
+
+    def test_other_layouts_are_played_as_well(self):
+        play = PlayOptions(rearranged=2, four_recipes=True)
+        groups = {one.group.name: one.group for one in self.prepare(play).trainer.players}
+        names = {group.layout.name for group in groups.values()}
+        assert names == {"cramped_up", "cramped_up four recipes", "cramped_up rearranged 0", "cramped_up rearranged 1"}
+        assert all(group.hidden for group in groups.values())
+        own = sum(len(group.teammates) for group in groups.values() if group.layout.name == "cramped_up")
+        assert own > sum(len(group.teammates) for group in groups.values()) / 2
+
+    def test_layouts_without_histories_need_tasks(self):
+        choice = HistoryOptions(("cramped_down",))
+        with pytest.raises(EmptySelectionError, match="cramped_down"):
+            self.prepare(PlayOptions(), (), choice)
+        tasks = read_tasks(manifest_path("layout", "test"))
+        job = self.prepare(PlayOptions(), tasks, choice, 8)
+        assert {cell["layout"] for cell in job.about["trained_on"]} == {"cramped_down"}
+        assert job.about["histories"]["layouts"] == ["cramped_down"]
+
+    def test_tasks_elsewhere(self):
+        tasks = read_tasks(manifest_path("layout", "test"))
+        with pytest.raises(OptionError, match="none of the 40 tasks is on cramped_up, but on asymm_right, "):
+            self.prepare(PlayOptions(), tasks)
 
 
 class TestCommand:

@@ -17,6 +17,8 @@ from baselines.report.comparison import (
     FORGETS,
     CellReturns,
     StoredResults,
+    ablation_table,
+    add_ablation,
     add_results,
     cells_with_headroom,
     gains_table,
@@ -161,3 +163,37 @@ def test_a_new_agent_needs_a_sentence(results):
         add_results(StoredResults({}, {}), results, "")
     known = add_results(StoredResults({}, {"ramp": "a ramp"}), results, "")
     assert known.about == {"ramp": "a ramp"}
+
+
+class TestAblations:
+    """Entries are compared with the first one, task by task."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        """Two entries with 10 tasks of two seeds: returns of 10 and 12, the first of the two rising by 1 an episode."""
+        protocol = get_protocol("seeded")
+        tasks = [task for task in published_test_tasks().values() if task.layout.name == "demo_wide"][:10]
+        for entry, offset in (("plain", 0.0), ("K500", 2.0)):
+            settings = {"agent": "AD", "seeds": [0, 1], "protocol": asdict(protocol), "code_version": "0"}
+            for number, task in enumerate(tasks):
+                rise = np.linspace(-5, 5, 100) if entry == "plain" else np.zeros(100)
+                returns = [(10 + offset + number + rise).tolist()] * 2
+                write_result(
+                    tmp_path / f"ad-{entry}" / "demo_wide" / "results", Result(task.task_id, settings, returns)
+                )
+        return tmp_path
+
+    def test_from_an_experiment_to_the_table(self, folder, tmp_path):
+        stored = add_ablation(StoredResults({}, {}), folder)
+        write_stored(tmp_path / "results.json", stored)
+        again = read_stored(tmp_path / "results.json")
+        assert shown_agents(again) == []
+        plain, longer = ablation_table(again, "ablate windows").splitlines()[2:]
+        assert plain.startswith("| `plain` | K = 200") and "| 14.5 (" in plain and "|  | +8.1 (+8.1 to +8.1) |" in plain
+        assert longer.startswith("| `K500` |") and "| 16.5 (" in longer
+        assert "| +2.0 (+2.0 to +2.0) | +0.0 (+0.0 to +0.0) |" in longer
+        assert "`K500`" not in ablation_table(again, "ablate contexts")
+
+    def test_a_folder_without_an_ablation(self, tmp_path):
+        with pytest.raises(OptionError, match="no results of an ablation; expected a folder that `ablate"):
+            add_ablation(StoredResults({}, {}), tmp_path)
