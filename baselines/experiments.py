@@ -27,7 +27,7 @@ from baselines.report.model_card import CARD_BEGINS, card_name, write_model_card
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import REPORT_BEGINS, write_report
-from baselines.training.ablations import ABLATIONS, ExperimentEntry
+from baselines.training.ablations import ABLATIONS, VARIED_IN_ABLATIONS, ExperimentEntry
 from baselines.training.histories import TrainingTask, filter_histories, prepare
 from baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from baselines.training.trainer import train
@@ -103,7 +103,7 @@ EXPERIMENTS = {
             ablation.title,
             ablation.entries,
             ("demo_wide",),
-            varies=("context", "teammate_actions", "next_obs", "positions", "label_smoothing", "reward_scale"),
+            varies=VARIED_IN_ABLATIONS,
             methods=(ablation.method,),
         )
         for name, ablation in ABLATIONS.items()

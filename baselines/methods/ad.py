@@ -37,10 +37,12 @@ class StepOutput(NamedTuple):
     Attributes:
         head: the head's output, float (B, L, ..).
         next_obs: float (B, L, N), predicted observation after taking the action; None without +next_obs.
+        teammate: float (B, L, A), logits of the teammate's action at the same step; None if they are not predicted.
     """
 
     head: Any
     next_obs: Float[Array, "B L N"] | None
+    teammate: Float[Array, "B L A"] | None = None
 
 
 class WindowMemory(NamedTuple):
@@ -69,6 +71,7 @@ class StepModel(nn.Module):
     trunk: nn.Module
     head: nn.Module
     next_obs: nn.Module | None = None
+    teammate: nn.Module | None = None
 
     def __call__(
         self,
@@ -81,7 +84,8 @@ class StepModel(nn.Module):
         tokens_BxLxD = self.tokens(steps, deterministic)
         features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
         predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
-        return StepOutput(self.head(features_BxLxD), predicted)
+        mate = None if self.teammate is None or actions is None else self.teammate(features_BxLxD)
+        return StepOutput(self.head(features_BxLxD), predicted, mate)
 
     def start(self, context: int, cached: bool) -> Any:
         """Returns the memory of an ego before its first step."""
@@ -132,7 +136,8 @@ def dropped_steps(context: int) -> int:
 
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
     """Returns a model of steps with the given trunk and head."""
-    return StepModel(make_tokens(StepTokens, options, world), trunk, head, make_next_obs_head(options, world))
+    teammate = nn.Dense(world.actions) if options.teammate_loss else None
+    return StepModel(make_tokens(StepTokens, options, world), trunk, head, make_next_obs_head(options, world), teammate)
 
 
 def example_step(world: World) -> StepInput:
@@ -145,6 +150,13 @@ def next_obs_loss(predicted: Float[Array, "B L N"], obs: Num[Array, "B L ..."], 
     """Returns the auxiliary loss over steps whose successor is in the window and in the same episode."""
     errors = squared_error(predicted[:, :-1], obs[:, 1:])
     return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
+
+
+def teammate_loss(predicted: Float[Array, "B L A"], batch: ADBatch) -> Float[Array, ""]:
+    """Returns the auxiliary loss over steps whose successor, which shows the teammate's action, is in the window."""
+    assert batch.prev_teammate_actions is not None
+    errors = cross_entropy(predicted[:, :-1], jnp.asarray(batch.prev_teammate_actions)[:, 1:], 0.0)
+    return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:])
 
 
 def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
@@ -164,6 +176,9 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
         if output.next_obs is not None:
             log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
             total += log["next_obs_loss"]
+        if output.teammate is not None:
+            log["teammate_loss"] = teammate_loss(output.teammate, batch)
+            total += log["teammate_loss"]
         return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
     return loss

@@ -19,7 +19,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from baselines.methods.ad import StepOutput, example_step, make_step_model, next_obs_loss
-from baselines.methods.method import Method, World, cross_entropy, make_transformer, mean_of_rows, run_model
+from baselines.methods.method import (
+    Method,
+    World,
+    check_no_teammate_loss,
+    cross_entropy,
+    make_transformer,
+    mean_of_rows,
+    run_model,
+)
 from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import batch_steps
 from generation.learners.encoder import encoding_log
@@ -66,6 +74,7 @@ class ActorCriticHead(nn.Module):
 
 def amago_offline(options: ModelOptions, world: World) -> Method:
     """Returns an offline actor-critic on AD's tokens and transformer."""
+    check_no_teammate_loss("amago_offline", options)
     head = ActorCriticHead(options.width, len(options.discounts), world.actions)
     model = make_step_model(options, world, make_transformer(options), head)
     discounts_G = jnp.asarray(options.discounts)

@@ -19,6 +19,7 @@ from baselines.methods.conditional import change_if
 from baselines.methods.method import (
     Method,
     World,
+    check_no_teammate_loss,
     cross_entropy,
     make_next_obs_head,
     make_tokens,
@@ -166,6 +167,7 @@ class DPT(nn.Module):
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
     """Returns the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
+    check_no_teammate_loss("dpt", options)
     tokens = make_tokens(TransitionTokens, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
     model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)

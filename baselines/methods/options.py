@@ -95,6 +95,7 @@ class ModelOptions:
     teammate_actions: bool = option_field(False, "+TA: input the teammate's previous action, too.", flags=["--ta"])
     reward_scale: float = option_field(1.0, "Factor of the rewards in tokens; a delivery earns 20.", above=0)
     next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")
+    teammate_loss: bool = option_field(False, "With --ta: also learn to predict the teammate's action (ad, hybrid_ad).")
     label_smoothing: float = option_field(0.0, "Label smoothing of the action loss.", at_least=0, below=1)
     discounts: tuple[float, ...] = option_field(
         (0.9, 0.95, 0.99, 0.995),
@@ -107,5 +108,7 @@ class ModelOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.teammate_loss and not self.teammate_actions:
+            raise OptionError("teammate_loss = True: expected teammate_actions as well; give --ta, or leave it out")
         if self.width % (2 * self.heads):
             raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")

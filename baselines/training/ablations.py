@@ -64,6 +64,7 @@ WINDOW_ENTRIES = (
     _window_entry("curriculum", "from early windows to all", histories={"curriculum": 0.5}),
     _window_entry("no-ta", "without the teammate's actions", {"teammate_actions": False}),
     _window_entry("next_obs", "predicts the next observation, too", {"next_obs": True}),
+    _window_entry("teammate", "predicts the teammate's action, too", {"teammate_loss": True}),
     _window_entry("no-positions", "without rope", {"positions": "none"}),
     _window_entry("smoothing", "label smoothing of 0.1", {"label_smoothing": 0.1}),
     _window_entry("rewards", "rewards as they are, 20 a delivery", {"reward_scale": 1.0}),
@@ -99,3 +100,14 @@ ABLATIONS = {
     "ablate contexts": Ablation("Contexts that teach", "dpt", CONTEXT_ENTRIES),
 }
 """Ablations by the name of their experiment."""
+
+VARIED_IN_ABLATIONS = (
+    "context",
+    "teammate_actions",
+    "next_obs",
+    "teammate_loss",
+    "positions",
+    "label_smoothing",
+    "reward_scale",
+)
+"""Options of models and trainings that an ablation sets itself."""

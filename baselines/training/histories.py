@@ -506,6 +506,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
+    label += "+teammate" * model.teammate_loss
     label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
     names = tuple(layout.name for layout in layouts)
     digest = json_hash(config)

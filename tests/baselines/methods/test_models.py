@@ -271,6 +271,27 @@ def test_next_observations_follow_the_actions_taken_not_the_labels():
     assert taken["action_loss"] != labelled["action_loss"]
 
 
+def test_the_teammates_action_is_predicted_from_the_steps_before_it():
+    method, params = tiny("ad", layers=1, teammate_actions=True, teammate_loss=True)
+    batch = ad_batch()
+    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1])
+    assert batch.prev_teammate_actions is not None
+    log = {name: float(value) for name, value in loss(batch).items()}
+    assert log["loss"] == pytest.approx(log["action_loss"] + log["next_obs_loss"] + log["teammate_loss"], rel=1e-5)
+    first, last = batch.prev_teammate_actions.copy(), batch.prev_teammate_actions.copy()
+    valid = int(batch.attention_mask[0].sum())
+    last[0, valid - 1] = (last[0, valid - 1] + 1) % 4  # a target, and an input that no prediction follows
+    assert loss(batch._replace(prev_teammate_actions=last))["teammate_loss"] != log["teammate_loss"]
+    beyond = first.copy()
+    beyond[~batch.attention_mask] = 3
+    assert loss(batch._replace(prev_teammate_actions=beyond))["teammate_loss"] == log["teammate_loss"]
+    for name in ("dpt", "amago_offline"):
+        with pytest.raises(OptionError, match=f"teammate_loss = True: {name} does not predict the teammate's action"):
+            tiny(name, layers=1, teammate_actions=True, teammate_loss=True)
+    with pytest.raises(OptionError, match="expected teammate_actions as well; give --ta, or leave it out"):
+        ModelOptions(teammate_loss=True)
+
+
 def percepts(steps: int, episode: int, seed=0) -> Percept:
     """Input of an ego over some steps."""
     rng = np.random.default_rng(seed)
