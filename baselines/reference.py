@@ -63,6 +63,9 @@ class Recipe:
         mode: way in which the model plays.
         protocols: protocol of the evaluation on test tasks -> number of seeds.
         forgets: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
+        meets_tests: whether a model that learns by playing plays with the test teammates on the test layouts, instead
+            of diverse ones on the training layouts. It is no result of the benchmark: it shows what an ego with this
+            view can earn at most, or nearly so.
     """
 
     method: str
@@ -74,6 +77,7 @@ class Recipe:
     mode: PlayMode = AS_PUBLISHED
     protocols: Mapping[str, int] = field(default_factory=lambda: {"seeded": 3, "published": 1})
     forgets: bool = False
+    meets_tests: bool = False
 
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
@@ -82,12 +86,22 @@ _TEACHER: dict[str, Any] = {**RL2_SETTINGS["train"], "steps": 1600}
 
 RECIPES = {
     "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER, mode=PlayMode(greedy=False)),
+    "rl2-tests": Recipe(
+        "rl2",
+        "tasks",
+        RL2_SETTINGS["model"],
+        {**_TEACHER, "steps": 1000},
+        mode=PlayMode(greedy=False),
+        protocols={"seeded": 1},
+        meets_tests=True,
+    ),
     "ad-noise": Recipe("ad", "noise", _TINY, _STEPS, {"labels": "oracle"}),
     "dpt-noise": Recipe("dpt", "noise", _TINY, _STEPS, {"labels": "oracle"}),
     "ad-ppo": Recipe("ad", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
     "dpt-ppo": Recipe("dpt", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
     "ad-both": Recipe("ad", "both", _TINY, _STEPS, {"labels": "oracle"}),
     "dpt-both": Recipe("dpt", "both", _TINY, _STEPS, {"labels": "oracle"}),
+    "ad-learned": Recipe("ad", "both", _TINY, _STEPS, {"labels": "oracle", "teammate_family": ("rl",)}),
     "ad-student": Recipe("ad", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
     "dpt-student": Recipe("dpt", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
     "ad-rising": Recipe(
@@ -208,8 +222,11 @@ class _Making:
         """Returns the run folder of RL^2."""
         recipe, folder = RECIPES[name], self.out / f"{name}-{self.track}"
         options = TrainOptions(**recipe.train)
-        choice = HistoryOptions(self.layouts, str(self.noise_release()), **TRACK_VIEWS[self.track])
-        play, tasks = PlayOptions(**TRACK_PLAY[self.track]), self.diverse("train")
+        layouts, tasks, play = self.layouts, self.diverse("train"), PlayOptions(**TRACK_PLAY[self.track])
+        if recipe.meets_tests:
+            tasks, play = self._tasks("test"), PlayOptions()
+            layouts = tuple(dict.fromkeys(task.layout.name for task in tasks))
+        choice = HistoryOptions(layouts, str(self.noise_release()), **TRACK_VIEWS[self.track])
         job = prepare_play(recipe.method, ModelOptions(**recipe.model), options, play, choice, tasks)
         train(
             job.method,

@@ -49,6 +49,7 @@ ENDS = 20
 RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
 """Files of the page -> their first bytes, by which they are recognised before they are replaced."""
 
+_NUMBERS = ("mean", "first", "last", "opening")
 _PAPER = ("AD", "DPT")
 _RESAMPLES = 10_000
 _DIGITS = 3
@@ -61,12 +62,14 @@ class CellReturns(NamedTuple):
         mean: float64 (U,), over all episodes.
         first: float64 (U,), over the first `ENDS` episodes.
         last: float64 (U,), over the last `ENDS`.
+        opening: float64 (U,), of the very first episode.
         overlaps: overlap of training data and tasks, see `baselines.report.overlap.OVERLAPS`.
     """
 
     mean: Float[np.ndarray, " U"]
     first: Float[np.ndarray, " U"]
     last: Float[np.ndarray, " U"]
+    opening: Float[np.ndarray, " U"]
     overlaps: tuple[str, ...] = ()
 
     @property
@@ -123,8 +126,8 @@ def read_stored(path: Path) -> StoredResults:
 
 
 def _stored_cell(found: Mapping[str, Any]) -> CellReturns:
-    mean, first, last = (np.array(found[name], np.float64) for name in ("mean", "first", "last"))
-    return CellReturns(mean, first, last, tuple(found["overlaps"]))
+    mean, first, last, opening = (np.array(found[name], np.float64) for name in _NUMBERS)
+    return CellReturns(mean, first, last, opening, tuple(found["overlaps"]))
 
 
 def write_stored(path: Path, stored: StoredResults) -> None:
@@ -133,7 +136,7 @@ def write_stored(path: Path, stored: StoredResults) -> None:
     for (agent, protocol), cells in stored.cells.items():
         for (layout, family), found in cells.items():
             of_protocol = agents.setdefault(agent, {}).setdefault(protocol, {})
-            numbers = {name: np.round(getattr(found, name), _DIGITS).tolist() for name in ("mean", "first", "last")}
+            numbers = {name: np.round(getattr(found, name), _DIGITS).tolist() for name in _NUMBERS}
             of_protocol.setdefault(layout, {})[family] = numbers | {"overlaps": list(found.overlaps)}
     with atomic_write(path) as partial:
         text = json.dumps({"about": stored.about, "agents": agents}, separators=(",", ":"))
@@ -170,12 +173,12 @@ def _cell_returns(folder: Path, run: EvaluationRun) -> dict[Cell, CellReturns]:
         returns = np.array(result.returns, np.float64)
         if returns.shape[1] < 2 * ENDS:
             raise OptionError(f"{path}: {returns.shape[1]} episodes, expected at least {2 * ENDS}; evaluate more")
-        ends = returns[:, :ENDS].mean(axis=1), returns[:, -ENDS:].mean(axis=1)
+        ends = returns[:, :ENDS].mean(axis=1), returns[:, -ENDS:].mean(axis=1), returns[:, 0]
         parts.setdefault(cell_of(tasks[result.task_id]), []).append(np.stack([returns.mean(axis=1), *ends]))
     found = {}
     for cell in sorted(parts, key=cell_order):
-        mean, first, last = np.concatenate(parts[cell], axis=1)
-        found[cell] = CellReturns(mean, first, last, run.overlaps([cell]))
+        mean, first, last, opening = np.concatenate(parts[cell], axis=1)
+        found[cell] = CellReturns(mean, first, last, opening, run.overlaps([cell]))
     return found
 
 
@@ -228,13 +231,22 @@ def summary_table(stored: StoredResults, protocol: str) -> str:
                 f"{mean:.2f} ({low:.2f} to {high:.2f})",
                 str(count),
                 f"{len(rising)} of {count}",
+                _opening_text(cells, protocol),
             ]
         )
         if protocol == PUBLISHED_PROTOCOL:
             rows[-1].append(", ".join(layouts_above_paper(cells)) or "none")
-    header = ["agent", "normalised return", "cells", "rising"]
+    header = ["agent", "normalised return", "cells", "rising", "first episode to last 20"]
     paper = ["layouts above the paper's AD and DPT"] if protocol == PUBLISHED_PROTOCOL else []
     return markdown_table([*header, *paper], rows)
+
+
+def _opening_text(cells: Mapping[Cell, CellReturns], protocol: str) -> str:
+    """Returns the mean return of the first episode and of the last ones over the cells with headroom, and the interval
+    of their difference over pairs of a task and a seed."""
+    chosen = [cells[cell] for cell in cells_with_headroom(protocol) if cell in cells]
+    opening, last = (np.concatenate([getattr(found, name) for found in chosen]) for name in ("opening", "last"))
+    return f"{opening.mean():z.1f} to {last.mean():z.1f}, {_with_interval(last - opening, '+')}"
 
 
 def layouts_above_paper(cells: Mapping[Cell, CellReturns]) -> list[str]:

@@ -40,7 +40,7 @@ from tests.helpers.paths import ROOT
 
 def cell(mean: float, gain: float = 0.0) -> CellReturns:
     values = np.full(15, mean)
-    return CellReturns(values, values - gain / 2, values + gain / 2)
+    return CellReturns(values, values - gain / 2, values + gain / 2, values - gain)
 
 
 def everywhere(share: float, gain: float = 0.0) -> dict:
@@ -64,7 +64,7 @@ class TestNumbers:
 
     def test_the_interval_shrinks_with_the_spread(self):
         wide = {
-            one: CellReturns(*[found.mean + 5 * np.linspace(-1, 1, 15)] * 3) for one, found in everywhere(0.5).items()
+            one: CellReturns(*[found.mean + 5 * np.linspace(-1, 1, 15)] * 4) for one, found in everywhere(0.5).items()
         }
         mean, low, high, _ = normalised_interval(wide, "seeded")
         assert low < mean - 0.01 and high > mean + 0.01 and mean == pytest.approx(0.5)
@@ -106,6 +106,7 @@ class TestStoring:
         stored = add_results(StoredResults({}, {}), results, "a ramp")
         found = stored.cells["ramp", "seeded"]["demo_wide", "H4"]
         assert found.mean.tolist() == [49.5, 50.5] * 5
+        assert found.opening.tolist() == [0.0, 1.0] * 5
         assert found.first.tolist() == [9.5, 10.5] * 5 and found.last.tolist() == [89.5, 90.5] * 5
         assert found.overlaps == ("family",)
         write_stored(tmp_path / "results.json", stored)
@@ -156,6 +157,13 @@ def test_agents_that_forget_have_no_columns_of_their_own_beside_the_others():
     named = {part.splitlines()[0] for part in parts if f"| `a{FORGETS}`" in part}
     assert named == {"Summary", "First and last episodes, protocol `seeded`"}
     assert "| `a` | 0.50 (0.50 to 0.50)" in summary_table(stored, "seeded")
+
+
+def test_the_summary_compares_the_very_first_episode_with_the_last():
+    stored = StoredResults({("a", "seeded"): everywhere(0.0, gain=2.0)}, {})
+    stays = np.mean([read_headroom("seeded")[one]["stay"] for one in cells_with_headroom("seeded")])
+    text = f"| {stays - 2:.1f} to {stays + 1:.1f}, +3.0 (+3.0 to +3.0) |"
+    assert text in summary_table(stored, "seeded")
 
 
 def test_a_new_agent_needs_a_sentence(results):
