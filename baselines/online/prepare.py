@@ -17,7 +17,7 @@ from baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_
 from baselines.online.teammates import check_heuristics
 from baselines.training.histories import filter_histories, history_settings, training_cells
 from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
-from baselines.training.seen import teammate_id
+from baselines.training.seen import TASKS_SOURCE, teammate_id
 from baselines.training.trainer import TrainingData
 from generation.policy import Policy
 from generation.teammates.registry import build_teammate, recover_teammate
@@ -255,7 +255,7 @@ def _task_cells(tasks: Sequence[Task], labels: Labels | None) -> list[dict[str, 
             "split": split,
             "family": family,
             "algorithm": kind,
-            "source": "tasks",
+            "source": TASKS_SOURCE,
             "labels": labels,
             "tasks": len(found),
             "histories": 0,

@@ -10,7 +10,7 @@ from typing import Any
 from baselines.report.overlap import describe_training, overlap_legend
 from baselines.report.results import EvaluationRun, ResultSource, instances_range
 from baselines.report.summary import track_tables
-from baselines.training.seen import TRAINED_ON
+from baselines.training.seen import TASKS_SOURCE, TRAINED_ON
 from icrl4aht_data.utils.templates import fill_template
 
 CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
@@ -73,8 +73,7 @@ def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
     instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
     layouts = ", ".join(histories["layouts"])
     if "groups" in histories:  # trained by playing
-        played = sum(histories["groups"].values())
-        selection = f"none: {played} tasks at a time, played with the teammates of the release's histories of {layouts}"
+        selection = _played_text(trained["config"], layouts)
     else:
         selection = f"{histories['sizes']['train']} of {layouts}"
     selection += f"; the release's manifest has SHA-256 `{trained['manifest_sha256']}`"
@@ -86,6 +85,17 @@ def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
         f"{sources[0].conditions}, {instances} in a cell",
     ]
     return f"| {' | '.join(values)} |"
+
+
+def _played_text(config: dict[str, Any], layouts: str) -> str:
+    """Returns what a model that learned by playing has played."""
+    played = sum(config["histories"]["groups"].values())
+    others = sum(cell["tasks"] for cell in config.get(TRAINED_ON, ()) if cell.get("source") == TASKS_SOURCE)
+    text = f"none: {played} tasks at a time, played with the teammates of the release's histories of {layouts}"
+    text += f", and with those of {others} other tasks" if others else ""
+    if rearranged := config["play"].get("rearranged"):
+        text += f"; also on {rearranged} rearranged versions of each layout"
+    return text + ("; also with four recipes" if config["play"].get("four_recipes") else "")
 
 
 def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:

@@ -16,6 +16,9 @@ from icrl4aht_data.utils.files import json_hash
 TRAINED_ON = "trained_on"
 """Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
 
+TASKS_SOURCE = "tasks"
+"""In that record, the `source` of teammates that a model has played with and that have no histories."""
+
 _KINDS = {family: tuple(kind for kind, of in KIND_FAMILIES.items() if of == family) for family in FAMILIES}
 
 
