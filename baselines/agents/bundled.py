@@ -17,7 +17,7 @@ from baselines.training.histories import read_trained
 from baselines.training.run_folder import CHECKPOINTS, CONFIG, read_config
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.remote.remote_release import is_address
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -49,18 +49,6 @@ def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
         if runs:
             found[path.name] = BundledModel(path.name, runs)
     return found
-
-
-def find_bundled(name: str, folder: Path = MODELS) -> BundledModel:
-    """Returns a bundled model.
-
-    Raises:
-        UnknownNameError: if there is none of this name; lists the names and the nearest.
-    """
-    models = bundled_models(folder)
-    if name not in models:
-        raise unknown("bundled model", name, models)
-    return models[name]
 
 
 def describe_model(model: BundledModel) -> list[str]:

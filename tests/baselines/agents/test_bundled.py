@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from baselines.agents import Percept, bundled
-from baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models, find_bundled
+from baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from baselines.agents.egos import PlayMode, find_agent
 from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate
@@ -96,8 +96,6 @@ def test_layouts_of_other_tracks(models):
 def test_unknown_names(models):
     with pytest.raises(UnknownNameError, match="unknown agent 'ad-tinny'; valid: stay, random, oracle, ad-tiny"):
         find_agent("ad-tinny")
-    with pytest.raises(UnknownNameError, match="unknown bundled model 'x'; valid: ad-tiny"):
-        find_bundled("x", models)
 
 
 def test_names_and_unfinished_runs(run, tmp_path):
