@@ -27,7 +27,7 @@ from baselines.report.model_card import CARD_BEGINS, card_name, write_model_card
 from baselines.report.page import write_page_with_episodes
 from baselines.report.results import merge, note_results, read_run
 from baselines.report.summary import REPORT_BEGINS, write_report
-from baselines.training.ablations import ABLATIONS, VARIED_IN_ABLATIONS, ExperimentEntry
+from baselines.training.ablations import ABLATIONS, ExperimentEntry
 from baselines.training.histories import TrainingTask, filter_histories, prepare
 from baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from baselines.training.trainer import train
@@ -52,10 +52,11 @@ class Experiment(NamedTuple):
         title: for the report.
         entries: one per model.
         layouts: to train on.
-        varies: options that distinguish the entries and can therefore not be set for all of them.
+        varies: options that the entries set and that can therefore not be set for all of them.
         held_out: whether to evaluate with learned teammates held out of training, on the training layouts.
         acting: way of acting of the trained models; see `agents.egos.ACTING`.
         methods: the methods that it is about.
+        split: which tasks its models are evaluated on, see `EVALUATION_SPLITS`.
     """
 
     title: str
@@ -65,6 +66,7 @@ class Experiment(NamedTuple):
     held_out: bool = False
     acting: Acting = "cached"
     methods: tuple[str, ...] = ("ad", "dpt")
+    split: str = "test"
 
 
 def _size_entry(name: str) -> ExperimentEntry:
@@ -103,8 +105,9 @@ EXPERIMENTS = {
             ablation.title,
             ablation.entries,
             ("demo_wide",),
-            varies=VARIED_IN_ABLATIONS,
+            varies=ablation.sets,
             methods=(ablation.method,),
+            split="diverse",
         )
         for name, ablation in ABLATIONS.items()
     },
@@ -127,12 +130,13 @@ class ExperimentPlan:
         root: folder or address of a release; None for the bundled mini release.
         suite: folder of learned teammates; required for "heldout-rl".
         size: name of the models' size; "sweep size" varies it.
+        batch_size: rows of a batch, where an entry has no value; the paper's by default.
         train: values of `TrainOptions` for all entries, such as steps.
         model: values of `ModelOptions` for all entries.
         filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
         values: names of the entries to run; all by default.
-        split: which tasks to evaluate on, see `EVALUATION_SPLITS`: "test", the default, or others, on the training
-            layouts.
+        split: which tasks to evaluate on, see `EVALUATION_SPLITS`: the experiment's by default; all but "test" are
+            on the training layouts.
         families: teammate families to evaluate with; all by default.
         tasks: tasks of each teammate kind and layout, at most.
         episodes: of a task; the protocol's by default.
@@ -150,6 +154,7 @@ class ExperimentPlan:
     root: str | None = None
     suite: Path | None = None
     size: str = "small"
+    batch_size: int = TrainOptions.batch_size
     train: dict[str, Any] = field(default_factory=dict)
     model: dict[str, Any] = field(default_factory=dict)
     filters: dict[str, Any] = field(default_factory=dict)
@@ -244,10 +249,10 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
     if plan.size not in SIZES:
         raise unknown("size", plan.size, SIZES)
     if "layers" in experiment.varies and plan.size != ExperimentPlan.size:
-        raise OptionError(f"size = {plan.size}: `{name}` varies it; choose by --only, such as {names[0]}")
+        raise OptionError(f"size = {plan.size}: `{name}` sets it; choose by --only, such as {names[0]}")
     for option, value in (plan.train | plan.model).items():
         if option in experiment.varies:
-            raise OptionError(f"{option} = {value}: `{name}` varies it; choose by --only, such as {names[0]}")
+            raise OptionError(f"{option} = {value}: `{name}` sets it; choose by --only, such as {names[0]}")
     return [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
 
 
@@ -313,7 +318,7 @@ def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> li
                               f"held-out teammates; leave --split out")  # fmt: skip
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
-        split = plan.split or "test"
+        split = plan.split or experiment.split
         played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
         tasks = [task for task in bundled_tasks(track_of(played_on), split) if task.layout.name == played_on]
         if not tasks:
@@ -372,7 +377,7 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
 
 def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
     size = SIZES[plan.size]
-    options = TrainOptions(**{**size.train, **entry.train, **plan.train})
+    options = TrainOptions(**{**size.train, "batch_size": plan.batch_size, **entry.train, **plan.train})
     model = ModelOptions(**{**size.model, **entry.model, **plan.model})
     histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters, **entry.histories)
     try:
@@ -433,5 +438,5 @@ def _evaluate_entry(
         details=details,
         played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
     )
-    own = experiment.held_out or plan.split in ("validation", "diverse")
+    own = experiment.held_out or (plan.split or experiment.split) != "test"
     note_results(folder, run, tasks if own else ())

@@ -63,9 +63,9 @@ class Recipe:
         mode: way in which the model plays.
         protocols: protocol of the evaluation on test tasks -> number of seeds.
         forgets: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
-        meets_tests: whether a model that learns by playing plays with the test teammates on the test layouts, instead
-            of diverse ones on the training layouts. It is no result of the benchmark: it shows what an ego with this
-            view can earn at most, or nearly so.
+        meets_tests: whether a model that learns by playing plays with the test teammates on the test layouts with
+            headroom, besides those of the noise histories there, instead of diverse ones on the training layouts. It
+            is no result of the benchmark: it shows what such a model earns that has met the teammates of the test.
     """
 
     method: str

@@ -485,8 +485,8 @@ def _run_experiment(
     from baselines.experiments import ExperimentPlan, run_experiment
 
     size = size or "small"
-    training = {"batch_size": default_batch_size(size)} | train
-    plan = ExperimentPlan(root=root and str(root), suite=suite, size=size, train=training, **histories, **options)
+    sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
+    plan = ExperimentPlan(root=root and str(root), suite=suite, **sizes, **histories, **options)
     with bars(edges=True) as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:

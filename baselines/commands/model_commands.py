@@ -10,6 +10,7 @@ import click
 from rich.console import Console
 
 from baselines.commands.options import (
+    ABLATION_NAME,
     EGO_NAME,
     REFERENCE_NAME,
     find_ego,
@@ -164,14 +165,19 @@ def reference_command(
 )
 @click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
 @click.option(
-    "--ablation", type=Folder(), metavar="FOLDER", help="Also add results of `ablate windows` or `ablate contexts`."
+    "--ablation",
+    "ablations",
+    type=(ABLATION_NAME, Folder()),
+    metavar="NAME FOLDER",
+    multiple=True,
+    help="Also add the results of `ablate NAME`, windows or contexts, from FOLDER.",
 )
 @click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
 @click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
 @overwrite_option
 def results_command(
-    runs: tuple[Path, ...], ablation: Path | None, about: str, out: Path, store: bool, overwrite: bool
+    runs: tuple[Path, ...], ablations: tuple[tuple[str, Path], ...], about: str, out: Path, store: bool, overwrite: bool
 ) -> None:
     """Compare reference models with the paper's numbers.
 
@@ -192,8 +198,8 @@ def results_command(
     stored = read_stored(results_file())
     for folder in runs:
         stored = add_results(stored, folder, about)
-    if ablation:
-        stored = add_ablation(stored, ablation)
+    for name, folder in ablations:
+        stored = add_ablation(stored, f"ablate {name}", folder)
     if store:
         write_stored(results_file(), stored)
     for path in write_comparison(stored, out):

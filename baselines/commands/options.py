@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
+from baselines.training.ablations import ABLATIONS
 from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import read_tasks
@@ -81,6 +82,7 @@ _EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols"
 METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
 _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
 _playing = lazy_attribute("baselines.methods.registry", "PLAYING")
+ABLATION_NAME = Names("ablation", lambda: [name.removeprefix("ablate ") for name in ABLATIONS])
 REFERENCE_NAME = Names("reference model", lazy_attribute("baselines.reference", "RECIPES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 

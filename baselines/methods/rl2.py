@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from baselines.methods.ad import example_step
 from baselines.methods.hybrid_ad import RecurrentTrunk
-from baselines.methods.method import Method, World, make_tokens
+from baselines.methods.method import Method, World, check_no_teammate_loss, make_tokens
 from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import StepInput, StepTokens
 from generation.learners.encoder import orthogonal_dense
@@ -79,6 +79,7 @@ def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, di
 
 def rl2(options: ModelOptions, world: World) -> Method:
     """Returns the recurrent policy of RL^2."""
+    check_no_teammate_loss("rl2", options)
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
     model = RL2Model(make_tokens(StepTokens, options, world), trunk, PolicyValueHead(options.width, world.actions))
     example = (example_step(world), jnp.zeros((1, options.recurrent_layers * options.width)))

@@ -17,37 +17,41 @@ def with_four_recipes(layout: Layout) -> Layout:
     """Returns a layout with the four recipes that the protocol `published` has on the layout track.
 
     Raises:
-        OptionError: if the layout lacks an ingredient of theirs.
+        OptionError: if the layout has no pile of one of their ingredients.
     """
     missing = {i for recipe in FOUR_RECIPES for i in recipe} - set(layout.ingredients)
     if missing:
         raise OptionError(f"{layout.name}: it has no pile of ingredient {min(missing)}, which the four recipes need")
-    return replace(layout, name=f"{layout.name} four recipes", alias=layout.alias, recipes=FOUR_RECIPES)
+    return replace(layout, name=f"{layout.name} four recipes", recipes=FOUR_RECIPES)
 
 
 def rearranged_layouts(layout: Layout, count: int, seed: int = 0) -> list[Layout]:
-    """Returns layouts with the same rooms, whose counters, piles, pots and other fixtures have changed places.
+    """Returns layouts with the same rooms, in which counters, piles, pots and other fixtures stand elsewhere.
 
-    Fixtures change places only among cells that the same agents reach, so that the same work is possible. None of the
-    layouts is one of the benchmark, mirrored ones included.
+    A fixture moves only to cells that the same agents reach, so that the same work is possible. None of the layouts is
+    one of the benchmark, mirrored ones included. Every second one has the four recipes of `with_four_recipes`.
 
     Args:
-        layout: the layout; every second result has the four recipes of `with_four_recipes`.
+        layout: the layout.
         count: number of different layouts.
-        seed: of the places.
+        seed: seed of the arrangements.
 
     Raises:
-        OptionError: if there are not so many different ones.
+        OptionError: if there are not so many different ones, or if the layout has no pile of one of the ingredients of
+            the four recipes.
     """
+    recipes = with_four_recipes(layout).recipes
     rng = np.random.default_rng([seed, *map(ord, layout.name)])
     known = {mirrored for name in LAYOUT_NAMES for mirrored in _mirrored(get_layout(name).rows)}
     found: list[Layout] = []
     for _ in range(100 * count):
+        if len(found) == count:
+            break
         rows = _rearranged(layout, rng)
-        if rows not in known and len(found) < count:
+        if rows not in known:
             known |= set(_mirrored(rows))
             one = replace(layout, name=f"{layout.name} rearranged {len(found)}", rows=rows)
-            found.append(replace(one, recipes=FOUR_RECIPES) if len(found) % 2 else one)
+            found.append(replace(one, recipes=recipes) if len(found) % 2 else one)
     if len(found) < count:
         raise OptionError(f"{layout.name}: its fixtures have {len(found)} other arrangements, expected {count}")
     return found
@@ -71,8 +75,8 @@ def _rearranged(layout: Layout, rng: np.random.Generator) -> tuple[str, ...]:
 def _touches(layout: Layout, cell: int, room: np.ndarray) -> bool:
     """Whether an agent in a room can face a cell."""
     x, y = cell % layout.width, cell // layout.width
-    beside = {(y + dy) * layout.width + x + dx for dx, dy in STEP.values() if 0 <= x + dx < layout.width}
-    return not beside.isdisjoint(room.tolist())
+    neighbours = {(y + dy) * layout.width + x + dx for dx, dy in STEP.values() if 0 <= x + dx < layout.width}
+    return not neighbours.isdisjoint(room.tolist())
 
 
 def _mirrored(rows: tuple[str, ...]) -> list[tuple[str, ...]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,9 @@ from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions,
 from baselines.training.seen import TASKS_SOURCE, teammate_id
 from baselines.training.trainer import TrainingData
 from generation.policy import Policy
+from generation.teammates.draws import find_draw
 from generation.teammates.registry import build_teammate, recover_teammate
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
@@ -99,13 +102,14 @@ def prepare_play(
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     teammates = _teammates(dataset, tasks)
-    everywhere = teammates | _on_other_layouts(teammates, play)
+    _check_layouts(layouts, teammates)
+    others = _other_layouts(teammates, play)
+    everywhere = teammates | {(other, family): _rebuilt(mates, other) for other, _, family, mates in others}
     policies = {key: [mate.policy for mate in found.values()] for key, found in everywhere.items()}
-    shares = _shares(dataset, tasks)
-    shares = {layout.name: shares.get(layout.name, OTHER_SHARE) for layout, _ in everywhere}
-    hides = {layout.name for layout, _ in everywhere if layout.name.split()[0] in hidden}
+    shares = _shares(dataset, tasks) | {other.name: OTHER_SHARE for other, *_ in others}
+    hides = {*hidden, *(other.name for other, layout, *_ in others if layout.name in hidden)}
     groups = make_groups(policies, options.batch_size, shares, hides)
-    played = _played(teammates, groups)
+    played = _played(everywhere, groups)
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -185,51 +189,77 @@ def _history_of_task(dataset: Dataset | None) -> dict[str, int]:
     return {str(task): int(number) for task, number in zip(dataset.column("task_id"), dataset.ids, strict=True)}
 
 
-def _on_other_layouts(teammates: _Teammates, play: PlayOptions) -> _Teammates:
-    """Returns heuristics on further layouts: all of a layout's families with four recipes, and one on each of its
-    rearranged layouts, in turn."""
-    families: dict[Layout, list[str]] = {}
-    for (layout, family), mates in teammates.items():
-        if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):
-            families.setdefault(layout, []).append(family)
-    chosen: list[tuple[Layout, Layout, str]] = []
-    for layout, names in families.items():
-        if play.four_recipes:
-            chosen += [(layout, with_four_recipes(layout), family) for family in names[:1]]
-        other = rearranged_layouts(layout, play.rearranged) if play.rearranged else []
-        chosen += [(layout, one, names[number % len(names)]) for number, one in enumerate(other)]
-    return {
-        (other, family): {
-            task_id: mate._replace(policy=build_teammate(other, mate.entry))
-            for task_id, mate in teammates[layout, family].items()
+def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
+    """Check that every chosen layout has teammates."""
+    missing = [layout.name for layout in layouts if layout not in {layout for layout, _ in teammates}]
+    if missing:
+        raise OptionError(
+            f"{', '.join(missing)}: neither a chosen history nor a task of a manifest is on this layout; leave it out, "
+            f"or choose other filters or manifests"
+        )
+
+
+def _other_layouts(teammates: _Teammates, play: PlayOptions) -> list[tuple[Layout, Layout, str, dict[str, _Teammate]]]:
+    """Returns layouts that are none of the benchmark's, with what they were made of, and a family and its heuristics.
+
+    Each layout with four recipes has the first family of the layout, the rearranged layouts have its families in turn.
+
+    Raises:
+        OptionError: if a layout has learned teammates alone, which play on their own layout only.
+    """
+    wanted = play.four_recipes or play.rearranged
+    found = []
+    for layout in dict.fromkeys(layout for layout, _ in teammates) if wanted else ():
+        families = {
+            family: mates
+            for (one, family), mates in teammates.items()
+            if one is layout and all(mate.entry["kind"] == "heuristic" for mate in mates.values())
         }
-        for layout, other, family in chosen
-    }
+        if not families:
+            raise OptionError(
+                f"{layout.name}: rearranged layouts and four recipes need heuristic teammates, this layout has learned "
+                f"ones alone; leave out --rearranged and --four-recipes, or give a manifest with heuristics"
+            )
+        made = [with_four_recipes(layout)] * play.four_recipes
+        made += rearranged_layouts(layout, play.rearranged) if play.rearranged else []
+        turns = zip(made, itertools.cycle(families.items()), strict=False)
+        found += [(other, layout, family, mates) for other, (family, mates) in turns]
+    return found
+
+
+def _rebuilt(mates: Mapping[str, _Teammate], layout: Layout) -> dict[str, _Teammate]:
+    """Returns heuristics on another layout."""
+    return {task_id: mate._replace(policy=build_teammate(layout, mate.entry)) for task_id, mate in mates.items()}
 
 
 def _played(teammates: _Teammates, groups: Sequence[TaskGroup]) -> set[str]:
     """Returns the tasks whose teammates are played with; with few tasks not all are."""
     played: set[str] = set()
     for group in groups:
-        names = list(teammates.get((group.layout, group.family), ()))
-        if names:
-            played |= {names[number] for number in chosen_teammates(len(names), len(group.teammates))}
+        names = list(teammates[group.layout, group.family])
+        played |= {names[number] for number in chosen_teammates(len(names), len(group.teammates))}
     return played
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
-    """Returns the share of the tasks on each layout, in units of those on layouts where the ego matters."""
-    shares = {task.layout.name: 1.0 for task in tasks}
-    if dataset is None:
-        return shares
-    path = Path(dataset.root) / PROVENANCE
-    provenance = read_provenance(path) if path.is_file() else {}
-    shares |= {layout.name: FLAT_SHARE if provenance else 1.0 for layout in dataset.layouts}
-    for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
-        made = provenance.get(str(task_id))
-        if made is not None and (made.references is None or made.references.matters):
-            shares[str(layout)] = 1.0
-    return shares
+    """Returns the share of the tasks on each layout, in units of those on layouts where the ego matters.
+
+    With a drawn teammate it matters if the oracle earns more than an ego that does nothing. Teammates without
+    measurements count as ones with which it matters.
+    """
+    matters: dict[str, bool] = {}
+    for task in tasks:
+        draw = find_draw(task.layout.name, task.teammate)
+        helps = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
+        matters[task.layout.name] = matters.get(task.layout.name, False) or helps
+    if dataset is not None:
+        path = Path(dataset.root) / PROVENANCE
+        provenance = read_provenance(path) if path.is_file() else {}
+        for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
+            made = provenance.get(str(task_id))
+            own = made is None or made.references is None or made.references.matters
+            matters[str(layout)] = matters.get(str(layout), False) or own
+    return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}
 
 
 def _played_cells(

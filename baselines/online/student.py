@@ -190,7 +190,7 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
     Args:
         dataset: the selection.
         number: number of the collection, from 0, which decides the tasks' seeds.
-        tasks: tasks with more teammates, heuristics; those on layouts that the selection has not are left out.
+        tasks: tasks with more teammates, heuristics; those on other layouts than the selection's are left out.
 
     Raises:
         OptionError: if the release does not describe the teammates of all of these histories, or for tasks with learned
@@ -209,6 +209,11 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         )
     check_heuristics(tasks)
     layouts = {layout.name for layout in dataset.layouts}
+    if tasks and not any(task.layout.name in layouts for task in tasks):
+        raise OptionError(
+            f"none of the {len(tasks)} tasks of the manifests is on {', '.join(sorted(layouts))}; leave them out, or "
+            f"choose other layouts"
+        )
     found: dict[tuple[str, str], Task] = {}
     references = {}
     for task in known + [task for task in tasks if task.layout.name in layouts]:

@@ -39,7 +39,7 @@ def check_heuristics(tasks: Iterable[Task]) -> None:
     """Check that all tasks have heuristic teammates.
 
     Raises:
-        OptionError: names the first one that has not.
+        OptionError: if one has a learned teammate; names the task.
     """
     for task in tasks:
         if task.teammate["kind"] != "heuristic":

@@ -10,7 +10,7 @@ Shapes: U pairs of a task and a seed.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,10 +35,11 @@ from baselines.report.results import (
     read_run,
 )
 from baselines.report.summary import bootstrap_interval
-from baselines.training.ablations import ABLATIONS
+from baselines.training.ablations import ABLATIONS, ExperimentEntry
+from baselines.training.run_folder import read_config
 from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
-from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.errors import IndexFormatError, OptionError, unknown
 from icrl4aht_data.plotting import save_figure
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
@@ -227,7 +228,7 @@ def summary_table(stored: StoredResults, protocol: str) -> str:
         rising = rising_cells(cells, protocol)
         rows.append(
             [
-                f"`{agent}`",
+                _code(agent) + _marks(one for found in cells.values() for one in found.overlaps),
                 f"{mean:.2f} ({low:.2f} to {high:.2f})",
                 str(count),
                 f"{len(rising)} of {count}",
@@ -242,11 +243,17 @@ def summary_table(stored: StoredResults, protocol: str) -> str:
 
 
 def _opening_text(cells: Mapping[Cell, CellReturns], protocol: str) -> str:
-    """Returns the mean return of the first episode and of the last ones over the cells with headroom, and the interval
-    of their difference over pairs of a task and a seed."""
+    """Returns the mean return of the first episode and of the last ones over the cells with headroom, and the 95 %
+    interval of their difference, a bootstrap over the pairs of a task and a seed within each cell."""
     chosen = [cells[cell] for cell in cells_with_headroom(protocol) if cell in cells]
-    opening, last = (np.concatenate([getattr(found, name) for found in chosen]) for name in ("opening", "last"))
-    return f"{opening.mean():z.1f} to {last.mean():z.1f}, {_with_interval(last - opening, '+')}"
+    if not chosen:
+        return ""
+    opening, last = (np.mean([getattr(found, name).mean() for found in chosen]) for name in ("opening", "last"))
+    rng = np.random.default_rng(0)
+    rises = [found.last - found.opening for found in chosen]
+    drawn = np.mean([rng.choice(values, (_RESAMPLES, len(values))).mean(axis=1) for values in rises], axis=0)
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    return f"{opening:z.1f} to {last:z.1f}, {last - opening:+z.1f} ({low:+z.1f} to {high:+z.1f})"
 
 
 def layouts_above_paper(cells: Mapping[Cell, CellReturns]) -> list[str]:
@@ -321,27 +328,51 @@ def gains_table(stored: StoredResults, protocol: str, agents: Sequence[str]) -> 
     return markdown_table(["layout", "family", *map(_code, agents)], rows)
 
 
-def add_ablation(stored: StoredResults, folder: Path) -> StoredResults:
-    """Returns stored results with those of an experiment `ablate windows` or `ablate contexts`.
+def add_ablation(stored: StoredResults, name: str, folder: Path) -> StoredResults:
+    """Returns stored results with those of an ablation, which replace what is stored of it.
 
     Args:
-        stored: the results so far; the experiment's are replaced.
+        stored: the results so far.
+        name: one of `ABLATIONS`.
         folder: the experiment's.
 
     Raises:
-        OptionError: if the folder has results of no entry, or results of fewer episodes than `add_results` needs.
+        UnknownNameError: for an unknown ablation.
+        OptionError: if the folder has no results of the first entry, a run whose settings are not the entry's, results
+            with other teammates than diverse validation ones, or too few episodes, see `add_results`.
     """
-    cells = dict(stored.cells)
-    for name, ablation in ABLATIONS.items():
-        for entry in ablation.entries:
-            found: dict[Cell, CellReturns] = {}
-            for results in sorted(folder.glob(f"{ablation.method}-{entry.name}/*/results")):
-                found |= _cell_returns(results, read_run(results))
-            if found:
-                cells[entry.name, name] = found
-    if cells.keys() == stored.cells.keys() and not any(folder.glob("*/*/results")):
-        raise OptionError(f"{folder}: no results of an ablation; expected a folder that `ablate windows` made")
+    if name not in ABLATIONS:
+        raise unknown("ablation", name, ABLATIONS)
+    ablation = ABLATIONS[name]
+    cells = {key: found for key, found in stored.cells.items() if key[1] != name}
+    for entry in ablation.entries:
+        found: dict[Cell, CellReturns] = {}
+        for results in sorted(folder.glob(f"{ablation.method}-{entry.name}/*/results")):
+            run = results.parents[1].with_name(f"{ablation.method}-{entry.run_of or entry.name}") / results.parent.name
+            _check_entry(entry, run / "run")
+            found |= _cell_returns(results, read_run(results))
+        others = sorted({group_of(cell) for cell in found} - {"diverse"})
+        if others:
+            raise OptionError(f"{folder}: {entry.name} has results of {', '.join(others)} tasks, expected diverse ones")
+        if found:
+            cells[entry.name, name] = found
+    first = ablation.entries[0].name
+    if (first, name) not in cells:
+        raise OptionError(f"{folder}: no results of {first}; expected a folder that `python -m baselines {name}` made")
     return StoredResults(cells, stored.about)
+
+
+def _check_entry(entry: ExperimentEntry, run: Path) -> None:
+    """Check that a run has the settings of an entry."""
+    config = read_config(run)
+    given = {"model": entry.model, "train": entry.train, "histories": entry.histories}
+    for part, values in given.items():
+        for name, expected in values.items():
+            if config[part].get(name) != expected:
+                raise OptionError(
+                    f"{run}: {name} = {config[part].get(name)!r}, expected {expected!r}, as {entry.name} has it; "
+                    f"train it again with this version"
+                )
 
 
 def ablation_table(stored: StoredResults, name: str) -> str:
@@ -359,8 +390,8 @@ def ablation_table(stored: StoredResults, name: str) -> str:
         mean = np.concatenate([cells[cell].mean for cell in sorted(cells, key=cell_order)])
         gain = np.concatenate([cells[cell].gain for cell in sorted(cells, key=cell_order)])
         first = mean if first is None else first
-        paired = mean - first if mean.shape == first.shape else None
-        difference = "" if paired is None or not paired.any() else _with_interval(paired, "+")
+        comparable = entry is not ABLATIONS[name].entries[0] and mean.shape == first.shape
+        difference = _with_interval(mean - first, "+") if comparable else ""
         rows.append([_code(entry.name), entry.about, _with_interval(mean), difference, _with_interval(gain, "+")])
     return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], rows)
 
@@ -377,8 +408,13 @@ def _code(name: str) -> str:
 def _cell_text(found: CellReturns | None) -> str:
     if found is None:
         return ""
-    marks = "".join(OVERLAPS[name].mark for name in found.overlaps)
-    return f"{found.mean.mean():z.1f}{marks}"
+    return f"{found.mean.mean():z.1f}{_marks(found.overlaps)}"
+
+
+def _marks(overlaps: Iterable[str]) -> str:
+    """Returns the marks of overlaps, each once, in the order of their legend."""
+    found = set(overlaps)
+    return "".join(kind.mark for name, kind in OVERLAPS.items() if name in found)
 
 
 def plot_comparison(stored: StoredResults, protocol: str, agents: Sequence[str], path: Path) -> None:

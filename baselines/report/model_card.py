@@ -122,7 +122,8 @@ def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
         made_by = sorted({cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell})
         data = {"sources of histories": ", ".join(made_by), "labels": config["histories"].get("labels")}
         histories = config["histories"]
-        changes = {name: histories.get(name) for name in ("every", "mirror") if histories.get(name) not in (None, 1)}
+        changes = {name: histories.get(name) for name in ("every", "mirror", "weights", "curriculum")}
+        changes = {name: value for name, value in changes.items() if value not in (None, 1, False, "uniform")}
         changes["hidden recipe indicators"] = ", ".join(histories.get("hide_recipe", ()))
         changes["started from run"] = (
             config.get("init", {}).get("run") if isinstance(config.get("init"), dict) else None

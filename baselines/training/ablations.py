@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from baselines.methods.options import SIZES
+
 
 @dataclass(frozen=True)
 class ExperimentEntry:
@@ -33,10 +35,7 @@ class ExperimentEntry:
     about: str = ""
 
 
-_ABLATED: dict[str, Any] = {"teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
-
-
-def _window_entry(
+def _ablated(
     name: str,
     about: str,
     model: Mapping[str, Any] = MappingProxyType({}),
@@ -44,41 +43,46 @@ def _window_entry(
     histories: Mapping[str, Any] = MappingProxyType({}),
     **options: Any,
 ) -> ExperimentEntry:
-    labels = {"labels": "expert"}
+    """Returns an entry of an ablation: these values, and for the rest those that all entries share."""
     return ExperimentEntry(
-        name, {**_ABLATED, **model}, dict(train), None, {**labels, **histories}, **options, about=about
+        name,
+        {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0, **model},
+        {"context": 200, "batch_size": 16, **train},
+        histories={"labels": "expert", **histories},
+        about=about,
+        **options,
     )
 
 
 WINDOW_ENTRIES = (
-    _window_entry("plain", "K = 200, +TA, labels of RL^2, rewards scaled, rope"),
-    _window_entry("sampled", "draws its actions", run_of="plain", sampled=True),
-    _window_entry("K500", "K = 500, 6 windows a batch", train={"context": 500, "batch_size": 6}),
-    _window_entry("K1000", "K = 1000, 3 windows a batch", train={"context": 1000, "batch_size": 3}),
-    _window_entry("K2000", "K = 2000, 2 windows a batch", train={"context": 2000, "batch_size": 2}),
-    _window_entry("every3", "every third episode", histories={"every": 3}),
-    _window_entry("every10", "every tenth episode", histories={"every": 10}),
-    _window_entry("own-actions", "targets are the actions taken, noise included", histories={"labels": None}),
-    _window_entry("oracle", "labels of the oracle, which sees the full state", histories={"labels": "oracle"}),
-    _window_entry("improvement", "histories by their improvement", histories={"weights": "improvement"}),
-    _window_entry("curriculum", "from early windows to all", histories={"curriculum": 0.5}),
-    _window_entry("no-ta", "without the teammate's actions", {"teammate_actions": False}),
-    _window_entry("next_obs", "predicts the next observation, too", {"next_obs": True}),
-    _window_entry("teammate", "predicts the teammate's action, too", {"teammate_loss": True}),
-    _window_entry("no-positions", "without rope", {"positions": "none"}),
-    _window_entry("smoothing", "label smoothing of 0.1", {"label_smoothing": 0.1}),
-    _window_entry("rewards", "rewards as they are, 20 a delivery", {"reward_scale": 1.0}),
+    _ablated("plain", "size tiny, K = 200, 16 windows a batch, +TA, labels of RL^2, scaled rewards, rope"),
+    _ablated("sampled", "draws its actions", run_of="plain", sampled=True),
+    _ablated("K500", "K = 500, 6 windows a batch", train={"context": 500, "batch_size": 6}),
+    _ablated("K1000", "K = 1000, 3 windows a batch", train={"context": 1000, "batch_size": 3}),
+    _ablated("K2000", "K = 2000, 2 windows a batch", train={"context": 2000, "batch_size": 2}),
+    _ablated("every3", "every third episode", histories={"every": 3}),
+    _ablated("every10", "every tenth episode", histories={"every": 10}),
+    _ablated("own-actions", "targets are the actions taken, noise included", histories={"labels": None}),
+    _ablated("oracle", "labels of the oracle, which sees the full state", histories={"labels": "oracle"}),
+    _ablated("improvement", "histories by their improvement", histories={"weights": "improvement"}),
+    _ablated("curriculum", "from early windows to all", histories={"curriculum": 0.5}),
+    _ablated("no-ta", "without the teammate's actions", {"teammate_actions": False}),
+    _ablated("next_obs", "predicts the next observation, too", {"next_obs": True}),
+    _ablated("teammate", "predicts the teammate's action, too", {"teammate_loss": True}),
+    _ablated("no-positions", "without rope", {"positions": "none"}),
+    _ablated("smoothing", "label smoothing of 0.1", {"label_smoothing": 0.1}),
+    _ablated("rewards", "rewards as they are, 20 a delivery", {"reward_scale": 1.0}),
 )
-"""What makes a window teach: AD with one difference each, on histories with labels of RL^2, as `collect` makes them."""
+"""Models of AD that differ in one thing each, trained on histories of RL^2 with its labels, as `collect` makes them."""
 
 CONTEXT_ENTRIES = (
-    _window_entry("plain", "contiguous contexts of K = 200, +TA, labels of RL^2"),
-    _window_entry("sampled", "draws its actions", run_of="plain", sampled=True),
-    _window_entry("mixed", "contexts of mixed skill: transitions of all of a history", histories={"order": "random"}),
-    _window_entry("K500", "K = 500, 6 contexts a batch", train={"context": 500, "batch_size": 6}),
-    _window_entry("oracle", "labels of the oracle, which sees the full state", histories={"labels": "oracle"}),
+    _ablated("plain", "size tiny, contiguous contexts of K = 200, 16 a batch, +TA, labels of RL^2"),
+    _ablated("sampled", "draws its actions", run_of="plain", sampled=True),
+    _ablated("mixed", "contexts of mixed skill: transitions of all of a history", histories={"order": "random"}),
+    _ablated("K500", "K = 500, 6 contexts a batch", train={"context": 500, "batch_size": 6}),
+    _ablated("oracle", "labels of the oracle, which sees the full state", histories={"labels": "oracle"}),
 )
-"""What makes a context teach: DPT with one difference each, on the same histories."""
+"""Models of DPT that differ in one thing each, trained on the same histories."""
 
 
 class Ablation(NamedTuple):
@@ -87,12 +91,17 @@ class Ablation(NamedTuple):
     Attributes:
         title: for the report.
         method: its name.
-        entries: one per model.
+        entries: one per model; with all others, the first one is compared.
     """
 
     title: str
     method: str
     entries: tuple[ExperimentEntry, ...]
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """Names of the values of `ModelOptions` and `TrainOptions` that the entries set."""
+        return tuple(dict.fromkeys(name for entry in self.entries for name in (*entry.model, *entry.train)))
 
 
 ABLATIONS = {
@@ -100,14 +109,3 @@ ABLATIONS = {
     "ablate contexts": Ablation("Contexts that teach", "dpt", CONTEXT_ENTRIES),
 }
 """Ablations by the name of their experiment."""
-
-VARIED_IN_ABLATIONS = (
-    "context",
-    "teammate_actions",
-    "next_obs",
-    "teammate_loss",
-    "positions",
-    "label_smoothing",
-    "reward_scale",
-)
-"""Options of models and trainings that an ablation sets itself."""

@@ -84,10 +84,13 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
     labels = _labels_of(method, histories.labels)
+    draws = _draws(split.train, options, histories)
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: _number_layouts(
-            _sampler(method, selection, options, model.teammate_actions, histories, labels),
+            _sampler(
+                method, selection, options, model.teammate_actions, histories, labels, draws if part == "train" else {}
+            ),
             dataset.layouts,
             histories.mirror,
         )
@@ -244,7 +247,9 @@ def _sampler(
     teammate_actions: bool,
     histories: HistoryOptions,
     labels: Labels | None,
+    draws: Mapping[str, Any],
 ) -> Any:
+    """Returns the sampler of a part of the histories; `draws` are further options of it."""
     lengths, every = dataset.column("T"), histories.every
     if options.context > lengths.min():
         raise OptionError(
@@ -257,11 +262,8 @@ def _sampler(
         "teammate_actions": teammate_actions,
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
+        **draws,
     }
-    if histories.weights == "improvement":
-        shared["weights"] = _improvements(dataset)
-    if histories.curriculum:
-        shared["curriculum"] = Curriculum(max(1, round(histories.curriculum * options.steps)))
     if method.data == "ad":
         _check_thinned(dataset, options.context, every)
         return dataset.ad(length=options.context, every=every, labels=labels, **shared)
@@ -271,9 +273,25 @@ def _sampler(
     return dataset.dpt(context=options.context, order=histories.order, labels=labels, **shared)
 
 
-def _improvements(dataset: Dataset) -> np.ndarray:
-    """Returns how much the return of each history rises; at least 1, a twentieth of a delivery."""
-    return np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
+def _draws(dataset: Dataset, options: TrainOptions, histories: HistoryOptions) -> dict[str, Any]:
+    """Returns the sampler's options on how histories are drawn in training; held-out ones are drawn uniformly.
+
+    Raises:
+        OptionError: if a window does not fit the part of a history that a curriculum begins with.
+    """
+    draws: dict[str, Any] = {}
+    if histories.weights == "improvement":  # a history that does not rise counts as one that rises by a point
+        draws["weights"] = np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
+    if histories.curriculum:
+        curriculum = Curriculum(max(1, round(histories.curriculum * options.steps)))
+        first = int(curriculum.first[1] * dataset.column("T").min())
+        if options.context > first:
+            raise OptionError(
+                f"context = {options.context}, curriculum = {histories.curriculum:g}: it begins with {first} steps of "
+                f"the shortest history of {dataset!r}; take fewer, or no --curriculum"
+            )
+        draws["curriculum"] = curriculum
+    return draws
 
 
 def _check_thinned(dataset: Dataset, context: int, every: int) -> None:

@@ -55,13 +55,13 @@ class PlayOptions:
     entropy: float = option_field(0.01, "Weight of the entropy bonus.", at_least=0)
     task_end: float = option_field(1 / 16, "Chance that a task ends after an episode.", above=0, at_most=1)
     imitation: float = option_field(1.0, "Weight of imitating the oracle at the start.", at_least=0)
+    imitation_end: float = option_field(0.5, "Share of the steps at which that weight has fallen to 0.", above=0)
     rearranged: int = option_field(
-        0, "Also play on so many versions of each layout whose piles, pots and counters changed places.", at_least=0
+        0, "Also play on so many rearranged versions of each layout, every second one with four recipes.", at_least=0
     )
     four_recipes: bool = option_field(
-        False, "Also play on each layout with the four recipes that the layout track has under the protocol published."
+        False, "Also play on each layout with the four recipes of the protocol published, with teammates of one family."
     )
-    imitation_end: float = option_field(0.5, "Share of the steps at which that weight has fallen to 0.", above=0)
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,9 +17,9 @@ import msgspec
 from generation.learners.resume import software_versions
 from generation.populations.headroom import learned_headroom
 from generation.teammates.distances import nearest_test
-from generation.teammates.draws import DRAWS_PER_SEED, Draw, hosted_families, ranges_of, read_draws
+from generation.teammates.draws import Draw, find_draw, hosted_families, read_draws
 from generation.teammates.references import REFERENCE_EPISODES, reference_returns
-from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
+from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
@@ -113,21 +112,6 @@ def _read(path: Path, settings: dict[str, Any]) -> list[TeammateFacts] | None:
         return msgspec.convert(content["facts"], list[TeammateFacts])
     except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
         return None
-
-
-def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
-    """Returns the draw of the table that a teammate entry is, or None."""
-    family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
-    if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
-        return None
-    draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
-    same = draws and _sampled(str(family), draws[0].theta_id, seed)["theta"] == teammate["theta"]
-    return draws[0] if same else None
-
-
-@cache
-def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
-    return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
 
 
 def _facts_of_draw(draw: Draw) -> TeammateFacts:

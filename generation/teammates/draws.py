@@ -12,9 +12,10 @@ farther from every test instance.
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from functools import lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -206,6 +207,26 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
             chosen = drawn_teammates(layout, [family], min(most, len(behaviours)), seed)
             tasks += [make_task(track, split, layout, teammate, seed=0) for teammate, _ in chosen]
     return tasks
+
+
+def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
+    """Returns the draw of the table that a teammate entry is, or None."""
+    family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
+    if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
+        return None
+    draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
+    same = draws and _equal(_sampled(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
+    return draws[0] if same else None
+
+
+def _equal(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Whether two parameter sets are equal up to the last digit, in which compilations of a draw may differ."""
+    return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
+
+
+@cache
+def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
+    return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
 
 
 def hosted_families(layout: str, base_seed: int = 0) -> list[str]:

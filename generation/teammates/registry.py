@@ -62,7 +62,8 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
         UnknownNameError: for a family or split that does not exist.
     """
     heuristic = _family(family)
-    samplings = {"train": heuristic.train, "test": heuristic.test, "diverse": heuristic.diverse}
+    samplings = {"train": heuristic.train, "test": heuristic.test}
+    samplings |= {"diverse": heuristic.diverse} if heuristic.diverse else {}
     if split not in samplings:
         raise unknown("split", split, samplings)
     presets, ranges = samplings[split]

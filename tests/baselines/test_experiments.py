@@ -126,14 +126,15 @@ def test_an_ablation_trains_one_method_and_shares_runs(release, tmp_path, monkey
     trained, played, modes = [], [], []
     monkeypatch.setattr(experiments, "prepare", lambda method, *others: trained.append(others) or 1 / 0)
     plan = dataclasses.replace(SMALL, root=str(release), methods=(), layouts=("demo_wide",), values=("every3",))
+    plan = dataclasses.replace(plan, train={"steps": 2}, model={}, families=("H3",))
     with pytest.raises(ZeroDivisionError):
         run_experiment("ablate windows", plan, tmp_path)
     ((model, _, histories),) = trained
     assert (histories.every, histories.labels, model.teammate_actions) == (3, "expert", True)
     with pytest.raises(UnknownNameError, match="unknown method of ablate windows 'dpt'; valid: ad"):
         run_experiment("ablate windows", dataclasses.replace(plan, methods=("dpt",)), tmp_path)
-    with pytest.raises(OptionError, match="context = 8: `ablate windows` varies it; choose by --only, such as plain"):
-        run_experiment("ablate windows", dataclasses.replace(plan, train=TRAIN | {"context": 8}), tmp_path)
+    with pytest.raises(OptionError, match="context = 8: `ablate windows` sets it; choose by --only, such as plain"):
+        run_experiment("ablate windows", dataclasses.replace(plan, train={"context": 8}), tmp_path)
     fake = TrainingTask(None, None, None, {"histories": {"channels": "own"}})  # type: ignore[arg-type]
     monkeypatch.setattr(experiments, "prepare", lambda *arguments: fake)
     monkeypatch.setattr(experiments, "_train_entry", lambda *arguments: None)
@@ -147,6 +148,18 @@ def test_an_ablation_trains_one_method_and_shares_runs(release, tmp_path, monkey
     run = "ad-plain/demo_wide/run"
     assert names == ["ad-plain/demo_wide/results", run, "ad-sampled/demo_wide/results", run]
     assert [mode.greedy for mode in modes] == [True, False]
+
+
+def test_entries_keep_their_batch_sizes(release, tmp_path, monkeypatch):
+    """The default of a CPU holds for entries that have none."""
+    prepared = []
+    monkeypatch.setattr(experiments, "prepare", lambda method, model, train, *others: prepared.append(train) or 1 / 0)
+    for command, size in (("ablate windows --only K500", 6), ("sweep context --only K250", 8)):
+        arguments = [*command.split(), "--root", str(release), "--layout", "demo_wide", "--out", str(tmp_path / "out")]
+        assert isinstance(CliRunner().invoke(cli, arguments).exception, ZeroDivisionError)
+        assert prepared[-1].batch_size == size
+    with pytest.raises(OptionError, match="batch_size = 3: `ablate windows` sets it; choose by --only, such as plain"):
+        run_experiment("ablate windows", dataclasses.replace(SMALL, train={"batch_size": 3}), tmp_path)
 
 
 def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_path, monkeypatch):
@@ -329,7 +342,7 @@ def test_a_size_applies_to_all_entries_and_sweeps_vary_it(release, tmp_path, mon
     (model, options), (_, swept) = seen
     assert (model.layers, model.width, model.encoder, model.positions) == (2, 64, "mlp", "rope")
     assert (options.context, swept.context) == (200, 250)
-    with pytest.raises(OptionError, match=r"size = tiny: `sweep size` varies it; choose by --only, such as small"):
+    with pytest.raises(OptionError, match=r"size = tiny: `sweep size` sets it; choose by --only, such as small"):
         run_experiment("sweep size", plan, tmp_path)
 
 
@@ -415,7 +428,7 @@ def test_impossible_plans(release, tmp_path):
     )
     fails(EmptySelectionError, absent, **learned)
     result = CliRunner().invoke(cli, ["sweep", "context", "--context", "9"])
-    assert "context = 9: `sweep context` varies it; choose by --only, such as K250" in str(result.exception)
+    assert "context = 9: `sweep context` sets it; choose by --only, such as K250" in str(result.exception)
     assert (
         "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'"
         in CliRunner().invoke(cli, ["sweep", "sizes"]).output

@@ -107,6 +107,7 @@ baselines: watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teamm
 baselines: headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
 baselines: sweep contxt | unknown sweep 'contxt'; valid: context, size. Did you mean 'context'?
 baselines: sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
+baselines: results --ablation ta empty --out r | unknown ablation 'ta'; valid: windows, contexts.
 baselines: ablate tb | unknown ablate 'tb'; valid: ta, windows, contexts.
 baselines: ablate windows --method dpt | unknown method of ablate windows 'dpt'; valid: ad
 baselines: train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
@@ -136,8 +137,8 @@ baselines: train amago_offline --layout demo_wide --labels oracle | amago_offlin
 baselines: train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
 baselines: train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
 baselines: collect --agent stay --source student --out c | source = student: none of Dataset(
-baselines: ablate windows --reward-scale 1 | reward_scale = 1.0: `ablate windows` varies it; choose by --only, such as
-baselines: results --ablation empty --out r | empty: no results of an ablation; expected a folder that `ablate windows`
+baselines: ablate windows --reward-scale 1 | reward_scale = 1.0: `ablate windows` sets it; choose by --only, such as
+baselines: results --ablation windows empty --out r | empty: no results of plain; expected a folder that `python -m
 baselines: collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
 baselines: results empty --out r | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
 baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,

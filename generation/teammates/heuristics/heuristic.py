@@ -46,11 +46,12 @@ class Heuristic:
         presets: preset -> parameters that differ from the defaults.
         train: distribution of sampled parameters for training tasks (paper, App. B.2).
         test: the one for test tasks.
-        diverse: one over all parameters that decide how a teammate acts, most of which the published ranges leave at
-            their defaults. It is not the paper's.
         spans: parameter -> full range; sampling moves these by up to a fifth of their range from the preset.
         choices: parameter -> n, for parameters that are one of 0..n-1.
         unbounded: parameters without an upper limit; all others are in 0..1, or choices.
+        diverse: distribution of all parameters that decide how a teammate acts, most of which the published ranges
+            leave at their defaults. It is not the paper's; None for a family without diverse
+            teammates.
     """
 
     kind: str
@@ -60,10 +61,10 @@ class Heuristic:
     presets: dict[str, dict[str, float]]
     train: Sampling
     test: Sampling
-    diverse: Sampling
     spans: dict[str, tuple[float, float]]
     choices: dict[str, int] = field(default_factory=dict)
     unbounded: frozenset[str] = frozenset()
+    diverse: Sampling | None = None
 
     def build(
         self, layout: Layout, theta: Mapping[str, float], slot: int = TEAMMATE, noise: Noise = "seeded"

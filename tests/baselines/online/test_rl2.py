@@ -21,7 +21,7 @@ from baselines.methods.options import RL2_SETTINGS, ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import StepInput
 from baselines.methods.view_change import ViewChange
-from baselines.online.prepare import prepare_play
+from baselines.online.prepare import FLAT_SHARE, _played, _shares, prepare_play
 from baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
@@ -38,6 +38,7 @@ from baselines.training.trainer import TrainingData, train
 from generation.teammates.instances import published_task
 from generation.teammates.registry import build_teammate, sample_teammate
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -287,6 +288,42 @@ class TestPreparing:
         job = self.prepare(PlayOptions(), tasks, choice, 8)
         assert {cell["layout"] for cell in job.about["trained_on"]} == {"cramped_down"}
         assert job.about["histories"]["layouts"] == ["cramped_down"]
+
+    def test_teammates_of_other_layouts_are_on_record(self):
+        """With few tasks, some teammates are played with on rearranged layouts alone."""
+        tasks = read_tasks(manifest_path("layout", "train", "diverse"))
+        few = self.prepare(PlayOptions(minibatches=1), tasks, batch=2)
+        job = self.prepare(PlayOptions(rearranged=6, minibatches=1), tasks, batch=2)
+        counts = [sum(cell["tasks"] for cell in one.about["trained_on"]) for one in (few, job)]
+        base = [one.group for one in job.trainer.players if one.group.layout.name == "cramped_up"]
+        assert sum(len(group.teammates) for group in base) <= counts[0] <= counts[1]
+        keys = [(one.group.layout, one.group.family) for one in job.trainer.players]
+        everywhere: Any = {key: {f"{key[1]}-{number}": None for number in range(9)} for key in keys}
+        groups = [dataclasses.replace(one.group, teammates=[None] * 9) for one in job.trainer.players[-1:]]
+        assert len(_played(everywhere, groups)) == 9  # those of a rearranged layout
+
+    def test_shares_follow_what_was_measured(self):
+        """The ego matters on demo_simple beside diverse teammates, on coord_simple beside none."""
+        tasks = read_tasks(manifest_path("teammate", "train", "diverse"))
+        assert _shares(None, [task for task in tasks if task.layout.name in ("demo_simple", "coord_simple")]) == {
+            "coord_simple": FLAT_SHARE,
+            "demo_simple": 1.0,
+        }
+        release = load_icrl4aht(split="train", layout=["demo_simple", "coord_simple"])
+        assert _shares(release, tasks)["demo_simple"] == 1.0
+        assert _shares(load_icrl4aht(split="train", layout="coord_simple"), ()) == {"coord_simple": FLAT_SHARE}
+        assert _shares(None, read_tasks(manifest_path("layout", "test"))) == {"asymm_right": 1.0, "cramped_down": 1.0}
+
+    def test_layouts_without_any_teammate(self):
+        choice = HistoryOptions(("cramped_up", "asymm_right"), source=("noise",))
+        tasks = read_tasks(manifest_path("layout", "train", "diverse"))
+        with pytest.raises(OptionError, match="asymm_right: neither a chosen history nor a task of a manifest"):
+            self.prepare(PlayOptions(), tasks, choice)
+
+    def test_learned_teammates_play_on_their_own_layout_only(self):
+        choice = HistoryOptions(("cramped_up",), teammate_family=("rl",))
+        with pytest.raises(OptionError, match="cramped_up: rearranged layouts and four recipes need heuristic"):
+            self.prepare(PlayOptions(rearranged=1), (), choice)
 
     def test_tasks_elsewhere(self):
         tasks = read_tasks(manifest_path("layout", "test"))

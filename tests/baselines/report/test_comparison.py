@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from baselines.commands.cli import cli
-from baselines.evaluate.protocols import get_protocol
+from baselines.evaluate.protocols import bundled_tasks, get_protocol
 from baselines.evaluate.results import Result, write_result
 from baselines.report import comparison
 from baselines.report.comparison import (
@@ -32,9 +32,13 @@ from baselines.report.comparison import (
     summary_table,
     write_stored,
 )
-from baselines.report.results import cell_of, published_cells, published_test_tasks
+from baselines.report.overlap import OVERLAPS
+from baselines.report.results import OWN_TASKS, cell_of, published_cells, published_test_tasks
+from baselines.training.ablations import ABLATIONS
+from baselines.training.run_folder import RUN_FORMAT
 from icrl4aht_data.benchmark.reference_returns import read_headroom
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.benchmark.tasks import write_tasks
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from tests.helpers.paths import ROOT
 
 
@@ -139,7 +143,7 @@ class TestStoring:
         result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         page = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
-        assert "* `ramp`: a ramp" in page and "| `ramp` | 1.1" in page
+        assert "* `ramp`: a ramp" in page and "| `ramp`† | 1.1" in page
         assert (tmp_path / "page" / "results.png").stat().st_size > 10_000
         assert read_stored(target).about == {"ramp": "a ramp"}
 
@@ -176,32 +180,75 @@ def test_a_new_agent_needs_a_sentence(results):
 class TestAblations:
     """Entries are compared with the first one, task by task."""
 
+    WINDOWS = "ablate windows"
+
     @pytest.fixture
     def folder(self, tmp_path):
-        """Two entries with 10 tasks of two seeds: returns of 10 and 12, the first of the two rising by 1 an episode."""
-        protocol = get_protocol("seeded")
-        tasks = [task for task in published_test_tasks().values() if task.layout.name == "demo_wide"][:10]
-        for entry, offset in (("plain", 0.0), ("K500", 2.0)):
-            settings = {"agent": "AD", "seeds": [0, 1], "protocol": asdict(protocol), "code_version": "0"}
-            for number, task in enumerate(tasks):
-                rise = np.linspace(-5, 5, 100) if entry == "plain" else np.zeros(100)
-                returns = [(10 + offset + number + rise).tolist()] * 2
-                write_result(
-                    tmp_path / f"ad-{entry}" / "demo_wide" / "results", Result(task.task_id, settings, returns)
-                )
+        """Two entries with 7 tasks of two seeds: returns of 10 and 12, the first of the two rising by 1 an episode."""
+        self.write(tmp_path, [task for task in bundled_tasks("teammate", "diverse") if task.layout.name == "demo_wide"])
         return tmp_path
 
+    def write(self, folder, tasks):
+        protocol = get_protocol("seeded")
+        entries = {entry.name: entry for entry in ABLATIONS[self.WINDOWS].entries}
+        for name, offset in (("plain", 0.0), ("K500", 2.0)):
+            settings = {"agent": "AD", "seeds": [0, 1], "protocol": asdict(protocol), "code_version": "0"}
+            of_entry = folder / f"ad-{name}" / "demo_wide"
+            for number, task in enumerate(tasks):
+                rise = np.linspace(-5, 5, 100) if name == "plain" else np.zeros(100)
+                returns = [(10 + offset + number + rise).tolist()] * 2
+                write_result(of_entry / "results", Result(task.task_id, settings, returns))
+            write_tasks(of_entry / "results" / OWN_TASKS, tasks)
+            (of_entry / "run").mkdir()
+            entry = entries[name]
+            config = {
+                "run_format": RUN_FORMAT,
+                "model": entry.model,
+                "train": entry.train,
+                "histories": entry.histories,
+            }
+            (of_entry / "run" / "config.json").write_text(json.dumps(config))
+
     def test_from_an_experiment_to_the_table(self, folder, tmp_path):
-        stored = add_ablation(StoredResults({}, {}), folder)
+        before = StoredResults({("gone", self.WINDOWS): {}}, {})
+        stored = add_ablation(before, self.WINDOWS, folder)
+        assert set(stored.cells) == {("plain", self.WINDOWS), ("K500", self.WINDOWS)}  # replaces what was stored
         write_stored(tmp_path / "results.json", stored)
         again = read_stored(tmp_path / "results.json")
         assert shown_agents(again) == []
-        plain, longer = ablation_table(again, "ablate windows").splitlines()[2:]
-        assert plain.startswith("| `plain` | K = 200") and "| 14.5 (" in plain and "|  | +8.1 (+8.1 to +8.1) |" in plain
-        assert longer.startswith("| `K500` |") and "| 16.5 (" in longer
+        plain, longer = ablation_table(again, self.WINDOWS).splitlines()[2:]
+        assert plain.startswith("| `plain` | size tiny") and "| 13.0 (" in plain
+        assert "|  | +8.1 (+8.1 to +8.1) |" in plain
+        assert longer.startswith("| `K500` |") and "| 15.0 (" in longer
         assert "| +2.0 (+2.0 to +2.0) | +0.0 (+0.0 to +0.0) |" in longer
         assert "`K500`" not in ablation_table(again, "ablate contexts")
 
+    def test_settings_that_are_not_the_entrys(self, folder):
+        path = folder / "ad-K500" / "demo_wide" / "run" / "config.json"
+        config = json.loads(path.read_text())
+        config["train"]["batch_size"] = 16
+        path.write_text(json.dumps(config))
+        with pytest.raises(OptionError, match="batch_size = 16, expected 6, as K500 has it; train it again"):
+            add_ablation(StoredResults({}, {}), self.WINDOWS, folder)
+
+    def test_test_tasks_are_refused(self, tmp_path):
+        self.write(tmp_path, [task for task in published_test_tasks().values() if task.layout.name == "demo_wide"][:3])
+        with pytest.raises(OptionError, match="plain has results of test tasks, expected diverse ones"):
+            add_ablation(StoredResults({}, {}), self.WINDOWS, tmp_path)
+
     def test_a_folder_without_an_ablation(self, tmp_path):
-        with pytest.raises(OptionError, match="no results of an ablation; expected a folder that `ablate"):
-            add_ablation(StoredResults({}, {}), tmp_path)
+        with pytest.raises(OptionError, match="no results of plain; expected a folder that `python -m baselines"):
+            add_ablation(StoredResults({}, {}), self.WINDOWS, tmp_path)
+        with pytest.raises(UnknownNameError, match="unknown ablation 'ablate ta'; valid: ablate windows"):
+            add_ablation(StoredResults({}, {}), "ablate ta", tmp_path)
+
+
+def test_agents_without_cells_with_headroom_have_a_row():
+    stored = StoredResults({("a", "seeded"): {("coord_simple", "H1"): cell(1.0)}}, {})
+    assert "| `a` | nan" in summary_table(stored, "seeded")
+
+
+def test_the_summary_marks_agents_that_met_the_teammates():
+    cells = {one: found._replace(overlaps=("teammate",)) for one, found in everywhere(0.5).items()}
+    mark = OVERLAPS["teammate"].mark
+    assert f"| `a`{mark} | 0.50" in summary_table(StoredResults({("a", "seeded"): cells}, {}), "seeded")
