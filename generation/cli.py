@@ -253,7 +253,7 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of the test and validation tasks, and of tasks with diverse teammates.
+    """Write the manifests of test, validation and diverse tasks.
 
     Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
     TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured. Files that have these tasks are kept.

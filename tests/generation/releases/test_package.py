@@ -21,7 +21,7 @@ from generation.profiles.work import Work
 from generation.releases import measures
 from generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
 from generation.releases.package import package_release, recorded_sources
-from generation.teammates import draws as drawn
+from generation.teammates import draws as draws_table
 from generation.teammates.draws import Draw
 from generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
@@ -223,7 +223,7 @@ def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
 
 def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkeypatch):
     monkeypatch.setattr(measures, "read_draws", fake_draws)
-    monkeypatch.setattr(drawn, "read_draws", fake_draws)
+    monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     entry = sample_teammate("assembly_line", 1, "train")
     drawn = make_task("teammate", "train", "demo_wide", entry, 0)
     other = make_task("teammate", "train", "demo_wide", entry | {"theta": dict(entry["theta"], x=1)}, 1)
@@ -249,7 +249,7 @@ def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatc
         return [first._replace(other="H1/t0", other_distance=0.006), first._replace(theta_id=1, other_distance=0.4)]
 
     monkeypatch.setattr(measures, "read_draws", draws)
-    monkeypatch.setattr(drawn, "read_draws", draws)
+    monkeypatch.setattr(draws_table, "read_draws", draws)
     entries = [sample_teammate("assembly_line", theta_id, "train") for theta_id in range(2)]
     tasks = [make_task("teammate", "train", "demo_wide", entry, 0) for entry in entries]
     facts = teammate_facts(tasks, Path("no artefacts"), Path("no suite"))
@@ -259,7 +259,7 @@ def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatc
 
 def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
     monkeypatch.setattr(measures, "read_draws", fake_draws)
-    monkeypatch.setattr(drawn, "read_draws", fake_draws)
+    monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     monkeypatch.setattr(
         measures, "hosted_families", lambda layout: ["recipe_aware_button", "territory", "assembly_line"]
     )
