@@ -41,7 +41,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.plotting import plot_layout_curves
+from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.new_file import check_new_file
 
@@ -91,7 +91,9 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     Raises:
         ReleaseError: if the release is damaged.
+        OptionError: if matplotlib is not installed.
     """
+    check_can_draw()
     started = time.perf_counter()
     settings = settings or DemoSettings()
     model, training = settings.model, settings.training

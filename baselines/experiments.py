@@ -39,6 +39,7 @@ from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, Option
 from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.new_file import check_new_files
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
@@ -204,9 +205,10 @@ def run_experiment(
         LabelsMissingError: for DPT on histories without expert actions.
         OptionError: if a context is longer than a history, the plan sets what the experiment varies, or a folder holds
             a run of other settings; for "heldout-rl", if the suite has no held-out teammates, or one of them is in
-            training.
+            training; if matplotlib is not installed.
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
+    check_can_draw()  # before the long work, not after it
     if name not in EXPERIMENTS:
         raise unknown("experiment", name, EXPERIMENTS)
     experiment = EXPERIMENTS[name]

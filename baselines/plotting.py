@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from icrl4aht_data.benchmark.facts import FAMILIES, LAYOUT_NAMES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, Cell
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import legend_below, save_figure
+from icrl4aht_data.plotting import legend_below, new_figure, save_figure
 
 
 class SweepPoint(NamedTuple):
@@ -39,7 +38,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     parts = list(dict.fromkeys(line["part"] for line in lines))
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure(figsize=(4.6 * columns, 3.1 * rows), layout="constrained")
+    figure = new_figure(4.6 * columns, 3.1 * rows)
     panels: list[Any] = [*figure.subplots(rows, columns, squeeze=False).flat]
     for axes, name in zip(panels, names, strict=False):
         for part in parts:
@@ -68,7 +67,7 @@ def plot_return_curves(runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]], pa
     layouts = [layout for layout in LAYOUT_NAMES if any(cell[0] == layout for cell in cells)]
     groups = {cell[1] for cell in cells}
     families = sorted(groups, key=lambda group: (FAMILIES.index(group.partition(" ")[0]), group))
-    figure = Figure(figsize=(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6), layout="constrained")
+    figure = new_figure(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6)
     axes = figure.subplots(len(families), len(layouts), squeeze=False, sharex=True)
     for i, family in enumerate(families):
         for j, layout in enumerate(layouts):
@@ -111,7 +110,7 @@ def plot_family_curves(
         title: heading of the figure.
         notes: teammate family -> text below the family's name.
     """
-    figure = Figure(figsize=(3.5 * len(families) + 0.4, 3.7), layout="constrained")
+    figure = new_figure(3.5 * len(families) + 0.4, 3.7)
     panels: Any = figure.subplots(1, len(families), squeeze=False, sharey=True)[0]
     for axes, (family, returns) in zip(panels, families.items(), strict=True):
         curves = returns[agent]
@@ -136,7 +135,7 @@ def plot_family_curves(
 
 def plot_sweep(panels: Mapping[str, Mapping[str, Sequence[SweepPoint]]], quantity: str, path: Path) -> None:
     """Plot the return over the varied quantity: a panel per layout, a line per agent, hollow diamonds for the paper."""
-    figure = Figure(figsize=(3.4 * len(panels) + 1, 3.2), layout="constrained")
+    figure = new_figure(3.4 * len(panels) + 1, 3.2)
     axes: Any = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (layout, lines) in zip(axes, panels.items(), strict=True):
         names = list(dict.fromkeys(str(point.value) for points in lines.values() for point in points))
@@ -169,7 +168,7 @@ def plot_adaptation_gain(runs: Sequence[tuple[str, Mapping[Cell, float]]], path:
     """
     if not runs:
         raise OptionError("no run to draw the adaptation gain of; give at least one folder of results")
-    figure = Figure(figsize=(4.2 + 0.5 * len(runs), 3.2), layout="constrained")
+    figure = new_figure(4.2 + 0.5 * len(runs), 3.2)
     axis = figure.add_subplot()
     width = 0.8 / len(runs)
     for number, (label, cells) in enumerate(runs):

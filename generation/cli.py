@@ -87,8 +87,8 @@ _SECTIONS = {
 def cli() -> None:
     """Rebuild the ICRL4AHT dataset from the environment and the teammates.
 
-    Needs the extra generation. Finished work is kept: the same command resumes a stopped one. Exit codes: 0 done, 1 a
-    failure or a difference, 2 a misused command.
+    Needs the extra generation. The same program is installed as icrl4aht-generate. Finished work is kept: the same
+    command resumes a stopped one. Exit codes: 0 done, 1 a failure or a difference, 2 a misused command.
     """
 
 
@@ -393,5 +393,5 @@ def diversity(
 
 
 def main() -> None:
-    """Entry point of `python -m generation`."""
-    run(cli)
+    """Entry point of `icrl4aht-generate` and `python -m generation`."""
+    run(cli, extra="generation")

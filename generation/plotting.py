@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from icrl4aht_data.plotting import save_figure
+from icrl4aht_data.plotting import new_figure, save_figure
 
 
 def plot_training(metrics: Path, path: Path, title: str) -> None:
     """Draw returns over environment steps from a JSON-lines log: self-play, and cross-play if there is any."""
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
-    figure = Figure(figsize=(7, 4), layout="constrained")
+    figure = new_figure(7, 4)
     axes: Any = figure.subplots()
     for stage in sorted({line["stage"] for line in lines}):
         own = [line for line in lines if line["stage"] == stage]
@@ -42,7 +41,7 @@ def plot_matrix(values: np.ndarray, names: Sequence[str], path: Path, title: str
         labels: what rows and columns are.
     """
     size = len(names)
-    figure = Figure(figsize=(max(1.6 + 0.75 * size, 4.2), max(1.4 + 0.6 * size, 3.4)), layout="constrained")
+    figure = new_figure(max(1.6 + 0.75 * size, 4.2), max(1.4 + 0.6 * size, 3.4))
     axes: Any = figure.subplots()
     image = axes.imshow(values, cmap="viridis", aspect="auto")
     middle = (values.max() + values.min()) / 2

@@ -17,6 +17,9 @@ from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
 from icrl4aht_data.sampling.draws import Curriculum
 
+__version__ = "0.1.0"
+"""Version of this package, which pyproject.toml reads from here."""
+
 __all__ = [
     "ACTIONS",
     "FAMILIES",
@@ -35,6 +38,7 @@ __all__ = [
     "Icrl4ahtError",
     "Layout",
     "Report",
+    "__version__",
     "get_layout",
     "load_icrl4aht",
     "verify_release",

@@ -20,6 +20,7 @@ from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.base import Sampler
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def torch_loader(
     try:
         from torch.utils.data import DataLoader
     except ImportError as error:
-        raise OptionError("a DataLoader needs PyTorch: pip install 'icrl4aht-data[torch]'") from error
+        raise OptionError(f"a DataLoader needs PyTorch: {install_command('torch')}") from error
     numbers = range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0))
     if workers and sampler.dataset.cache.cache != "stream":
         _ = sampler.dataset.storage  # decoded here once: mapped by the workers, or inherited by forked ones
@@ -189,5 +190,5 @@ def _datasets() -> Any:
     try:
         import datasets
     except ImportError as error:
-        raise OptionError("Hugging Face datasets are needed: pip install 'icrl4aht-data[hf]'") from error
+        raise OptionError(f"Hugging Face datasets are needed: {install_command('hf')}") from error
     return datasets

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK
 
 if TYPE_CHECKING:
@@ -195,14 +197,38 @@ def _panels(path: Path, count: int, size: tuple[float, float], columns: int | No
     """Return a figure and its `count` axes, each `size` inches (width, height); checks the suffix of `path`."""
     if path.suffix not in PICTURES:
         raise OptionError(f"{path}: expected a name that ends in {', '.join(PICTURES)}")
+    columns = columns or (2 if count == 4 else min(3, count))
+    rows = -(-count // columns)
+    figure = new_figure(size[0] * columns, size[1] * rows)
+    return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
+
+
+def can_draw() -> bool:
+    """Return whether the libraries of figures are installed: matplotlib and Pillow."""
+    return all(find_spec(name) for name in ("matplotlib", "PIL"))
+
+
+def check_can_draw() -> None:
+    """Check, before work whose results will be drawn, that figures can be drawn.
+
+    Raises:
+        OptionError: if matplotlib or Pillow is not installed.
+    """
+    if not can_draw():
+        raise OptionError(f"drawing needs matplotlib and Pillow: {install_command('plot')}")
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of this size in inches, whose parts are arranged so that none overlap.
+
+    Raises:
+        OptionError: if matplotlib is not installed.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise OptionError("drawing needs matplotlib: pip install 'icrl4aht-data[plot]'") from error
-    columns = columns or (2 if count == 4 else min(3, count))
-    rows = -(-count // columns)
-    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
-    return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
+        raise OptionError(f"drawing needs matplotlib: {install_command('plot')}") from error
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def legend_below(figure: Figure) -> None:

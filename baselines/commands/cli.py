@@ -69,6 +69,8 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import can_draw
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
 from icrl4aht_data.utils.templates import card_file
 
@@ -97,8 +99,9 @@ _SECTIONS = {
 def cli() -> None:
     """Train reference learners and evaluate agents on the ICRL4AHT benchmark.
 
-    Needs the extra baselines. Finished work is kept: the same command resumes a stopped one. Exit codes: 0 done, 1 a
-    failure or a failed check, 2 a misused command, 130 or 143 training stopped by SIGINT or SIGTERM, and saved.
+    Needs the extra baselines. The same program is installed as icrl4aht-baselines. Finished work is kept: the same
+    command resumes a stopped one. Exit codes: 0 done, 1 a failure or a failed check, 2 a misused command, 130 or 143
+    training stopped by SIGINT or SIGTERM, and saved.
     """
 
 
@@ -379,13 +382,14 @@ def train_command(
     """Train a model on learning histories.
 
     METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories;
-    --epochs to --manifest are its own. Writes settings, checkpoints, metrics.jsonl and curves.png into OUT;
-    the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second
-    Ctrl-C does not wait for it.
+    --epochs to --manifest are its own. Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png
+    into OUT; the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a
+    second Ctrl-C does not wait for it.
     """
     join_processes(coordinator, processes, process)
     from baselines.methods.registry import PLAYING
     from baselines.training.histories import read_trained, start_from
+    from baselines.training.run_folder import RUN_CURVES
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
 
@@ -413,6 +417,8 @@ def train_command(
     _console.print(
         f"{options.steps} {noun} in {folder}; `python -m baselines evaluate --agent {folder} --out ...` plays it"
     )
+    if not can_draw():
+        click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")
 
 
 @cli.command(
@@ -535,9 +541,9 @@ for _command in MODEL_COMMANDS:
 
 
 def main() -> None:
-    """Entry point of `python -m baselines`."""
+    """Entry point of `icrl4aht-baselines` and `python -m baselines`."""
     try:
-        run(cli)
+        run(cli, extra="baselines")
     except TrainingStopped as stopped:
         click.echo(stopped.message, err=True)
         raise

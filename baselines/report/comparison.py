@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from baselines.agents.egos import FORGETS
 from baselines.evaluate.results import read_result
@@ -40,7 +39,7 @@ from baselines.training.run_folder import read_config
 from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
 from icrl4aht_data.errors import IndexFormatError, OptionError, unknown
-from icrl4aht_data.plotting import save_figure
+from icrl4aht_data.plotting import new_figure, save_figure
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 
@@ -420,7 +419,7 @@ def _marks(overlaps: Iterable[str]) -> str:
 def plot_comparison(stored: StoredResults, protocol: str, agents: Sequence[str], path: Path) -> None:
     """Plot the mean returns of agents in the cells with headroom as bars, with `stay` and the oracle as marks."""
     headroom, chosen = read_headroom(protocol), cells_with_headroom(protocol)
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    figure = new_figure(11, 4.2)
     axes, numbers = figure.subplots(), np.arange(len(chosen))
     width = 0.8 / max(1, len(agents))
     for number, agent in enumerate(agents):

@@ -28,6 +28,7 @@ from baselines.report.results import (
 )
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, headroom_table, read_headroom
+from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.templates import markdown_table
 
 REPORT_BEGINS = {
@@ -102,7 +103,12 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
 
 
 def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
-    """Write report.md, report.csv and curves.png of some runs into the folder `out`. Returns their paths."""
+    """Write report.md, report.csv and curves.png of some runs into the folder `out`. Returns their paths.
+
+    Raises:
+        OptionError: if matplotlib is not installed; nothing is written then.
+    """
+    check_can_draw()
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / "report.md", out / "report.csv", out / "curves.png"]
     paths[0].write_text(markdown(runs), encoding="utf-8")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.installation import install_command
 
 _FLUSH_SECONDS = 10
 
@@ -61,4 +62,4 @@ def check_installed() -> None:
     try:
         import tensorboardX  # noqa: F401
     except ImportError as error:
-        raise OptionError("TensorBoard's log needs tensorboardX: pip install 'icrl4aht-data[tensorboard]'") from error
+        raise OptionError(f"TensorBoard's log needs tensorboardX: {install_command('tensorboard')}") from error

@@ -30,6 +30,7 @@ from baselines.training.stopping import StopSignals, TrainingStopped
 from baselines.training.tensorboard import TensorBoardLog, check_installed
 from generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock, xla_threads
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.sampling.batches import Batches
 
 BATCH_AXIS = "data"
@@ -211,8 +212,8 @@ def train(
         method: what to train.
         data: batches of `options.batch_size` rows.
         options: how.
-        folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, curves.png and
-            checkpoints/.
+        folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
+            matplotlib is installed, curves.png.
         about: further settings for config.json, such as the model's and the data's.
         devices: all by default.
         trainer: what computes the steps, with the interface of `Trainer`, which is the default.
@@ -276,7 +277,7 @@ def train(
                 name = signal.Signals(stopped_by).name
                 where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
                 raise TrainingStopped(stopped_by, f"{where}, whose state is saved; the same command resumes it")
-        if writes:
+        if writes and can_draw():
             plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
     return state
 

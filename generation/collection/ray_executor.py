@@ -20,6 +20,7 @@ from generation.learners.resume import limit_xla_threads
 from generation.profiles.work import Work
 from generation.progress import ProgressBoard
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.installation import install_command
 
 _POLL_SECONDS = 1.0
 _CONNECT_SECONDS = 10.0
@@ -105,7 +106,7 @@ def _connected(options: CollectOptions) -> Iterator[Any]:
     try:
         import ray
     except ImportError as error:
-        raise OptionError("the executor ray needs Ray: pip install 'icrl4aht-data[cluster]'") from error
+        raise OptionError(f"the executor ray needs Ray: {install_command('cluster')}") from error
     _check_reachable(options.address)
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     try:

@@ -24,6 +24,7 @@ from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.new_file import check_new_file
 
 
@@ -47,7 +48,11 @@ def build_suite(
 
     Returns:
         The selected teammates of each population in `algorithms`.
+
+    Raises:
+        OptionError: if matplotlib is not installed.
     """
+    check_can_draw()  # before the long work, not after it
     for name in chain(*algorithms.values()):
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
@@ -146,8 +151,9 @@ def report_diversity(
 
     Raises:
         OptionError: if a population is not finished, or no layout has all of them; if a picture may not be written, see
-            `new_file.check_new_file`.
+            `new_file.check_new_file`; if matplotlib is not installed.
     """
+    check_can_draw()
     out = out or suite
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
         name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)

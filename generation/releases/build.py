@@ -24,6 +24,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.locks import process_lock
 from icrl4aht_data.writing.card_content import read_content
 from icrl4aht_data.writing.card_tables import print_learning, teammate_name
@@ -63,10 +64,11 @@ def build_releases(
 
     Raises:
         CollectionError: if a task could not be collected; nothing is packed then.
-        OptionError: if something but a release of this profile is at out/<kind>.
+        OptionError: if something but a release of this profile is at out/<kind>, or if matplotlib is not installed.
     """
+    check_can_draw()  # before the long work, not after it
     for kind in kinds:
-        check_release_folder(out / kind, profile)  # before the long work, not after it
+        check_release_folder(out / kind, profile)
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
     if tasks is None:
         works, headroom, left_out = train_teammates(profile, suite, seed, console)

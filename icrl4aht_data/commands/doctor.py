@@ -21,7 +21,7 @@ from huggingface_hub import constants
 from packaging.specifiers import SpecifierSet
 
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.requirements import PACKAGE, Dependency, dependencies, installed_version
+from icrl4aht_data.commands.requirements import Dependency, dependencies, installed_version
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.info import read_info
@@ -31,6 +31,7 @@ from icrl4aht_data.remote.download import default_remote
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.remote.store import offline_switches
 from icrl4aht_data.utils.cache import CACHE_VARIABLES, DATA_VARIABLES, cache_folder, cache_limit, data_folder
+from icrl4aht_data.utils.installation import PACKAGE, install_command, installation_source, restore_command
 from icrl4aht_data.utils.memory import free_memory
 from icrl4aht_data.utils.threads import usable_cores
 
@@ -100,14 +101,14 @@ def _packages(problems: list[Problem]) -> dict[str, Any]:
         supported = SpecifierSet(metadata(PACKAGE)["Requires-Python"])
         wanted += [Dependency("Python", supported, None, platform.python_version()), *dependencies()]
     except PackageNotFoundError:
-        problems.append(Problem(f"{PACKAGE}: not installed", "`pip install -e .` in its checkout installs it"))
-    checkout = all(importlib.util.find_spec(name) for name in ("generation", "baselines"))
-    about = {"found": installed_version(PACKAGE), "folder": str(MINI.parent), "checkout": checkout}
+        problems.append(Problem(f"{PACKAGE}: not installed", install_command()))
+    found = installed_version(PACKAGE)
+    about = {"found": found, "folder": str(MINI.parent), "source": str(installation_source()) if found else None}
     facts: dict[str, Any] = {PACKAGE: about}
     for name, versions, extra, found in wanted:
         facts[name] = {"found": found, "expected": str(versions), "extra": extra}
         if found is None and extra is not None:
-            facts[name]["install"] = f"pip install '{PACKAGE}[{extra}]'"
+            facts[name]["install"] = install_command(extra)
         elif found is None or not versions.contains(found, prereleases=True):
             problem = f"{name} {found or 'is not installed'}: expected {versions}"
             problems.append(Problem(problem, steps.get(name, f"pip install -U '{name}{versions}'")))
@@ -121,7 +122,7 @@ def _devices(problems: list[Problem]) -> dict[str, Any]:
             backend, devices = json.loads(_query_jax())
             facts["jax"] = {"backend": backend, "devices": devices}
             if backend == "cpu" and shutil.which("nvidia-smi"):
-                facts["note"] = "JAX sees no GPU: on a machine with one, install jax[cuda13] or jax[cuda12]"
+                facts["note"] = f"JAX sees no GPU: on a machine with one, `{install_command('cuda13')}`, or cuda12"
         except (OSError, ValueError, subprocess.SubprocessError) as error:
             reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
             step = "pip install -U --force-reinstall jax jaxlib"
@@ -199,7 +200,7 @@ def _network(problems: list[Problem]) -> dict[str, Any]:
 
 def _bundled(problems: list[Problem]) -> dict[str, Any]:
     report = verify_release(MINI, level="quick")
-    step = f"pip install --force-reinstall --no-deps {PACKAGE}, or `git checkout` in a checkout"
+    step = restore_command()
     problems += [Problem(f"the bundled release, {f.file}: {f.problem}", step) for f in report.findings]
     facts: dict[str, Any] = {"ok": report.ok}
     with suppress(Icrl4ahtError):  # what cannot be read is among the findings

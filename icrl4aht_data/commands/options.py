@@ -21,11 +21,12 @@ from rich.console import Console
 from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 
 from icrl4aht_data.benchmark.facts import FAMILIES, SPLITS, TRACKS
-from icrl4aht_data.commands.requirements import PACKAGE, extra_with
+from icrl4aht_data.commands.requirements import extras_with
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import FULL, describe_disk
+from icrl4aht_data.utils.installation import PACKAGE, install_command
 from icrl4aht_data.utils.progress import LineProgress
 
 SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
@@ -175,7 +176,7 @@ COUNT_OR_NONE = click.IntRange(min=0)
 
 def version_option(command: Any) -> Any:
     """Add `--version`, which prints the version of the installed package."""
-    return click.version_option(package_name="icrl4aht-data", message="%(package)s %(version)s")(command)
+    return click.version_option(package_name=PACKAGE, message="%(package)s %(version)s")(command)
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
@@ -256,11 +257,15 @@ def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int],
     return advance
 
 
-def run(command: click.Command) -> None:
+def run(command: click.Command, extra: str | None = None) -> None:
     """Run a command line; errors about its input become one line and an exit code.
 
     Output that nobody reads is no error message: where the reader of a pipe has gone (`| head`) the command stops
     quietly with exit code 1, and output that was closed from the start (`>&-`) is dropped.
+
+    Args:
+        command: the command line.
+        extra: the extra that all of its commands need; messages about missing modules suggest it if it has them.
     """
     _open_outputs()
     try:
@@ -274,10 +279,11 @@ def run(command: click.Command) -> None:
     except OSError as error:
         _stop(_in_words(error), 1)
     except ModuleNotFoundError as error:
-        extra = extra_with(error.name or "")
-        if extra is None:
+        extras = extras_with(error.name or "")
+        if not extras:
             raise
-        _stop(f"this needs {error.name}, which is not installed: pip install '{PACKAGE}[{extra}]'", 1)
+        chosen = extra if extra in extras else extras[0]
+        _stop(f"this needs {error.name}, which is not installed: {install_command(chosen)}", 1)
 
 
 def _open_outputs() -> None:

@@ -9,10 +9,10 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-PACKAGE = "icrl4aht-data"
+from icrl4aht_data.utils.installation import PACKAGE
 
-_UNNAMED_EXTRAS = ("dev", "peers", "all", "baselines", "cuda12", "cuda13")
-"""Extras that are never suggested: three for work on this project; the others install what `generation` does."""
+_UNNAMED_EXTRAS = ("dev", "peers", "all", "cuda12", "cuda13")
+"""Extras that are never suggested: three for work on this project; the others install JAX for GPUs."""
 
 _DISTRIBUTIONS = {"PIL": "pillow"}
 """Module -> distribution, where the names differ."""
@@ -40,16 +40,8 @@ def dependencies() -> list[Dependency]:
     Raises:
         PackageNotFoundError: if this package itself is not installed.
     """
-    about = metadata(PACKAGE)
-    listed = [Requirement(line) for line in about.get_all("Requires-Dist") or []]
-    listed = [one for one in listed if canonicalize_name(one.name) != PACKAGE]  # an extra may include another
-    extras = [name for name in about.get_all("Provides-Extra") or [] if name not in _UNNAMED_EXTRAS]
-    needed = {
-        extra: [one for one in listed if one.marker is None or one.marker.evaluate({"extra": extra})]
-        for extra in ("", *extras)
-    }
     found: dict[str, Dependency] = {}
-    for extra, members in sorted(needed.items(), key=lambda item: (item[0] != "", len(item[1]), item[0])):
+    for extra, members in _requirements_by_extra().items():
         for one in members:
             found.setdefault(one.name, Dependency(one.name, one.specifier, extra or None, installed_version(one.name)))
     return list(found.values())
@@ -63,8 +55,24 @@ def installed_version(name: str) -> str | None:
         return None
 
 
-def extra_with(module: str) -> str | None:
-    """Return the extra that installs a module, if there is one."""
+def extras_with(module: str) -> list[str]:
+    """Return the extras that install a module, the smallest first; none for a required one."""
     top = module.partition(".")[0]
     name = canonicalize_name(_DISTRIBUTIONS.get(top, top))
-    return next((one.extra for one in dependencies() if canonicalize_name(one.name) == name), None)
+    needed = _requirements_by_extra()
+    found = [extra for extra, members in needed.items() if name in {canonicalize_name(one.name) for one in members}]
+    return [] if "" in found else found
+
+
+def _requirements_by_extra() -> dict[str, list[Requirement]]:
+    """Extra -> its requirements, the smallest extra first; before them "" -> those that are always required."""
+    about = metadata(PACKAGE)
+    listed = [Requirement(line) for line in about.get_all("Requires-Dist") or []]
+    listed = [one for one in listed if canonicalize_name(one.name) != PACKAGE]  # an extra may include another
+    extras = [name for name in about.get_all("Provides-Extra") or [] if name not in _UNNAMED_EXTRAS]
+    required = [one for one in listed if one.marker is None or one.marker.evaluate({"extra": ""})]
+    needed = {
+        extra: [one for one in listed if one not in required and one.marker and one.marker.evaluate({"extra": extra})]
+        for extra in extras
+    }
+    return {"": required} | dict(sorted(needed.items(), key=lambda item: (len(item[1]), item[0])))

@@ -26,6 +26,7 @@ from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READ
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.installation import upgrade_advice
 from icrl4aht_data.utils.paths import resolve_inside
 
 _NUMBER = r"(0|[1-9]\d*)"
@@ -226,7 +227,7 @@ def read_info(root: Path) -> ReleaseInfo:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
     found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
-        raise FormatTooNewError(f"{found}: `pip install -U icrl4aht-data`")
+        raise FormatTooNewError(f"{found}: {upgrade_advice()}")
     raise FormatTooOldError(f"{found}: rebuild or fetch the release again")
 
 

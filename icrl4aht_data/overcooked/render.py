@@ -20,6 +20,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, PLATE, WINDOW, Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, faults, record_size, unpack
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ def _pillow():
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise OptionError("drawing needs Pillow: pip install 'icrl4aht-data[plot]'") from error
+        raise OptionError(f"drawing needs Pillow: {install_command('plot')}") from error
     return Image, ImageDraw, ImageFont
 
 

@@ -23,6 +23,7 @@ from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layou
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.paths import files_below
 from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.card_content import PARQUET_INDEX
@@ -74,7 +75,7 @@ def build_release(
     check_target(target, overwrite, [source])
     missing = [name for name in _LIBRARIES if find_spec(name) is None]
     if missing:
-        raise OptionError(f"building a release needs {', '.join(missing)}: pip install 'icrl4aht-data[plot,hf]'")
+        raise OptionError(f"building a release needs {', '.join(missing)}: {install_command('plot', 'hf')}")
     check_valid(source, advance)
     if not (info := read_info(source)).has_chunk_hashes:
         raise OptionError(

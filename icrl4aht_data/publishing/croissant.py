@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.dataset_card import PARQUET_INDEX
@@ -61,7 +62,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     try:
         import mlcroissant as mlc
     except ImportError as error:
-        raise OptionError("croissant.json needs mlcroissant: pip install 'icrl4aht-data[hf]'") from error
+        raise OptionError(f"croissant.json needs mlcroissant: {install_command('hf')}") from error
     info, texts = read_info(root), card_texts("arrays")
     arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)

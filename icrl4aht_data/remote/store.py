@@ -19,6 +19,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, Remot
 from icrl4aht_data.remote.addresses import address_of, check_credentials, check_redirect, without_credentials
 from icrl4aht_data.utils.disk import NO_ROOM
 from icrl4aht_data.utils.forks import ForkSafeLock
+from icrl4aht_data.utils.installation import install_command
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -263,7 +264,7 @@ def _open_filesystem(url: str) -> Any:
         files = fsspec.url_to_fs(url, **options)[0]
     except ImportError as error:
         extra = {"s3": "s3"}.get(scheme)
-        remedy = f"`pip install 'icrl4aht-data[{extra}]'`" if extra else "install what fsspec needs for it"
+        remedy = f"`{install_command(extra)}`" if extra else "install what fsspec needs for it"
         raise OptionError(f"{without_credentials(url)}: {error}; {remedy}") from error
     except ValueError as error:
         problem = f"{without_credentials(url)}: not an address that fsspec opens: {without_credentials(str(error))}"

@@ -10,6 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, Protocol, TypeVar
 
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B")
@@ -195,7 +196,7 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
         import jax
         import jax.numpy as jnp
     except ImportError as error:
-        raise OptionError("a device needs JAX: pip install 'icrl4aht-data[generation]'") from error
+        raise OptionError(f"a device needs JAX: {install_command('jax')}") from error
 
     def one(x: Any) -> Any:
         if getattr(device, "is_fully_addressable", True):

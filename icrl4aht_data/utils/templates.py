@@ -7,6 +7,7 @@ from pathlib import Path
 from string import Template
 
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.installation import restore_command
 
 _PACKAGE = Path(__file__).parent.parent
 
@@ -27,7 +28,7 @@ def card_file(name: str, package: Path = _PACKAGE) -> Path:
     for folder in (package / "cards", package.parent / "cards", package.parent):
         if (folder / name).is_file():
             return folder / name
-    raise OptionError(f"{package / 'cards' / name}: missing; install icrl4aht-data again")
+    raise OptionError(f"{package / 'cards' / name}: missing; restore it: `{restore_command()}`")
 
 
 def fill_template(template: str, **values: str) -> str:

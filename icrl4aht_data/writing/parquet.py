@@ -9,6 +9,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import ENTRY_HINTS
 from icrl4aht_data.utils.disk import explain_full_disk
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK, check_new_file
 
 
@@ -28,7 +29,7 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
-        raise OptionError("Parquet needs pyarrow: pip install 'icrl4aht-data[hf]'") from error
+        raise OptionError(f"Parquet needs pyarrow: {install_command('hf')}") from error
     check_new_file(path, overwrite)
     if path.resolve().is_relative_to(dataset.root.resolve()):
         raise OptionError(f"{path}: is inside {dataset.root}, which is read; give another path")

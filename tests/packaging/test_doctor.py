@@ -19,9 +19,10 @@ from click.testing import CliRunner
 
 from icrl4aht_data.commands import doctor, requirements
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.commands.requirements import dependencies, extra_with
+from icrl4aht_data.commands.requirements import dependencies, extras_with
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import read_info
+from icrl4aht_data.utils.installation import install_command, installation_source, restore_command
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import SHARD
 
@@ -58,9 +59,9 @@ def test_no_problems(elsewhere):
     assert facts["ok"], facts["problems"]
     info = read_info(MINI)
     for expected in (
-        f"found {importlib.metadata.version('icrl4aht-data')}, folder {MINI.parent}, checkout yes",
+        f"found {importlib.metadata.version('icrl4aht-data')}, folder {MINI.parent}, source {installation_source()}",
         f"found {h5py.version.hdf5_version}, expected >=1.10.5",
-        "expected >=0.8, extra generation",
+        "expected >=0.8, extra jax",
         "backend cpu",
         f"path {elsewhere / 'cache'}, set by ICRL4AHT_CACHE_DIR",
         "exists no, writable yes",
@@ -164,7 +165,7 @@ def test_damaged_bundled_release(elsewhere, monkeypatch, damaged):
     monkeypatch.setattr(doctor, "MINI", damaged)
     ((problem, step),) = problems().items()
     assert problem.startswith(f"the bundled release, {SHARD}: ")
-    assert "pip install --force-reinstall --no-deps icrl4aht-data" in step
+    assert step == restore_command()
     (damaged / "meta/info.json").unlink()
     assert any("meta/info.json" in problem for problem in problems())
 
@@ -188,7 +189,7 @@ def test_versions_that_are_not_accepted(elsewhere, monkeypatch):
     assert set(found) == {"matplotlib 3.0: expected >=3.9", "rich is not installed: expected >=13"}, (
         "extras are optional"
     )
-    assert "extra plot, install pip install 'icrl4aht-data[plot]'" in run_doctor()[1]
+    assert f"extra plot, install {install_command('plot')}" in run_doctor()[1]
 
 
 def test_broken_jax(elsewhere, monkeypatch):
@@ -199,9 +200,8 @@ def test_broken_jax(elsewhere, monkeypatch):
 
 def test_installation_without_jax(elsewhere, monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    facts, text = run_doctor()
+    facts, _ = run_doctor()
     assert facts["ok"] and "jax" not in facts["devices"]
-    assert "checkout no" in text
 
 
 def test_gpu_that_jax_does_not_use(elsewhere, monkeypatch):
@@ -231,14 +231,16 @@ def test_dependencies_come_from_the_metadata(monkeypatch):
         ("jax", ">=0.8", "small"),
         ("flax", "", "big"),
     ]
-    assert extra_with("flax.linen") == "big"
-    assert extra_with("pytest") is None
+    assert extras_with("flax.linen") == ["big"]
+    assert extras_with("jax") == ["small", "big"]
+    assert extras_with("pytest") == extras_with("numpy") == []
 
 
 def test_every_extra_for_users_installs_something():
-    extras = {"plot", "generation", "tensorboard", "hf", "s3", "grain", "torch", "cluster"}
+    extras = {"plot", "jax", "tensorboard", "hf", "s3", "grain", "torch", "cluster"}
     assert {one.extra for one in dependencies()} == {None, *extras}
-    assert extra_with("PIL.Image") == "plot"
+    assert extras_with("PIL.Image") == ["plot", "baselines", "generation"]
+    assert extras_with("optax") == ["jax", "baselines", "generation"]
 
 
 def test_package_that_is_not_installed(elsewhere, monkeypatch):
@@ -247,7 +249,8 @@ def test_package_that_is_not_installed(elsewhere, monkeypatch):
 
     monkeypatch.setattr(requirements, "metadata", missing)
     monkeypatch.setattr(doctor, "metadata", missing)
-    assert problems() == {"icrl4aht-data: not installed": "`pip install -e .` in its checkout installs it"}
+    monkeypatch.setattr("icrl4aht_data.utils.installation.distribution", missing)
+    assert problems() == {"icrl4aht-data: not installed": f"pip install --editable {ROOT}"}
 
 
 def test_missing_module_names_its_extra(tmp_path):
@@ -258,5 +261,5 @@ def test_missing_module_names_its_extra(tmp_path):
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.endswith(
-        "error: this needs flax.linen, which is not installed: pip install 'icrl4aht-data[generation]'\n"
+        f"error: this needs flax.linen, which is not installed: {install_command('generation')}\n"
     ), done.stderr

@@ -41,7 +41,8 @@ JAX = {"jax", "jaxlib", "flax", "optax"}
 JAX_ON_DEMAND = {"icrl4aht_data.sampling.batches"}
 """The modules of the reader with functions that import JAX: they put batches on a device if the caller has one."""
 
-HEAVY = {*JAX, "matplotlib", "PIL", "torch", "datasets", "huggingface_hub", "grain", "pyarrow"}
+PICTURES = {"matplotlib", "PIL"}
+HEAVY = {*JAX, *PICTURES, "torch", "datasets", "huggingface_hub", "grain", "pyarrow"}
 
 
 class Import(NamedTuple):
@@ -181,8 +182,24 @@ def narrow_use_of_generation(tree: Tree) -> Iterator[str]:
             yield f"{found}: baselines may use {', '.join(BASELINES_MAY_USE)}"
 
 
+def pictures_on_demand(tree: Tree) -> Iterator[str]:
+    """Imports of libraries for pictures at the top level: without the extra `plot`, only drawing fails."""
+    for found in tree.imports:
+        package, library = found.importer.split(".")[0], found.imported.split(".")[0]
+        if library in PICTURES and not found.how and package not in ("benchmarks", "tests"):
+            yield f"{found}: import it where it draws"
+
+
 Rule = Callable[[Tree], Iterator[str]]
-RULES: tuple[Rule, ...] = (absolute, downwards, acyclic, at_the_top, reader_without_jax, narrow_use_of_generation)
+RULES: tuple[Rule, ...] = (
+    absolute,
+    downwards,
+    acyclic,
+    at_the_top,
+    reader_without_jax,
+    narrow_use_of_generation,
+    pictures_on_demand,
+)
 
 
 @cache
@@ -208,7 +225,7 @@ def test_wrong_imports_are_found(tmp_path):
         "generation/env.py": "import baselines.demo, jax.numpy",
         "generation/new.py": "from . import env",
         "generation/learners/a.py": "from generation.learners import b",
-        "generation/learners/b.py": "def f():\n    from generation.learners.a import x",
+        "generation/learners/b.py": "import PIL.Image\ndef f():\n    from generation.learners.a import x",
         "generation/releases.py": "import generation.new, os",
         "baselines/demo.py": "import numpy\nif TYPE_CHECKING:\n    import generation.releases",
         "benchmarks/bench.py": "import tests.conftest",
@@ -237,6 +254,7 @@ def test_wrong_imports_are_found(tmp_path):
             "icrl4aht_data.sampling.batches imports jax.numpy: the reader works without JAX",
         ],
         narrow_use_of_generation: [f"baselines.demo imports generation.releases under TYPE_CHECKING: {allowed}"],
+        pictures_on_demand: ["generation.learners.b imports PIL.Image: import it where it draws"],
     }
 
 
@@ -244,6 +262,8 @@ def test_right_imports_are_not_found(tmp_path):
     files = {
         "icrl4aht_data/sampling/batches.py": "def f():\n    import jax",
         "generation/env.py": "import icrl4aht_data.sampling.batches\nimport jax.numpy",
+        "generation/plotting.py": "def f():\n    from matplotlib.figure import Figure",
+        "benchmarks/bench.py": "import matplotlib",
         "generation/policy.py": "import generation.env",
         "generation/cli.py": "import numpy\ndef f():\n    from generation.env import step",
         "baselines/demo.py": "from generation import env",

@@ -1,5 +1,5 @@
-"""The wheel contains the reader and nothing else, and works in an environment with only its dependencies; the source
-archive contains all that the wheel is built from.
+"""The wheel contains the three packages with their data, and works in an environment with only its dependencies; with
+the extras that its messages name, it trains and evaluates. The source archive contains all that the wheel is made of.
 """
 
 from __future__ import annotations
@@ -7,33 +7,39 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 
-from icrl4aht_data import load_icrl4aht
+from icrl4aht_data import __version__, load_icrl4aht
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import read_info
 from tests.helpers.paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-PACKAGE = "icrl4aht_data"
-NAME, VERSION = PROJECT["project"]["name"], PROJECT["project"]["version"]
+READER = "icrl4aht_data"
+PACKAGES = (READER, "generation", "baselines")
+NAME, VERSION = PROJECT["project"]["name"], __version__
 
 pytestmark = pytest.mark.slow
 
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-CODE_BYTES, RELEASE_BYTES = 2_000_000, 16_000_000
-"""Size limits of the installed package without the bundled release, and of the release."""
+CODE_BYTES, RELEASE_BYTES, MODEL_BYTES = 4_000_000, 16_000_000, 4_000_000
+"""Size limits of the installed packages without what is bundled, of the bundled release, and of the bundled models."""
 ENVIRONMENT_BYTES = 250_000_000
 """Size limit of the package with its dependencies."""
+
+INSTALLER = "uv pip install" if Path(sys.executable).with_name("uv").exists() else "pip install"
+"""The command that installs here, and that messages of an environment made here name."""
 
 UNREACHABLE = ("NewConnectionError", "NameResolutionError", "ConnectTimeoutError", "dns error", "Connection refused")
 
@@ -54,6 +60,33 @@ print(json.dumps({
     "heavy": sorted({"jax", "torch", "matplotlib", "datasets", "huggingface_hub"} & sys.modules.keys()),
 }))
 """
+
+EVALUATE = """
+import sys
+
+import numpy as np
+
+from baselines.agents import from_host
+from baselines.evaluate import evaluate, get_protocol
+from baselines.report import as_run, markdown
+from generation.teammates.instances import published_tasks
+
+
+class MyAgent:
+    def reset(self, batch):
+        self.rng = np.random.default_rng(0)
+
+    def act(self, percept):
+        return self.rng.integers(0, 6, len(percept.obs))
+
+
+tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"]
+protocol = get_protocol("seeded", episodes=2)
+results = evaluate("mine", from_host(MyAgent()), tasks[:2], protocol, details={"trained_on": []})
+print(markdown([as_run(results)]))
+print("matplotlib" in sys.modules or "PIL" in sys.modules)
+"""
+"""Evaluates an agent of one's own, without drawing anything."""
 
 
 def call(*command: str | Path, **options) -> subprocess.CompletedProcess:
@@ -100,7 +133,7 @@ def sdist(backend, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sdist")
     with tarfile.open(build(backend, ROOT, folder / "packed", "sdist")) as archive:
         archive.extractall(folder, filter="data")
-    return folder / f"{PACKAGE}-{VERSION}"
+    return folder / f"{READER}-{VERSION}"
 
 
 @pytest.fixture(scope="session")
@@ -116,21 +149,29 @@ def files_below(folder: Path) -> set[str]:
     return {name for name in names if not any(part.startswith((".", "__pycache__")) for part in Path(name).parts)}
 
 
-def test_the_wheel_contains_the_reader_and_nothing_else(wheel):
+def test_the_wheel_contains_the_packages_and_nothing_else(wheel):
+    about = f"{READER}-{VERSION}.dist-info"
     with zipfile.ZipFile(wheel) as archive:
-        names = {name for name in archive.namelist() if not name.startswith(f"{PACKAGE}-{VERSION}.dist-info/")}
-        about = archive.read(f"{PACKAGE}-{VERSION}.dist-info/METADATA").decode()
-        assert f"{PACKAGE}-{VERSION}.dist-info/licenses/LICENSE" in archive.namelist()
-    cards = {f"cards/{name}" for name in {*files_below(ROOT / "cards"), "LICENSE", "CITATION.cff"}}
-    assert names == {f"{PACKAGE}/{name}" for name in files_below(ROOT / PACKAGE) | cards}
-    assert {f"{PACKAGE}/mini/MANIFEST.sha256", f"{PACKAGE}/py.typed", f"{PACKAGE}/cards/dataset.md"} <= names
-    assert f"Name: {NAME}\nVersion: {VERSION}\n" in about
-    assert "License-Expression: MIT" in about
-    assert (ROOT / "README.md").read_text(encoding="utf-8").splitlines()[0] in about
+        names = {name for name in archive.namelist() if not name.startswith(f"{about}/")}
+        metadata, scripts = (archive.read(f"{about}/{name}").decode() for name in ("METADATA", "entry_points.txt"))
+        assert f"{about}/licenses/LICENSE" in archive.namelist()
+    cards = {f"{READER}/cards/{name}" for name in {*files_below(ROOT / "cards"), "LICENSE", "CITATION.cff"}}
+    assert names == {f"{package}/{name}" for package in PACKAGES for name in files_below(ROOT / package)} | cards
+    data = ("mini/MANIFEST.sha256", "manifests/teammate_test.jsonl", "cards/dataset.md", "py.typed")
+    assert {f"{READER}/{name}" for name in data} <= names
+    assert {"generation/teammates/draws.jsonl", "generation/profiles/smoke.toml", "generation/py.typed"} <= names
+    assert any(name.startswith("baselines/models/ad-reference/") for name in names)
+    assert f"Name: {NAME}\nVersion: {VERSION}\n" in metadata
+    assert "License-Expression: MIT" in metadata
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert f"Author: {cited['authors'][0]['name']}\n" in metadata
+    assert (ROOT / "README.md").read_text(encoding="utf-8").splitlines()[0] in metadata
+    for script, target in PROJECT["project"]["scripts"].items():
+        assert f"{script} = {target}\n" in scripts
 
 
 def test_the_source_archive_is_complete(sdist):
-    for folder in (PACKAGE, "generation", "baselines", "benchmarks", "cards", "docs", "tests"):
+    for folder in (*PACKAGES, "benchmarks", "cards", "docs", "tests"):
         assert files_below(ROOT / folder) == files_below(sdist / folder), folder
     assert {"LICENSE", "CITATION.cff", "CHANGELOG.md", "README.md", "Makefile", "pyproject.toml"} <= files_below(sdist)
     assert not {".git", ".venv", "build", "dist", "runs"} & {path.name for path in sdist.iterdir()}
@@ -144,41 +185,65 @@ def find_python(version: str) -> str | None:
     return found if found and call(found, "--version").returncode == 0 else None
 
 
-@pytest.fixture(scope="module")
-def environments(wheel, tmp_path_factory) -> dict[str, Future[Path]]:
-    """Environments with only the wheel and its dependencies, one for each installed version of Python."""
+def make_environment(python: str, folder: Path, *packages: str | Path) -> Path:
+    """Make an environment with only these packages and their dependencies. Returns the folder of its commands."""
+    made = call(python, "-m", "venv", "--without-pip", folder)
+    assert made.returncode == 0, made.stderr
+    install(folder / "bin" / "python", *packages)
+    return folder / "bin"
 
-    def make(python: str, folder: Path) -> Path:
-        made = call(python, "-m", "venv", "--without-pip", folder)
-        assert made.returncode == 0, made.stderr
-        install(folder / "bin" / "python", wheel)
-        return folder / "bin"
 
-    pythons = {version: find_python(version) for version in PYTHONS}
-    with ThreadPoolExecutor() as pool:
-        return {
-            version: pool.submit(make, python, tmp_path_factory.mktemp(f"python{version}"))
-            for version, python in pythons.items()
-            if python is not None
-        }
+def interpreter(version: str) -> str:
+    """Return the path of a Python of this version, or skip the test."""
+    python = find_python(version)
+    if python is None:
+        absent = ", ".join(other for other in PYTHONS if find_python(other) is None)
+        pytest.skip(f"no Python {version} on the PATH; absent are {absent}")
+    return python
 
 
 @pytest.fixture(scope="module", params=PYTHONS)
-def installed(request, environments) -> Path:
-    """The folder with the commands of one environment."""
-    if request.param not in environments:
-        absent = ", ".join(version for version in PYTHONS if version not in environments)
-        pytest.skip(f"no Python {request.param} on the PATH; absent are {absent}")
-    return environments[request.param].result()
+def installed(request, wheel, tmp_path_factory) -> Path:
+    """The folder with the commands of an environment with only the wheel and its dependencies."""
+    return make_environment(interpreter(request.param), tmp_path_factory.mktemp(f"python{request.param}"), wheel)
 
 
-def test_the_reader_works_without_extras(installed, tmp_path):
+@pytest.fixture(scope="module", params=PYTHONS)
+def grown(request, wheel, tmp_path_factory) -> Path:
+    """The folder with the commands of an environment with the extra `jax`, to which tests add others."""
+    folder = tmp_path_factory.mktemp(f"grown{request.param}")
+    return make_environment(interpreter(request.param), folder, f"{NAME}[jax] @ {wheel.as_uri()}")
+
+
+Run = Callable[..., str]
+
+
+def runner(commands: Path, folder: Path) -> Run:
+    """Return a function that runs a command of an environment, checks its exit code and returns its output."""
+
     def run(*command: str | Path, code: int = 0, **env: str) -> str:
-        done = call(installed / command[0], *command[1:], cwd=tmp_path, env={"HOME": str(tmp_path), **env})
+        done = call(commands / command[0], *command[1:], cwd=folder, env={"HOME": str(folder), **env})
         assert done.returncode == code, done.stdout + done.stderr
         assert "Traceback" not in done.stderr
         return done.stdout + done.stderr
 
+    return run
+
+
+def hinted(wheel: Path, *extras: str) -> str:
+    """Return the command that messages name in an environment made from the wheel."""
+    return f"{INSTALLER} '{NAME}[{','.join(extras)}] @ {wheel.as_uri()}'"
+
+
+def follow(hint: str, commands: Path) -> None:
+    """Run the command that a message ends with, in an environment."""
+    found = re.search(rf"{INSTALLER} .*$", hint)
+    assert found, hint
+    install(commands / "python", *shlex.split(found[0].removeprefix(INSTALLER)))
+
+
+def test_the_reader_works_without_extras(installed, wheel, tmp_path):
+    run = runner(installed, tmp_path)
     used, here = json.loads(run("python", "-c", USE)), load_icrl4aht(split="train", layout="coord_simple")
     assert used["histories"] == read_info(MINI).histories
     assert used["ok"] and used["heavy"] == []
@@ -188,35 +253,63 @@ def test_the_reader_works_without_extras(installed, tmp_path):
     assert used == json.loads(call(sys.executable, "-c", USE, cwd=ROOT).stdout), "the same batches everywhere"
 
     assert run("icrl4aht-data", "--version") == f"{NAME} {VERSION}\n"
+    assert run("python", "-c", f"import {READER}; print({READER}.__version__)") == f"{VERSION}\n"
     assert "coord_simple" in run("icrl4aht-data", "list")
     assert ": valid; checked" in run("icrl4aht-data", "verify")
     report = run("icrl4aht-data", "doctor")
     assert "no problems found" in report
-    assert "checkout no" in report
+    assert f"source {wheel.as_uri()}" in report
     assert "jax" not in report.partition("Devices")[2]
-    assert re.search(rf"jax +not installed, expected >=0.8, extra generation, install pip install '{NAME}\[gen", report)
-    assert f"pip install '{NAME}[plot]'" in run("icrl4aht-data", "show", "--plot", "curves.png", code=1)
+    assert re.search(r"jax +not installed, expected >=0.8, extra jax, install ", report)
+    for extra in ("jax", "plot", "hf", "s3"):
+        assert f"install {hinted(wheel, extra)}\n" in report
+    assert run("icrl4aht-data", "show", "--plot", "curves.png", code=1).endswith(f": {hinted(wheel, 'plot')}\n")
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_commands_name_the_missing_extra(installed, tmp_path):
-    """`generation` and `baselines` are not in the wheel; in a checkout they name the extra they need."""
-    done = call(installed / "python", "-c", "import generation", cwd=tmp_path)
-    assert "No module named 'generation'" in done.stderr
-    python = (installed / "python", "-B")
-    assert call(*python, "-c", "import generation, baselines", cwd=ROOT).returncode == 0
-    for package in ("generation", "baselines"):
-        assert call(*python, "-m", package, "--version", cwd=ROOT).stdout == f"{NAME} {VERSION}\n"
-        assert "Examples:" in call(*python, "-m", package, "--help", cwd=ROOT).stdout
-    for arguments in (
-        ("generation", "plan"),
-        ("baselines", "evaluate", "--agent", "stay", "--out", tmp_path / "results"),
-        ("baselines", "train", "ad", "--layout", "demo_wide", "--out", tmp_path / "run"),
-    ):
-        done = call(*python, "-m", *arguments, cwd=ROOT)
-        assert done.returncode == 1
-        assert done.stderr.startswith("error: this needs "), done.stderr
-        assert done.stderr.endswith(f", which is not installed: pip install '{NAME}[generation]'\n"), done.stderr
+@pytest.mark.parametrize("package", ["generation", "baselines"])
+def test_commands_name_the_missing_extra(installed, wheel, tmp_path, package):
+    run = runner(installed, tmp_path)
+    script = {"generation": "icrl4aht-generate", "baselines": "icrl4aht-baselines"}[package]
+    for program in ((script,), ("python", "-m", package)):
+        assert run(*program, "--version") == f"{NAME} {VERSION}\n"
+        assert "Examples:" in run(*program, "--help")
+    for arguments in {
+        "generation": (("plan",),),
+        "baselines": (
+            ("evaluate", "--agent", "stay", "--out", "results"),
+            ("train", "ad", "--layout", "demo_wide", "--out", "run"),
+        ),
+    }[package]:
+        message = run(script, *arguments, code=1)
+        assert message.startswith("error: this needs "), message
+        assert message.endswith(f", which is not installed: {hinted(wheel, package)}\n"), message
+    assert not list(tmp_path.iterdir())
+
+
+def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
+    """With `jax` alone, models train and agents play, and nothing is drawn; the command that is named then helps."""
+    run = runner(grown, tmp_path)
+    run("python", "-c", "import jax, flax, optax, importlib.util as u; assert not u.find_spec('matplotlib')")
+    assert run("python", "-c", EVALUATE).endswith("\nFalse\n")
+    assert "ad-reference" in run("icrl4aht-baselines", "models")
+    run("icrl4aht-generate", "manifests", "--check")
+    small = ("--layout", "demo_wide", "--tasks", "1", "--episodes", "2")
+    run("icrl4aht-baselines", "evaluate", "--agent", "ad-reference", *small, "--out", "results")
+    settings = ("--layout", "demo_wide", "--steps", "2", "--batch-size", "2", "--context", "20")
+    trained = run("icrl4aht-baselines", "train", "ad", *settings, "--out", "run")
+    assert f"curves.png was not drawn, matplotlib is not installed: {hinted(wheel, 'plot')}" in trained
+    assert not list(tmp_path.rglob("*.png"))
+    generate = ("icrl4aht-generate", "generate", "--profile", "smoke", "--out", "rebuilt")
+    for command in (generate, ("icrl4aht-baselines", "report", "results")):
+        message = run(*command, code=1)
+        assert message == f"error: drawing needs matplotlib and Pillow: {hinted(wheel, 'plot')}\n"
+    assert not (tmp_path / "rebuilt").exists() and not (tmp_path / "results" / "report").exists()
+
+    follow(hinted(wheel, "baselines"), grown)
+    assert "| demo_wide |" in run("python", "-c", EVALUATE)
+    run("icrl4aht-baselines", "report", "results")
+    assert (tmp_path / "results" / "report" / "curves.png").stat().st_size > 5000
 
 
 def test_the_installed_size_is_limited(installed, capsys):
@@ -224,10 +317,14 @@ def test_the_installed_size_is_limited(installed, capsys):
     files = (path for path in site.rglob("*") if path.is_file())
     # Python adds bytecode when a test imports the package: which of it is there depends on the tests that ran before.
     sizes = {path: path.stat().st_size for path in files if path.suffix != ".pyc"}
-    own = sum(size for path, size in sizes.items() if path.relative_to(site).parts[0].startswith(PACKAGE))
+    own = sum(size for path, size in sizes.items() if path.relative_to(site).parts[0].startswith(PACKAGES))
     with capsys.disabled():
         print(f"\n{NAME}: {own:,} bytes installed, {sum(sizes.values()):,} with its dependencies ({site.parent.name})")
-    release = sum(size for path, size in sizes.items() if path.is_relative_to(site / PACKAGE / "mini"))
-    assert own - release <= CODE_BYTES
+    release, models = (
+        sum(size for path, size in sizes.items() if path.is_relative_to(site / folder))
+        for folder in (f"{READER}/mini", "baselines/models")
+    )
+    assert own - release - models <= CODE_BYTES
     assert 0 < release <= RELEASE_BYTES
+    assert 0 < models <= MODEL_BYTES
     assert sum(sizes.values()) <= ENVIRONMENT_BYTES

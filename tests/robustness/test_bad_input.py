@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.utils.installation import upgrade_advice
 from tests.helpers.random_releases import SHARD
 
 
@@ -79,7 +81,7 @@ def test_no_release_here(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "error", "what_to_do"),
-    [(5, FormatTooNewError, "pip install -U"), (1, FormatTooOldError, "fetch the release again")],
+    [(5, FormatTooNewError, re.escape(upgrade_advice())), (1, FormatTooOldError, "fetch the release again")],
 )
 def test_other_format_versions(damaged, version, error, what_to_do):
     (damaged / "meta" / "info.json").write_text(json.dumps({"format_version": version, "renamed": 1}))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import signal
 import socket
 import struct
@@ -39,6 +40,7 @@ from baselines.training.trainer import (
 from generation.learners.resume import Checkpoints
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
+from icrl4aht_data.utils.installation import install_command
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start
@@ -149,7 +151,7 @@ class TestResume:
 
     def test_tensorboard_that_is_not_installed(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "tensorboardX", None)
-        with pytest.raises(OptionError, match=r"needs tensorboardX: pip install 'icrl4aht-data\[tensorboard\]'"):
+        with pytest.raises(OptionError, match=re.escape(f"needs tensorboardX: {install_command('tensorboard')}")):
             trained(tmp_path / "run", tensorboard=True)
         assert not (tmp_path / "run").exists()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import numpy as np
@@ -13,6 +14,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, INDICATOR, LAYOUTS, PLATE, WALL
 from icrl4aht_data.overcooked.render import draw_frame, save_episode, save_frame
 from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.utils.installation import install_command
 from tests.helpers.states import random_records, state_record
 
 CELL = 32
@@ -245,5 +247,5 @@ def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
 
 def test_without_pillow_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[plot\]'"):
+    with pytest.raises(OptionError, match=re.escape(install_command("plot"))):
         draw_frame(COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0])

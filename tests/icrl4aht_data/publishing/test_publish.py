@@ -28,6 +28,7 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.card_texts import card_texts
 from icrl4aht_data.writing.combine import combine_releases
@@ -348,7 +349,7 @@ def test_cards_are_found_in_a_checkout_and_in_an_installed_package(tmp_path):
         copy(ROOT / source, tmp_path / target)
     for name in names:
         assert card_file(name, tmp_path / "icrl4aht_data") == tmp_path / "icrl4aht_data/cards" / name
-    with pytest.raises(OptionError, match=r"cards/nothing\.md: missing; install icrl4aht-data again"):
+    with pytest.raises(OptionError, match=r"cards/nothing\.md: missing; restore it: `"):
         card_file("nothing.md")
 
 
@@ -375,7 +376,7 @@ def test_the_command_builds(release, tmp_path):
 def test_missing_libraries_are_named(release, tmp_path, monkeypatch):
     absent = ("pyarrow", "mlcroissant")
     monkeypatch.setattr("icrl4aht_data.publishing.build.find_spec", lambda name: None if name in absent else name)
-    with pytest.raises(OptionError, match=r"needs pyarrow, mlcroissant: pip install 'icrl4aht-data\[plot,hf\]'"):
+    with pytest.raises(OptionError, match=re.escape(f"needs pyarrow, mlcroissant: {install_command('plot', 'hf')}")):
         build_release(release, tmp_path / "out")
 
 

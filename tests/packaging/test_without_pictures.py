@@ -1,0 +1,57 @@
+"""Without matplotlib and Pillow, work whose results will be drawn is refused before it starts, with a command."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from baselines.demo import run_demo
+from baselines.experiments import ExperimentPlan, run_experiment
+from baselines.report import write_report
+from generation.plotting import plot_matrix
+from generation.populations.build import build_suite, report_diversity
+from generation.profiles import load_profile
+from generation.releases.build import build_releases
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.plotting import can_draw
+from icrl4aht_data.utils.installation import install_command
+
+CONSOLE = Console(quiet=True)
+SMOKE = load_profile("smoke")
+HINT = re.escape(install_command("plot"))
+
+
+@pytest.fixture(params=["matplotlib", "PIL"])
+def missing(request, monkeypatch) -> str:
+    """The name of a library that cannot be imported."""
+    assert can_draw()
+    monkeypatch.setitem(sys.modules, request.param, None)
+    return request.param
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda out: run_demo(out, CONSOLE),
+        lambda out: run_experiment("tracks", ExperimentPlan(), out),
+        lambda out: write_report([], out),
+        lambda out: build_releases(SMOKE, out, ("lite",), CONSOLE),
+        lambda out: build_suite(SMOKE, out, {"demo_wide": ["fcp"]}, 0, CONSOLE),
+        lambda out: report_diversity(out, ["demo_wide"], ["fcp"], False, CONSOLE),
+    ],
+    ids=["demo", "experiment", "report", "releases", "suite", "diversity"],
+)
+def test_work_with_pictures_is_refused_at_once(missing, work, tmp_path):
+    with pytest.raises(OptionError, match=f"drawing needs matplotlib and Pillow: {HINT}"):
+        work(tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_figure_without_matplotlib(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(OptionError, match=f"drawing needs matplotlib: {HINT}"):
+        plot_matrix(np.eye(2), "ab", tmp_path / "a.png", "title", ("rows", "columns"))
