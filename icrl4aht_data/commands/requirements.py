@@ -11,8 +11,8 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = "icrl4aht-data"
 
-_UNNAMED_EXTRAS = ("dev", "peers", "all", "baselines", "cuda12", "cuda13")
-"""Extras that are never suggested: three for work on this project; the others install what `generation` does."""
+_UNNAMED_EXTRAS = ("dev", "browser", "peers", "all", "baselines", "cuda12", "cuda13")
+"""Extras that are never suggested: four for work on this project; the others install what `generation` does."""
 
 _DISTRIBUTIONS = {"PIL": "pillow"}
 """Module -> distribution, where the names differ."""

@@ -25,11 +25,13 @@ Colour = tuple[int, int, int]
 FOOTER = 0.8
 """Height of the strip with the recipe below the map."""
 
+AGENT_COLOURS = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
+"""Coats of the chefs."""
+
 INK, _STEEL, _DARK_STEEL, _WHITE = (43, 48, 58), (124, 133, 146), (58, 64, 75), (255, 255, 255)
 _FLOOR, _FAR_WALL, PAPER = ((248, 245, 238), (239, 234, 224)), (199, 193, 184), (255, 252, 240)
 _COUNTER, _COUNTER_TOP, _CRATE, _CRATE_INSIDE = (168, 131, 92), (205, 171, 130), (133, 92, 54), (92, 62, 38)
 _HEAT, _READY, _LAMP, _PLATE_RIM = (255, 140, 40), (67, 190, 95), (255, 205, 40), (160, 178, 200)
-_CHEF = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
 _CHEF_EDGE = {EGO: (17, 58, 133), TEAMMATE: (122, 14, 27)}
 _SKIN, _PLEAT, _LEAF, _GOLD = (250, 214, 180), (196, 204, 216), (62, 132, 60), (246, 190, 50)
 
@@ -111,14 +113,14 @@ class StatePart(NamedTuple):
     Attributes:
         name: parts of one layout with the same name and values look the same.
         moves: whether the cell around which it is drawn depends on the state.
-        place: this cell; of a part that moves, the column of the state record that has it.
+        anchor: this cell; of a part that moves, the column of the state record that has it.
         columns: columns of the state record whose values determine the drawing.
         draw: called with a canvas, the coordinates of the cell's centre, and the values.
     """
 
     name: str
     moves: bool
-    place: int
+    anchor: int
     columns: tuple[int, ...]
     draw: Callable[..., None]
 
@@ -273,7 +275,7 @@ def _draw_view(layout: Layout, canvas: Canvas, x: float, y: float, cell: int) ->
     reach = WINDOW / 2
     visible = np.clip([column - reach, row - reach, column + reach, row + reach], 0, [layout.width, layout.height] * 2)
     corners = visible + [x - column, y - row] * 2
-    for thick, colour in ((0.1, _WHITE), (0.065, _CHEF[EGO])):
+    for thick, colour in ((0.1, _WHITE), (0.065, AGENT_COLOURS[EGO])):
         canvas.frame(corners.tolist(), thick, colour)
 
 
@@ -281,8 +283,8 @@ def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, f
     """A chef from above: coat in the agent's colour, white hat; eyes, arms and the item in hand point forward."""
     forward = STEP[FACINGS[facing]]
     body = [
-        (0.42, _CHEF[agent], (-0.16, -0.2), (-0.16, 0.2)),
-        *((0.15, _CHEF[agent], (-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in (-1, 1)),
+        (0.42, AGENT_COLOURS[agent], (-0.16, -0.2), (-0.16, 0.2)),
+        *((0.15, AGENT_COLOURS[agent], (-0.1, 0.33 * side), (0.26, 0.27 * side)) for side in (-1, 1)),
         *((0.16, _SKIN, (0.34, 0.24 * side)) for side in (-1, 1)),
         (0.43, _SKIN, (0.03, 0)),
         *((0.075, INK, (0.17, 0.08 * side)) for side in (-1, 1)),
@@ -299,6 +301,6 @@ def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, f
 def _draw_footer(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int) -> None:
     """The current recipe in the strip below the map, from its left edge."""
     left, middle = x - 0.5, y + 0.5 + FOOTER / 2
-    canvas.text(left + 0.15, middle, "Recipe", 0.34, INK, "lm")
+    canvas.text(left + 0.15, middle, "Recipe", 0.34, INK, "lm", room=1.15)
     for number, ingredient in enumerate(item_contents(layout, recipe)):
         _draw_ingredient(canvas, ingredient, left + 1.56 + 0.42 * number, middle, 0.2)

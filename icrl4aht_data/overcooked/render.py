@@ -175,7 +175,7 @@ def _picture(layout: Layout, record: np.ndarray, size: int, caption: str, view: 
     canvas = _Picture(layout.width, layout.height + FOOTER, size)
     for part in state_parts(layout):
         if view or part.name != VIEW:
-            cell = int(record[part.place]) if part.moves else part.place
+            cell = int(record[part.anchor]) if part.moves else part.anchor
             part.draw(canvas, *cell_centre(layout, cell), *(int(record[column]) for column in part.columns))
     middle = layout.height + FOOTER / 2
     canvas.text(layout.width - 0.15, middle, caption, 0.34, INK, "rm", room=layout.width - 2.9)
