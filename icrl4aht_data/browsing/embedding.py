@@ -107,15 +107,12 @@ def _check(history: History, fulfilled: bool, expected: str, found: object) -> N
 
 
 def _embedded_actions(entry: Entry) -> list[str]:
-    """The action fields of a history; not the oracle's where its expert is the oracle."""
-    fields = [FIELDS[name] for name in ACTION_FIELDS]
-    return [field.name for field in fields if entry.has(field) and entry.stored_field(field) is field]
+    """The action fields of a history; not the oracle's of a noise history whose expert, the oracle, has the same."""
+    names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
+    twice = entry.source == "noise" and "expert_actions" in names
+    return [name for name in names if not (twice and name == "oracle_actions")]
 
 
 def _index_facts(entry: Entry) -> dict[str, Any]:
     names = ("history_id", "task_id", "layout", "source", "split", "track", "learner", "episodes", "expert_return")
-    return {
-        **{name: getattr(entry, name) for name in names},
-        "steps": entry.T,
-        "teammate": f"{entry.teammate_family}/{entry.teammate_kind}",
-    }
+    return {name: getattr(entry, name) for name in names} | {"steps": entry.T}

@@ -98,7 +98,7 @@ def make_browser_page(
         longest = max(len(one.facts["shown"]) for one in embedded)
         if longest <= 2:
             raise OptionError(
-                f"the page has {len(html) / 1e6:.1f} MB with the first and last episodes of {len(dataset)} histories, "
+                f"the page has {len(html) / 1e6:.2f} MB with the first and last episodes of {len(dataset)} histories, "
                 f"expected less than {megabytes:g} MB: take fewer histories, or allow a larger page"
             )
         most = max(2, min(longest - 1, int(longest * 0.95 * megabytes * 1e6 / len(html))))
@@ -120,7 +120,7 @@ def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
         "no_action": NO_ACTION,
         "window": WINDOW,
         "layouts": {name: layout_drawings(get_layout(name), np.concatenate(own)) for name, own in records.items()},
-        "histories": [one.facts for one in embedded],
+        "histories": [one.facts | {"teammate": _teammate(dataset, one.facts["history_id"])} for one in embedded],
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
     data = {"index": _base64(packed), "histories": [_base64(one.data) for one in embedded]}
@@ -139,6 +139,13 @@ def _release_facts(dataset: Dataset) -> dict[str, Any]:
     info = dataset.info
     name = _release_name(dataset)
     return {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories}
+
+
+def _teammate(dataset: Dataset, history_id: int) -> str:
+    """The teammate's family, kind and, where the release has its tasks, its number among those of the kind."""
+    entry = dataset.index.entry(history_id)
+    name = f"{entry.teammate_family}/{entry.teammate_kind}"
+    return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.knows_tasks else name
 
 
 def _release_name(dataset: Dataset) -> str:
