@@ -73,7 +73,9 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     ends = np.flatnonzero(dones) + 1
     _check(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
     starts, shown = np.concatenate([[0], ends[:-1]]), spread_episodes(len(ends), most)
-    steps = np.concatenate([np.arange(starts[e], ends[e] + 1) for e in shown])  # an episode's last row is not a step
+    steps = np.concatenate(
+        [np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown]
+    )  # an episode's last row is not a step
     last = np.cumsum(ends[shown] + 1 - starts[shown]) - 1
     steps[last] -= 1
 

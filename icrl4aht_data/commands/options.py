@@ -211,7 +211,7 @@ def filter_options(command: Any) -> Any:
     return command
 
 
-def wanted_filters(filters: Mapping[str, tuple[str, ...]]) -> dict[str, list[str] | None]:
+def wanted_filters(filters: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     """Return the arguments of `load_icrl4aht` for the values of `filter_options`."""
     return {name: list(values) or None for name, values in filters.items()}
 
