@@ -6,7 +6,6 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 from rich.console import Console
@@ -14,6 +13,7 @@ from rich.console import Console
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.commands.browse import browse
 from icrl4aht_data.commands.doctor import diagnose, in_words
 from icrl4aht_data.commands.options import (
     COUNT,
@@ -33,6 +33,7 @@ from icrl4aht_data.commands.options import (
     quiet_option,
     run,
     version_option,
+    wanted_filters,
 )
 from icrl4aht_data.commands.summaries import summarize_selection, summarize_tasks, task_table
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
@@ -57,16 +58,12 @@ from icrl4aht_data.writing.statistics import print_statistics
 _root = click.argument("root", required=False, type=Root())
 
 
-def _wanted(filters: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-    return {name: list(values) or None for name, values in filters.items()}
-
-
 def _load(root: str | Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
-    return load_icrl4aht(root, **_wanted(filters))
+    return load_icrl4aht(root, **wanted_filters(filters))
 
 
 _SECTIONS = {
-    "Look": ("list", "show", "verify", "doctor"),
+    "Look": ("list", "show", "browse", "verify", "doctor"),
     "Fetch and convert": ("download", "convert", "combine"),
     "Publish": ("release", "upload"),
 }
@@ -170,6 +167,9 @@ def show(
         click.echo(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
 
 
+cli.add_command(browse)
+
+
 @cli.command(
     epilog=examples(
         "icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple --dry-run",
@@ -196,7 +196,7 @@ def download(
     if root is None:
         raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
     with bars(quiet, of_bytes=True) as show:
-        plan = plan_download(str(root), to=to, advance=show, **_wanted(filters))
+        plan = plan_download(str(root), to=to, advance=show, **wanted_filters(filters))
         facts = plan.to_json()
         if not dry_run:
             traffic = fetch_planned(plan, counted(show, "download", plan.size))
@@ -245,7 +245,7 @@ def verify(
     level = "quick" if quick else "deep" if deep else "full"
     if origin and not repair:
         raise click.UsageError("--from is the source of a repair: give --repair with it")
-    wanted = _wanted(filters)
+    wanted = wanted_filters(filters)
     with bars(quiet) as advance:
         report = verify_release(root, level=level, advance=advance, **wanted)
         if repair and not report.ok:

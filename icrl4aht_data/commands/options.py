@@ -212,6 +212,11 @@ def filter_options(command: Any) -> Any:
     return command
 
 
+def wanted_filters(filters: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    """Return the arguments of `load_icrl4aht` for the values of `filter_options`."""
+    return {name: list(values) or None for name, values in filters.items()}
+
+
 def examples(*lines: str) -> str:
     """Return a help epilog that shows command lines."""
     return "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)])

@@ -11,8 +11,8 @@ from packaging.utils import canonicalize_name
 
 from icrl4aht_data.utils.installation import PACKAGE
 
-_UNNAMED_EXTRAS = ("dev", "peers", "all", "cuda12", "cuda13")
-"""Extras that are never suggested: three for work on this project; the others install JAX for GPUs."""
+_UNNAMED_EXTRAS = ("dev", "browser", "peers", "all", "cuda12", "cuda13")
+"""Extras that are never suggested: four for work on this project; the others install JAX for GPUs."""
 
 _DISTRIBUTIONS = {"PIL": "pillow"}
 """Module -> distribution, where the names differ."""

@@ -21,7 +21,7 @@ from tests.helpers.paths import ROOT
 ORDER = {
     "": "icrl4aht_data generation baselines benchmarks tests",
     "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling dataset interop plotting "
-    "writing checking publishing commands",
+    "writing checking publishing browsing commands",
     "generation": "progress plotting env policy paths learners experts teammates profiles collection populations "
     "releases planning cli",
     "baselines": "plotting methods training agents evaluate online control report experiments reference demo commands",

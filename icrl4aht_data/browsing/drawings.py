@@ -1,0 +1,100 @@
+"""Drawings of a layout's states as lists of shapes, which a page draws without knowledge of the game."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.overcooked.drawing import FOOTER, PAPER, VIEW, Canvas, Colour, state_parts
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import record_size
+
+_DIGITS = 3  # of coordinates: a thousandth of a cell
+
+
+class ShapeRecorder(Canvas):
+    """A canvas that records shapes, as lists of their kind and the arguments of the methods of `Canvas`.
+
+    Attributes:
+        shapes: ["box", x, y, width, height, fill, radius], ["disc", x, y, radius, fill, part],
+            ["line", thickness, fill, x, y, x, y, ...], ["frame", left, top, right, bottom, thickness, fill] or
+            ["text", x, y, words, size, fill, anchor, room]; a fill is a colour such as "#2b303a".
+    """
+
+    def __init__(self) -> None:
+        self.shapes: list[list[Any]] = []
+
+    def box(self, x: float, y: float, width: float, height: float, fill: Colour, radius: float = 0) -> None:
+        self._add("box", x, y, width, height, hex_colour(fill), radius)
+
+    def disc(self, x: float, y: float, radius: float, fill: Colour, part: float = 1) -> None:
+        self._add("disc", x, y, radius, hex_colour(fill), part)
+
+    def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
+        self._add("line", thickness, hex_colour(fill), *(value for point in points for value in point))
+
+    def frame(self, corners: Sequence[float], thickness: float, fill: Colour) -> None:
+        self._add("frame", *corners, thickness, hex_colour(fill))
+
+    def text(
+        self, x: float, y: float, words: str, size: float, fill: Colour, anchor: str = "mm", room: float = 99
+    ) -> None:
+        self._add("text", x, y, words, size, hex_colour(fill), anchor, room)
+
+    def _add(self, kind: str, *values: Any) -> None:
+        self.shapes.append([kind, *(value if isinstance(value, str) else _rounded(value) for value in values)])
+
+
+def _rounded(value: float) -> float:
+    short = round(float(value), _DIGITS)
+    return int(short) if short.is_integer() else short
+
+
+def _distinct(rows: np.ndarray) -> list[list[int]]:
+    """The different rows among uint8 (N, K), for few columns much faster than `np.unique`."""
+    found = np.zeros((256,) * rows.shape[1], bool)
+    found[tuple(rows.T)] = True
+    return np.argwhere(found).tolist()
+
+
+def hex_colour(colour: Colour) -> str:
+    """Return a colour as CSS writes it, such as #2b303a."""
+    return "#" + bytes(colour).hex()
+
+
+def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
+    """Return everything that a page needs to draw these states of a layout, as JSON.
+
+    Args:
+        layout: the layout.
+        records: state records uint8 (N, S).
+
+    Returns:
+        width, height: of the map, in cells; footer: height of the strip below it; paper: colour of the background.
+        record_size: S.
+        view: name of the part that outlines the cells that the ego observes.
+        parts: in the order in which they are drawn, see `StatePart`: [name, moves, anchor, columns].
+        drawings: name of a part -> the values of its columns, joined by commas -> its shapes, see `ShapeRecorder`,
+            relative to the centre of the cell. Only the values that are in the records.
+    """
+    drawings: dict[str, dict[str, list]] = {}
+    for part in state_parts(layout):
+        known = drawings.setdefault(part.name, {})
+        for values in _distinct(records[:, list(part.columns)]):
+            key = ",".join(map(str, values))
+            if key not in known:
+                recorder = ShapeRecorder()
+                part.draw(recorder, 0.0, 0.0, *values)
+                known[key] = recorder.shapes
+    return {
+        "width": layout.width,
+        "height": layout.height,
+        "footer": FOOTER,
+        "paper": hex_colour(PAPER),
+        "record_size": record_size(layout),
+        "view": VIEW,
+        "parts": [[part.name, part.moves, part.anchor, list(part.columns)] for part in state_parts(layout)],
+        "drawings": drawings,
+    }

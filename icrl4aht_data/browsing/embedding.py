@@ -1,0 +1,120 @@
+"""Histories as compressed bytes and facts in JSON, for a page to decode: which ones, and which of their episodes."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+from itertools import zip_longest
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import ReleaseError
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, Entry, episode_returns
+from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.state import faults
+from icrl4aht_data.reading.history import History
+
+NO_ACTION = 255
+"""Action in an episode's last frame, the state after its last step."""
+
+
+class EmbeddedHistory(NamedTuple):
+    """A history as a page has it.
+
+    Attributes:
+        facts: the history in JSON: what a person chooses it by; `returns` of all episodes; `shown`, the numbers from 0
+            of the episodes with frames; `frames`, how many each of them has, one more than steps; `columns`, the names
+            of the columns that follow the state record's.
+        records: uint8 (F, S), the state records of all frames.
+        data: the columns of F bytes each, those of the state record and `columns`, compressed by zlib. The action in
+            an episode's last frame is `NO_ACTION` and its reward 0; rewards are int8.
+    """
+
+    facts: dict[str, Any]
+    records: np.ndarray
+    data: bytes
+
+
+def spread_histories(dataset: Dataset, count: int) -> list[int]:
+    """Return the ids of at most `count` histories, ascending: of all layouts, and on each of all teammates and sources.
+
+    Layouts take turns, and on each layout its kinds of teammates and sources do.
+    """
+    groups: dict[str, dict[tuple[str, ...], list[int]]] = {}
+    names = ("layout", "source", "teammate_family", "teammate_kind")
+    for number, layout, *group in zip(dataset.ids.tolist(), *(dataset.column(n).tolist() for n in names), strict=True):
+        groups.setdefault(layout, {}).setdefault(tuple(group), []).append(number)
+    return sorted(_alternating(_alternating(of_layout.values()) for of_layout in groups.values())[:count])
+
+
+def _alternating(lists: Iterable[list[int]]) -> list[int]:
+    """The first elements of all lists, then the second ones, and so on."""
+    return [number for turn in zip_longest(*lists) for number in turn if number is not None]
+
+
+def spread_episodes(episodes: int, most: int | None) -> np.ndarray:
+    """Return numbers of at most `most` of a history's episodes, evenly spaced, the first and the last among them."""
+    if most is None or most >= episodes:
+        return np.arange(episodes)
+    return np.unique(np.linspace(0, episodes - 1, max(2, most)).round().astype(int))
+
+
+def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
+    """Return a history as a page has it, with frames of all its episodes, or of `most` of them.
+
+    Raises:
+        NotStoredError: if the release has no state records.
+        ReleaseError: if the release cannot be read, or has states or actions that cannot be.
+    """
+    entry, rewards, dones = history.entry, history.read("rewards"), history.read("dones")
+    ends = np.flatnonzero(dones) + 1
+    _check(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
+    starts, shown = np.concatenate([[0], ends[:-1]]), spread_episodes(len(ends), most)
+    steps = np.concatenate(
+        [np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown]
+    )  # an episode's last row is not a step
+    last = np.cumsum(ends[shown] + 1 - starts[shown]) - 1
+    steps[last] -= 1
+
+    records = history.read("state")[steps]
+    records[last] = history.read("episode_end_state")[shown]
+    wrong = faults(get_layout(entry.layout), records)
+    _check(history, not wrong, "possible states", "; ".join(wrong))
+    values = {"rewards": rewards[steps].astype(np.int8).view(np.uint8)}
+    values["rewards"][last] = 0
+    for name in _embedded_actions(entry):
+        values[name] = history.read(name)[steps].astype(np.uint8)
+        _check(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
+        values[name][last] = NO_ACTION
+    columns = np.vstack([records.T, *values.values()])  # equal columns of successive frames compress best
+    facts = {
+        **_index_facts(entry),
+        "returns": episode_returns(rewards, dones).tolist(),
+        "shown": shown.tolist(),
+        "frames": np.diff(last, prepend=-1).tolist(),
+        "columns": list(values),
+    }
+    return EmbeddedHistory(facts, records, zlib.compress(np.ascontiguousarray(columns).tobytes(), 9))
+
+
+def _check(history: History, fulfilled: bool, expected: str, found: object) -> None:
+    if not fulfilled:
+        raise ReleaseError(
+            f"{history.entry.shard}: history {history.entry.history_id}: expected {expected}, found {found}; "
+            f"`icrl4aht-data verify --deep` lists all problems"
+        )
+
+
+def _embedded_actions(entry: Entry) -> list[str]:
+    """The action fields of a history; not the oracle's of a noise history whose expert, the oracle, has the same."""
+    names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
+    twice = entry.source == "noise" and "expert_actions" in names
+    return [name for name in names if not (twice and name == "oracle_actions")]
+
+
+def _index_facts(entry: Entry) -> dict[str, Any]:
+    names = ("history_id", "task_id", "layout", "source", "split", "track", "learner", "episodes", "expert_return")
+    return {name: getattr(entry, name) for name in names} | {"steps": entry.T}

@@ -1,0 +1,161 @@
+"""One self-contained HTML file with histories: their learning curves, and their episodes to watch."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.browsing.drawings import hex_colour, layout_drawings
+from icrl4aht_data.browsing.embedding import NO_ACTION, EmbeddedHistory, embed_history
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import NotStoredError, OptionError
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
+from icrl4aht_data.overcooked.layouts import WINDOW, get_layout
+from icrl4aht_data.utils.files import atomic_write
+
+PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
+"""First bytes of a page, by which it is recognised before it is replaced."""
+
+PAGE_HISTORIES = 30
+"""Histories on a page, unless another number is chosen."""
+
+PAGE_MEGABYTES = 5
+"""Size below which a page stays, unless another one is chosen."""
+
+_FILES = Path(__file__).parent
+
+
+class BrowserPage(NamedTuple):
+    """A page with histories.
+
+    Attributes:
+        html: the complete file, UTF-8.
+        histories: number of histories on it.
+        episodes: number of their episodes.
+        shown_episodes: number of episodes that can be watched.
+    """
+
+    html: bytes
+    histories: int
+    episodes: int
+    shown_episodes: int
+
+
+def check_drawable(dataset: Dataset) -> None:
+    """Check that a release has what is needed to draw its episodes.
+
+    Raises:
+        NotStoredError: if it has no state records.
+    """
+    if not dataset.has_states:
+        raise NotStoredError(
+            f"{dataset.origin}: a release of kind {dataset.info.kind} has no state records, so there is nothing to "
+            f"draw; browse a full or lite release"
+        )
+
+
+def make_browser_page(
+    dataset: Dataset,
+    *,
+    megabytes: float = PAGE_MEGABYTES,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+) -> BrowserPage:
+    """Return a page with all histories of a selection; see `spread_histories` for a smaller one.
+
+    Every episode can be watched if the page stays below its size; if not, episodes of each history, evenly spaced, the
+    first and the last among them. The page says which.
+
+    Args:
+        dataset: the histories.
+        megabytes: the size, in millions of bytes.
+        advance: called with the number of histories that were read, and of those to read.
+
+    Raises:
+        NotStoredError: if the release has no state records.
+        OptionError: if the page would be larger even with two episodes a history.
+        ReleaseError: if the release cannot be read.
+    """
+    check_drawable(dataset)
+    most: int | None = None
+    while True:
+        embedded = []
+        for number, history in enumerate(dataset):
+            embedded.append(embed_history(history, most))
+            advance(number + 1, len(dataset))
+        html = _render(dataset, embedded)
+        if len(html) < megabytes * 1e6:
+            shown = sum(len(one.facts["shown"]) for one in embedded)
+            return BrowserPage(html, len(embedded), sum(one.facts["episodes"] for one in embedded), shown)
+        longest = max(len(one.facts["shown"]) for one in embedded)
+        if longest <= 2:
+            raise OptionError(
+                f"the page has {len(html) / 1e6:.2f} MB with the first and last episodes of {len(dataset)} histories, "
+                f"expected less than {megabytes:g} MB: take fewer histories, or allow a larger page"
+            )
+        most = max(2, min(longest - 1, int(longest * 0.95 * megabytes * 1e6 / len(html))))
+
+
+def save_browser_page(page: BrowserPage, path: Path) -> None:
+    """Write a page, which appears complete or not at all."""
+    with atomic_write(path) as partial:
+        partial.write_bytes(page.html)
+
+
+def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
+    records: dict[str, list[np.ndarray]] = {}
+    for one in embedded:
+        records.setdefault(one.facts["layout"], []).append(one.records)
+    index = {
+        "release": _release_facts(dataset),
+        "actions": ACTIONS,
+        "no_action": NO_ACTION,
+        "window": WINDOW,
+        "layouts": {name: layout_drawings(get_layout(name), np.concatenate(own)) for name, own in records.items()},
+        "histories": [one.facts | {"teammate": _teammate(dataset, one.facts["history_id"])} for one in embedded],
+    }
+    packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
+    data = {"index": _base64(packed), "histories": [_base64(one.data) for one in embedded]}
+    colours = {"ego": AGENT_COLOURS[EGO], "teammate": AGENT_COLOURS[TEAMMATE]}
+    style = "".join(f"--{name}: {hex_colour(colour)}; " for name, colour in colours.items())
+    text = Template(_source("page.html")).substitute(
+        release=escape(_release_name(dataset)),
+        style=f":root {{ {style}}}\n{_source('page.css')}",
+        script="\n".join(_source(name) for name in ("state.js", "curve.js", "page.js")),
+        data=json.dumps(data),  # base64 only: nothing in it can end the element
+    )
+    return text.encode()
+
+
+def _release_facts(dataset: Dataset) -> dict[str, Any]:
+    info = dataset.info
+    name = _release_name(dataset)
+    return {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories}
+
+
+def _teammate(dataset: Dataset, history_id: int) -> str:
+    """The teammate's family, kind and, where the release has its tasks, its number among those of the kind."""
+    entry = dataset.index.entry(history_id)
+    name = f"{entry.teammate_family}/{entry.teammate_kind}"
+    return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.knows_tasks else name
+
+
+def _release_name(dataset: Dataset) -> str:
+    """The address of a remote release, or the name of a folder without its path, which others do not have."""
+    return str(dataset.origin) if dataset.origin.remote else dataset.root.resolve().name
+
+
+def _source(name: str) -> str:
+    return (_FILES / name).read_text(encoding="utf-8")
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

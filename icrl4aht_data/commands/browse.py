@@ -1,0 +1,127 @@
+"""`icrl4aht-data browse`: histories as one HTML file to look at."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from icrl4aht_data.browsing.embedding import spread_histories
+from icrl4aht_data.browsing.page import (
+    PAGE_HISTORIES,
+    PAGE_MEGABYTES,
+    PAGE_START,
+    check_drawable,
+    make_browser_page,
+    save_browser_page,
+)
+from icrl4aht_data.browsing.serving import LOOPBACK, page_server
+from icrl4aht_data.commands.options import (
+    COUNT,
+    COUNT_OR_NONE,
+    NewFile,
+    Root,
+    bars,
+    examples,
+    filter_options,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    wanted_filters,
+)
+from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.utils.new_file import check_new_file
+
+_FILE = "browse.html"
+
+
+@click.command(
+    epilog=examples(
+        "icrl4aht-data browse --layout demo_wide --source ppo --out demo_wide.html",
+        "icrl4aht-data browse path/to/release --history 0 --history 7 --serve",
+    )
+)
+@click.argument("root", required=False, type=Root())
+@filter_options
+@click.option(
+    "--history", "wanted", type=COUNT_OR_NONE, multiple=True, metavar="ID", help="Only this history; repeat for more."
+)
+@click.option("--histories", type=COUNT, default=PAGE_HISTORIES, help="At most so many, of all layouts and teammates.")
+@click.option("--megabytes", type=COUNT, default=PAGE_MEGABYTES, help="Keep the page below this size.")
+@click.option(
+    "--out",
+    type=NewFile(".html", ".htm"),
+    metavar="FILE",
+    help="Write the page here.",
+    show_default=f"{_FILE}, with --serve nowhere",
+)
+@overwrite_option
+@click.option("--serve", is_flag=True, help="Show the page at an address of this machine only, until Ctrl-C.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), metavar="PORT", help="Port of --serve.", show_default="a free one"
+)
+@quiet_option
+@json_option
+def browse(
+    root: str | Path | None,
+    wanted: tuple[int, ...],
+    histories: int,
+    megabytes: int,
+    out: Path | None,
+    overwrite: bool,
+    serve: bool,
+    port: int | None,
+    quiet: bool,
+    as_json: bool,
+    **filters: tuple[str, ...],
+) -> None:
+    """Write an HTML page on which to look at histories.
+
+    One file that needs no other and no network: choose a layout, a teammate and a history, see its learning curve, and
+    watch its episodes step by step, with the ego's window and the expert's action next to the ego's. Where not all
+    episodes fit, some of each history can be watched, the first and the last among them; the page says which. A release
+    of observations has no states to draw.
+    """
+    if port is not None and not serve:
+        raise click.UsageError("--port is for the server: give --serve with it")
+    if out is None and not serve:
+        out = Path(_FILE)
+    if out is None and overwrite:
+        raise click.UsageError("--overwrite replaces a file: give --out FILE with it")
+    if out is not None:
+        check_new_file(out, overwrite, PAGE_START)
+    matching = load_icrl4aht(root, **wanted_filters(filters))
+    check_drawable(matching)
+    chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
+    with bars(quiet) as show:
+        page = make_browser_page(
+            chosen, megabytes=megabytes, advance=lambda done, total: show("histories", done, total)
+        )
+    if out is not None:
+        save_browser_page(page, out)
+    server = page_server(page.html, port or 0) if serve else None
+    address = f"http://{LOOPBACK}:{server.server_port}/" if server else None
+    if as_json:
+        facts = {
+            "page": str(out) if out else None,
+            "address": address,
+            "histories": page.histories,
+            "episodes": page.episodes,
+            "shown_episodes": page.shown_episodes,
+        }
+        click.echo(json.dumps(facts | {"bytes": len(page.html)}, indent=2))
+    elif not quiet:
+        shown = "all" if page.shown_episodes == page.episodes else f"{page.shown_episodes:,} of"
+        click.echo(
+            f"{out or 'page'}: {page.histories} of {len(matching)} histories, {shown} {page.episodes:,} episodes to "
+            f"watch, {len(page.html):,} bytes"
+        )
+    if server:
+        with server:
+            if not as_json:
+                click.echo(f"{address} until Ctrl-C")
+            try:
+                server.serve_forever()
+            except KeyboardInterrupt:
+                return

@@ -1,0 +1,30 @@
+"""A decoder of the pages of `icrl4aht-data browse`, written from their description, not from the code of the page."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import zlib
+from typing import Any
+
+import numpy as np
+
+
+def embedded(html: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    """Return a page's index and the decompressed data of each of its histories."""
+    (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', html.decode(), re.DOTALL)
+    data = json.loads(text)
+    index, *histories = (zlib.decompress(base64.b64decode(one)) for one in (data["index"], *data["histories"]))
+    return json.loads(index), histories
+
+
+def episodes(index: dict[str, Any], facts: dict[str, Any], content: bytes) -> dict[int, dict[str, np.ndarray]]:
+    """Return the frames of each episode with frames: number -> "state" uint8 (frames, S) and the other columns."""
+    size, names = index["layouts"][facts["layout"]]["record_size"], facts["columns"]
+    columns = np.frombuffer(content, np.uint8).reshape(size + len(names), sum(facts["frames"]))
+    named = {"state": columns[:size].T, **dict(zip(names, columns[size:], strict=True))}
+    named["rewards"] = named["rewards"].view(np.int8)
+    ends = np.cumsum(facts["frames"])[:-1]
+    parts = {name: np.split(values, ends) for name, values in named.items()}
+    return {number: {name: parts[name][at] for name in parts} for at, number in enumerate(facts["shown"])}

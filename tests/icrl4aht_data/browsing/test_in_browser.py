@@ -1,0 +1,215 @@
+"""The page in headless Chromium: decoded states, drawn pixels, what is shown, keys, phone width and dark mode."""
+
+from __future__ import annotations
+
+import base64
+import io
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.browsing.page import make_browser_page, save_browser_page
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.render import draw_frame
+from tests.helpers.random_releases import random_release
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
+
+OpenPage = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Dataset:
+    root = tmp_path_factory.mktemp("browse") / "release"
+    random_release(root, layouts=("coord_simple", "test_wide"), oracle=True, streams=2)
+    return load_icrl4aht(root)
+
+
+@pytest.fixture(scope="module")
+def file(dataset, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "browse.html"
+    save_browser_page(make_browser_page(dataset), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def open_page(file) -> Iterator[OpenPage]:
+    """Opens the page in a new tab, which must have no error and ask for no other file."""
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        problems: list[str] = []
+
+        def opened(address: str = "", path: Path = file, width: int = 1280, dark: bool = False) -> Any:
+            scheme = "dark" if dark else "light"
+            page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+            page.set_default_timeout(60_000)
+            page.on("pageerror", lambda error: problems.append(str(error)))
+            page.on("console", lambda message: problems.append(message.text))
+            page.on("request", lambda request: problems.append(request.url) if request.url[:5] == "http:" else None)
+            page.goto(f"{path.as_uri()}{address}")
+            page.evaluate("opened")
+            return page
+
+        yield opened
+        browser.close()
+        assert not problems
+
+
+def table_of(page) -> dict[str, str]:
+    """Return the rows of the first pane."""
+    cells = page.locator(".pane").first.locator("th, td").all_inner_texts()
+    return dict(zip(cells[::2], cells[1::2], strict=True))
+
+
+def test_the_browser_decodes_the_states_of_the_reader(open_page, dataset):
+    page = open_page()
+    decode = """async (position) => (await episodesOf(position)).map(({ records, rewards, actions, expert_actions }) =>
+        [records.map((record) => [...record]), [...rewards], [...actions], [...expert_actions]])"""
+    for position, history in enumerate(dataset):
+        decoded = page.evaluate(decode, position)
+        assert len(decoded) == history.entry.episodes
+        states, rewards, actions, expert = (np.stack(part) for part in zip(*decoded, strict=True))
+        np.testing.assert_array_equal(states[:, :-1].reshape(history.state.shape), history.state[:])
+        np.testing.assert_array_equal(states[:, -1], history.episode_end_state[:])
+        for shown, array in ((rewards, history.rewards), (actions, history.actions), (expert, history.expert_actions)):
+            np.testing.assert_array_equal(shown[:, :-1].reshape(-1), array[:])
+    page.close()
+
+
+def test_a_drawn_state_is_that_of_draw_frame(open_page, dataset):
+    """The pixels differ in text, which has the browser's font, and by smoothing at edges."""
+    for number in (0, len(dataset) - 1):
+        history = dataset[number]
+        layout = get_layout(history.entry.layout)
+        page = open_page(f"#history={history.entry.history_id}&episode=2&step=9")
+        page.uncheck("#window")
+        width = 48 * layout.width
+        picture = page.evaluate(
+            """(width) => {
+                const canvas = document.querySelector(".picture");
+                canvas.style.cssText = `width: ${width}px; max-width: none; border: 0`;
+                canvas.parentElement.style.display = "block";
+                drawState(canvas, index.layouts[currentFacts().layout], shownEpisodes()[0].records[9]);
+                return canvas.toDataURL();
+            }""",
+            width,
+        )
+        drawn = np.array(Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))).convert("RGB")).astype(int)
+        expected = draw_frame(layout, history.state[29], cell=48, view=False).astype(int)
+        other = draw_frame(layout, history.state[5], cell=48, view=False).astype(int)
+        height = 48 * layout.height
+        assert drawn.shape[1] == width
+        difference, larger = (np.abs(drawn[:height] - frame[:height]).mean() for frame in (expected, other))
+        assert difference < 3 < larger
+        page.close()
+
+
+def test_what_is_shown_of_a_step(open_page, dataset):
+    history = dataset[1]
+    page = open_page(f"#history={history.entry.history_id}&episode=3&step=7")
+    at, earned = 47, history.rewards[40:47].sum()
+    names = {"Ego": "actions", "Expert": "expert_actions", "Oracle": "oracle_actions", "Teammate": "teammate_actions"}
+    acted = {who: ACTIONS[int(history.read(field)[at])] for who, field in names.items()}
+    marks = {who: "same" if acted[who] == acted["Ego"] else "differs" for who in ("Expert", "Oracle")}
+    assert table_of(page) == {
+        "Step": "7 of 20",
+        "Return so far": f"{earned:g} of {history.returns()[2]:g}",
+        "Reward of this step": f"{history.rewards[at]:+g}".replace("+0", "0"),
+        **{f"{who}'s action": f"{name} ({marks[who]})" if who in marks else name for who, name in acted.items()},
+    }
+    page.keyboard.press("End")
+    assert table_of(page)["Ego's action"] == "none, the episode is over"
+    assert table_of(page)["Return so far"] == "{0:g} of {0:g}".format(history.returns()[2])
+    page.close()
+
+
+def test_choosing_and_keys(open_page, dataset):
+    page = open_page("#history=0&episode=3&step=0")
+    shown = "document.querySelector('.pane figcaption').textContent.split(',')[0]"
+    page.keyboard.press("n")
+    page.wait_for_function(f"{shown} === 'Episode 4 of 6'")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert table_of(page)["Step"] == "2 of 20"
+    page.fill("#scrub", "13")
+    assert table_of(page)["Step"] == "13 of 20"
+    page.focus("#curve")
+    page.keyboard.press("Home")
+    page.wait_for_function(f"{shown} === 'Episode 1 of 6'")
+    page.keyboard.press("f")
+    page.wait_for_function("document.querySelectorAll('.pane').length === 2")
+    assert [text[:14] for text in page.locator("figcaption").all_inner_texts()] == ["Episode 1 of 6", "Episode 6 of 6"]
+    page.keyboard.press("f")
+    page.wait_for_function("document.querySelectorAll('.pane').length === 1")
+    curve = page.locator("#curve")
+    curve.click(position={"x": curve.bounding_box()["width"] / 2, "y": 60})
+    page.wait_for_function(f"['Episode 3 of 6', 'Episode 4 of 6'].includes({shown})")
+    page.select_option("#layout", "test_wide")
+    page.wait_for_function("currentFacts().layout === 'test_wide'")
+    kind = dataset.entries[0].teammate_kind
+    teammates = page.locator("#teammate option").all_text_contents()
+    assert [name.partition("/")[2] for name in teammates] == [f"{kind} t0", f"{kind} t1"]
+    page.select_option("#teammate", teammates[1])
+    page.wait_for_function(f"currentFacts().teammate === '{teammates[1]}'")
+    assert page.locator("#history option").count() == 2
+    page.close()
+
+
+def test_playing_ends_with_the_episode_and_can_pause(open_page):
+    page = open_page("#history=0&episode=1&step=0")
+    page.select_option("#speed", "50")
+    page.keyboard.press(" ")
+    page.wait_for_function("chosen.step === 20 && playing === null")
+    assert page.inner_text("#play") == "Play"
+    page.select_option("#speed", "1")
+    page.keyboard.press("Home")
+    page.click("#play")
+    assert page.inner_text("#play") == "Pause"
+    page.click("#play")
+    assert page.evaluate("playing === null && chosen.step < 20")
+    page.close()
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_phone_does_not_scroll_sideways(open_page, dark):
+    page = open_page("#history=0&episode=1&step=3&ends=1", width=390, dark=dark)
+    assert page.locator(".pane").count() == 2
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
+    assert (max(shade) < 60) is dark
+    page.close()
+
+
+def test_a_page_with_some_episodes_says_which(open_page, dataset, tmp_path):
+    size = len(make_browser_page(dataset).html)
+    smaller = make_browser_page(dataset, megabytes=0.985 * size / 1e6)
+    save_browser_page(smaller, tmp_path / "small.html")
+    page = open_page("#history=0", tmp_path / "small.html")
+    shown = page.evaluate("index.histories[0].shown.map((episode) => episode + 1)")
+    assert len(shown) < 6
+    told = (
+        f"{len(shown)} of 6 episodes can be watched, those with a mark below the curve: {', '.join(map(str, shown))}."
+    )
+    assert page.inner_text("#shown-text") == told
+    page.close()
+
+
+def test_a_damaged_page_says_so(open_page, file, tmp_path):
+    text = file.read_text()
+    at = text.index('"histories": ["') + 200
+    (tmp_path / "damaged.html").write_text(text[:at] + "AAAA" + text[at + 4 :])
+    page = open_page("", tmp_path / "damaged.html")
+    page.wait_for_function("!document.getElementById('problem').hidden")
+    assert page.inner_text("#problem").startswith("This page is damaged")
+    page.close()

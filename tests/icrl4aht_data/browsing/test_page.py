@@ -1,0 +1,266 @@
+"""The page of `icrl4aht-data browse`: what it embeds is what the reader gives, within its size, and safely written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import urllib.error
+import urllib.request
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.browsing.drawings import ShapeRecorder, layout_drawings
+from icrl4aht_data.browsing.embedding import NO_ACTION, embed_history, spread_episodes, spread_histories
+from icrl4aht_data.browsing.page import PAGE_START, make_browser_page, save_browser_page
+from icrl4aht_data.browsing.serving import page_server
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
+from icrl4aht_data.overcooked.drawing import state_parts
+from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.reading.history import History
+from icrl4aht_data.writing.convert import to_release
+from tests.helpers.browser_pages import embedded, episodes
+from tests.helpers.random_releases import random_release
+from tests.helpers.states import random_records
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory) -> Path:
+    """Two layouts with two teammates each, one with noise histories; expert and oracle labels."""
+    root = tmp_path_factory.mktemp("browse") / "release"
+    sources = ("ppo", "noise", "ppo", "noise")
+    random_release(root, oracle=True, sources=sources, episodes=8)
+    return root
+
+
+def browse(*arguments: object, code: int = 0) -> str:
+    result = CliRunner().invoke(cli, ["browse", *map(str, arguments)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def assert_embeds(page: bytes, dataset, shown: int | None = None) -> None:
+    """Check every frame of a page against the reader's arrays."""
+    index, contents = embedded(page)
+    assert [facts["history_id"] for facts in index["histories"]] == dataset.ids.tolist()
+    for facts, content, history in zip(index["histories"], contents, dataset, strict=True):
+        returns, ends = history.returns(), np.flatnonzero(history.dones[:]) + 1
+        assert facts["returns"] == returns.tolist()
+        decoded = episodes(index, facts, content)
+        assert len(decoded) == (len(ends) if shown is None else min(shown, len(ends)))
+        assert {0, len(ends) - 1} <= set(decoded)
+        names = {"state", "rewards", "actions", "teammate_actions", "expert_actions"}
+        names |= {"oracle_actions"} if history.entry.source != "noise" else set()
+        arrays = {name: history.read(name) for name in names}
+        end_states = history.read("episode_end_state")
+        for number, frames in decoded.items():
+            steps = slice(ends[number - 1] if number else 0, ends[number])
+            assert frames.keys() == names
+            for name in names:
+                np.testing.assert_array_equal(frames[name][:-1], arrays[name][steps])
+            np.testing.assert_array_equal(frames["state"][-1], end_states[number])
+            assert {int(frames[name][-1]) for name in names if name.endswith("actions")} == {NO_ACTION}
+            assert frames["rewards"].sum() == returns[number]
+
+
+def test_embedded_episodes_are_those_of_the_reader(release):
+    dataset = load_icrl4aht(release)
+    page = make_browser_page(dataset)
+    assert_embeds(page.html, dataset)
+    total = int(dataset.column("episodes").sum())
+    assert page[1:] == (len(dataset), total, total)
+
+
+def test_a_full_release_gives_the_same_page(release, tmp_path):
+    to_release(load_icrl4aht(release), tmp_path / "full", "full")
+    pages = [embedded(make_browser_page(load_icrl4aht(root)).html) for root in (release, tmp_path / "full")]
+    assert pages[0][1] == pages[1][1]
+    assert pages[0][0]["histories"] == pages[1][0]["histories"]
+
+
+def test_histories_without_labels_have_no_columns_of_labels(tmp_path):
+    random_release(tmp_path / "r", labels=False, teammates=1, streams=1)
+    index, _ = embedded(make_browser_page(load_icrl4aht(tmp_path / "r")).html)
+    assert [facts["columns"] for facts in index["histories"]] == [["rewards", "actions", "teammate_actions"]] * 2
+
+
+def test_thirty_bundled_histories_stay_below_five_megabytes():
+    bundled = load_icrl4aht()
+    chosen = bundled.select(spread_histories(bundled, 30))
+    assert len(chosen) == 30
+    assert {layout.name for layout in chosen.layouts} == {layout.name for layout in bundled.layouts}
+    assert set(chosen.counts("source")) == set(bundled.counts("source"))
+    assert set(chosen.counts("teammate_kind")) == set(bundled.counts("teammate_kind"))
+    page = make_browser_page(chosen)
+    assert len(page.html) < 5_000_000
+    assert page.shown_episodes == page.episodes == chosen.column("episodes").sum()
+    assert_embeds(page.html, chosen)
+
+
+def test_a_page_that_would_be_too_large_has_fewer_episodes_and_says_so(release):
+    dataset = load_icrl4aht(release)
+    size = len(make_browser_page(dataset).html)
+    page = make_browser_page(dataset, megabytes=0.9 * size / 1e6)
+    assert len(page.html) < 0.9 * size
+    assert page.shown_episodes < page.episodes
+    assert_embeds(page.html, dataset, shown=len(embedded(page.html)[0]["histories"][0]["shown"]))
+    with pytest.raises(OptionError, match=r"first and last episodes of 12 histories, expected less than 0\.05 MB"):
+        make_browser_page(dataset, megabytes=0.05)
+
+
+@settings(deadline=None)
+@given(st.integers(1, 5000), st.integers(1, 400))
+def test_spread_episodes(number, most):
+    chosen = spread_episodes(number, most)
+    assert {0, number - 1} <= set(chosen.tolist())
+    assert len(chosen) == min(number, max(2, most))
+    gaps = np.diff(chosen)
+    assert number == 1 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
+    assert spread_episodes(number, None).tolist() == list(range(number))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_state_can_be_drawn_from_the_page(layout):
+    records = random_records(layout, 50, np.random.default_rng(0))
+    drawings = layout_drawings(layout, records)
+    json.dumps(drawings)
+    for record in records[:5]:
+        for part, (name, moves, anchor, columns) in zip(state_parts(layout), drawings["parts"], strict=True):
+            values = record[columns].tolist()
+            recorder = ShapeRecorder()
+            part.draw(recorder, 0.0, 0.0, *values)
+            assert drawings["drawings"][name][",".join(map(str, values))] == recorder.shapes
+            assert (part.moves, part.anchor) == (moves, anchor)
+
+
+def test_the_page_is_self_contained(release):
+    html = make_browser_page(load_icrl4aht(release)).html
+    assert html.startswith(PAGE_START)
+    text = html.decode()
+    outside = text[: text.index('<script id="data"')] + text[text.index("</script>") :]
+    for address in ("http:", "https:", "src=", "@import", "url("):
+        assert address not in outside
+    assert "href=" not in outside.replace('href="data:,"', "")
+
+
+def test_names_of_a_release_are_text_on_the_page(release, tmp_path):
+    hostile = shutil.copytree(release, tmp_path / "<b>$data&amp;<script>")
+    html = make_browser_page(load_icrl4aht(hostile)).html.decode()
+    assert "<h1>Learning histories of &lt;b&gt;$data&amp;amp;&lt;script&gt;</h1>" in html
+    assert str(tmp_path) not in html
+
+
+class TestCommand:
+    def test_it_writes_a_page(self, release, tmp_path):
+        out = tmp_path / "page.html"
+        assert browse(release, "--out", out).startswith(f"{out}: 12 of 12 histories, all 96 episodes to watch, ")
+        facts = json.loads(browse(release, "--out", out, "--overwrite", "--histories", 4, "--json"))
+        assert facts == {
+            "page": str(out),
+            "address": None,
+            "histories": 4,
+            "episodes": 32,
+            "shown_episodes": 32,
+            "bytes": out.stat().st_size,
+        }
+        assert [facts["layout"] for facts in embedded(out.read_bytes())[0]["histories"]].count("demo_wide") == 2
+
+    def test_chosen_histories(self, release, tmp_path):
+        out = tmp_path / "page.html"
+        browse(release, "--out", out, "--history", 5, "--history", 2, "--history", 5, "-q")
+        assert [facts["history_id"] for facts in embedded(out.read_bytes())[0]["histories"]] == [5, 2]
+        with pytest.raises(UnknownNameError, match="99"):
+            browse(release, "--out", tmp_path / "other.html", "--history", 99)
+
+    def test_a_release_of_observations_has_nothing_to_draw(self, release, tmp_path):
+        to_release(load_icrl4aht(release), tmp_path / "obs", "observations")
+        with pytest.raises(NotStoredError, match="obs: a release of kind observations has no state records"):
+            browse(tmp_path / "obs", "--out", tmp_path / "page.html")
+        assert not (tmp_path / "page.html").exists()
+
+    def test_only_pages_are_overwritten(self, release, tmp_path):
+        out = tmp_path / "page.html"
+        out.write_text("<!doctype html>\n<html><title>mine</title>")
+        for overwrite in ((), ("--overwrite",)):
+            with pytest.raises(OptionError, match=f"{out}: (exists|is not a file as this command writes it)"):
+                browse(release, "--out", out, *overwrite)
+        assert out.read_text().endswith("<title>mine</title>")
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("--port", "0"), "--serve"),
+            (("--overwrite", "--serve"), "--out FILE"),
+            (("--out", "page.txt"), ".html"),
+            (("--out", "missing/page.html"), "missing"),
+            (("--histories", "0"), "--histories"),
+        ],
+    )
+    def test_misuse(self, release, tmp_path, monkeypatch, arguments, message):
+        monkeypatch.chdir(tmp_path)
+        assert message in browse(release, *arguments, code=2)
+        assert not list(tmp_path.iterdir())
+
+    def test_serve(self, release, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert "http://127.0.0.1:" in browse(release, "--serve")
+        assert json.loads(browse(release, "--serve", "--json"))["address"].startswith("http://127.0.0.1:")
+        assert not list(tmp_path.iterdir())
+
+
+def test_impossible_states_and_actions_are_errors(release, monkeypatch):
+    history = load_icrl4aht(release)[0]
+    read, wrong = History.read, []
+
+    def damaged(self, name, start=0, stop=None):
+        rows = read(self, name, start, stop)
+        if name in wrong:
+            rows = rows.copy()
+            rows[3] = 200
+        return rows
+
+    monkeypatch.setattr(History, "read", damaged)
+    for name, found in (("state", "a position"), ("expert_actions", "expert_actions below 6"), ("dones", "ends")):
+        wrong.append(name)
+        with pytest.raises(ReleaseError, match=f"history 0: .*{found}"):
+            embed_history(history)
+        wrong.clear()
+    assert len(embed_history(history).records) == 8 * 21
+
+
+def test_the_server_gives_the_page_to_this_machine_only():
+    with page_server(b"<p>page") as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            assert server.server_address[0] == "127.0.0.1"
+            address = f"http://127.0.0.1:{server.server_port}"
+            with urllib.request.urlopen(f"{address}/?x#history=1") as response:
+                assert response.read() == b"<p>page"
+                assert response.headers["Content-Type"] == "text/html; charset=utf-8"
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(f"{address}/other")
+            with pytest.raises(OptionError, match=f"port {server.server_port}: .*; give another one"):
+                page_server(b"", server.server_port)
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_page_appears_complete_or_not_at_all(release, tmp_path, monkeypatch):
+    page = make_browser_page(load_icrl4aht(release)[:1])
+    monkeypatch.setattr("os.fsync", lambda number: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space"):
+        save_browser_page(page, tmp_path / "page.html")
+    assert not list(tmp_path.iterdir())
