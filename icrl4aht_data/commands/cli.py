@@ -154,7 +154,7 @@ def show(
         dataset = dataset.select([history_id])
         facts = {
             **dataset[0].entry.to_json(),
-            "environment": dataset.recover_environment(history_id),
+            "environment": dataset.environment_parameters(history_id),
         }
         if dataset.knows_tasks:
             facts["teammate"] = dataset.recover_teammate(history_id)
