@@ -8,6 +8,7 @@ The environment itself is `generation.adapters.gymnasium_env.TaskEnv`, which nee
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -44,6 +45,22 @@ def register_environments() -> None:
     for name, (entry_point, arguments) in entries.items():
         if name not in registry:
             register(name, f"{_MODULE}:{entry_point}", max_episode_steps=KEPT_STEPS, kwargs=arguments)
+
+
+def environment_spec(max_steps: int, arguments: dict[str, Any]) -> gymnasium.envs.registration.EnvSpec:
+    """Return what Gymnasium and Minari need to make the environment of a task, without making it.
+
+    Args:
+        max_steps: steps of an episode.
+        arguments: arguments of `generation.adapters.gymnasium_env.TaskEnv`.
+
+    Raises:
+        ImportError: if Gymnasium is not installed.
+    """
+    import gymnasium
+
+    register_environments()
+    return replace(gymnasium.spec(TASK_ENVIRONMENT), max_episode_steps=max_steps, kwargs=arguments)
 
 
 def make_environment(**options: Any) -> gymnasium.Env:
