@@ -34,7 +34,7 @@ def test_it_has_what_the_base_class_asks_for():
         assert env.observation_space(agent).contains(obs[agent])
         assert env.action_space(agent).n == env.num_actions == len(env.get_avail_actions(state)[agent])
         assert env.action_space(agent).contains(env.action_space(agent).sample(jax.random.PRNGKey(1)))
-    assert sum(env.agent_classes.values(), []) == env.agents
+    assert env.agent_classes == {"chef": env.agents}
     assert env.name == "icrl4aht_demo_wide"
 
 
