@@ -17,6 +17,7 @@ from icrl4aht_data.errors import OptionError
 
 if TYPE_CHECKING:
     import gymnasium
+    from gymnasium.envs.registration import EnvSpec
 
 TASK_ENVIRONMENT = "icrl4aht/task-v0"
 """Gymnasium id of the environment of any task, which is its argument `task`."""
@@ -47,7 +48,7 @@ def register_environments() -> None:
             register(name, f"{_MODULE}:{entry_point}", max_episode_steps=KEPT_STEPS, kwargs=arguments)
 
 
-def environment_spec(max_steps: int, arguments: dict[str, Any]) -> gymnasium.envs.registration.EnvSpec:
+def environment_spec(max_steps: int, arguments: dict[str, Any]) -> EnvSpec:
     """Return what Gymnasium and Minari need to make the environment of a task, without making it.
 
     Args:

@@ -81,7 +81,7 @@ class JaxMARLEnv(MultiAgentEnv):
         state = JaxMARLState(data, jnp.int32(0), jnp.bool_(False), record)
         return self.get_obs(state), state
 
-    def step_env(
+    def step_env(  # type: ignore[override]
         self, key: Key[Array, ""] | UInt32[Array, " 2"], state: JaxMARLState, actions: dict[str, Int[Array, ""]]
     ) -> tuple[
         dict[str, UInt8[Array, "5 5 C"]],
@@ -107,14 +107,18 @@ class JaxMARLEnv(MultiAgentEnv):
         after = state.replace(step=state.step + 1, done=ended, record=outcome.state[0])  # type: ignore[attr-defined]
         shaped = dict(zip(self.agents, outcome.shaped[0], strict=True))
         dones = dict.fromkeys((*self.agents, "__all__"), ended)
-        rewards = dict.fromkeys(self.agents, outcome.reward[0])
+        rewards: dict[str, Any] = dict.fromkeys(self.agents, outcome.reward[0])
         return self.get_obs(after), after, rewards, dones, {"shaped_reward": shaped}
 
-    def get_obs(self, state: JaxMARLState) -> dict[str, UInt8[Array, "5 5 C"]]:
+    def get_obs(  # type: ignore[override]
+        self, state: JaxMARLState
+    ) -> dict[str, UInt8[Array, "5 5 C"]]:
         """Returns the observation of each agent."""
         return dict(zip(self.agents, observe_both(self.layout, state.record, self._canonical), strict=True))
 
-    def get_avail_actions(self, state: JaxMARLState) -> dict[str, Bool[Array, " 6"]]:
+    def get_avail_actions(  # type: ignore[override]
+        self, state: JaxMARLState
+    ) -> dict[str, Bool[Array, " 6"]]:
         """Returns for each agent that every action is available."""
         return dict.fromkeys(self.agents, jnp.ones(len(ACTIONS), bool))
 
