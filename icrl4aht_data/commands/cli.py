@@ -290,7 +290,7 @@ def _verdict(report: Report) -> str:
     epilog=examples(
         "icrl4aht-data convert path/to/release --to full --layout coord_simple --out full",
         "icrl4aht-data convert path/to/published --out lite",
-        "icrl4aht-data convert --layout demo_wide --to minari --out demo_wide-v0",
+        "icrl4aht-data convert path/to/release --layout demo_wide --to minari --out demo_wide-v0",
     )
 )
 @click.argument("root", type=Root(), metavar="SOURCE")

@@ -71,7 +71,7 @@ def test_back_to_a_release(two_sources, kind, tmp_path):
 
 
 def test_a_dataset_of_one_task_has_its_environment(tmp_path):
-    """Its spec is the environment that recovers from the release; making it is tested where it is."""
+    """Minari recovers the environment that the release recovers."""
     release = load_icrl4aht(MINI, layout="demo_wide", source="noise", teammate_family="H3")
     part = release.filter(task_id=release.entries[0].task_id)[:1]
     to_minari(part, tmp_path / "one-v0")
