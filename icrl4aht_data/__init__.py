@@ -8,6 +8,7 @@ from icrl4aht_data.benchmark.facts import FAMILIES, SOURCES, SPLITS, TRACKS
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.environments import register_environments
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
@@ -43,3 +44,5 @@ __all__ = [
     "load_icrl4aht",
     "verify_release",
 ]
+
+register_environments()

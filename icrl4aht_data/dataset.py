@@ -6,16 +6,20 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.errors import NotStoredError, unknown
+from icrl4aht_data.environments import make_environment
+from icrl4aht_data.errors import NotStoredError, OptionError, unknown
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import INFO, TASKS
+from icrl4aht_data.format.schema import INFO, TASKS, TEAMMATES
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
@@ -26,6 +30,10 @@ from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.validation import check_int
+
+if TYPE_CHECKING:
+    import gymnasium
 
 MINI = Path(__file__).parent / "mini"
 """Path of the bundled mini release."""
@@ -125,7 +133,73 @@ class Dataset(Selection):
     def _tasks(self) -> dict[str, Task]:
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
-    def recover_environment(self, history_id: int) -> dict[str, Any]:
+    def recover_environment(self, history_id: int, **options: Any) -> gymnasium.Env:
+        """Return the Gymnasium environment of a history: the ego's side of its task, with the teammate inside.
+
+        Episodes have as many steps as when the history was made, of which the release keeps the first ones: 400 and 100
+        in the benchmark. `reset(options=dataset.reset_options(history_id, episode))` starts it as a recorded episode.
+
+        Args:
+            history_id: a history of the release, whether selected or not.
+            options: options of `gymnasium.make`, such as `max_episode_steps` or `render_mode`, and of
+                `generation.adapters.gymnasium_env.TaskEnv`. Channels are those of the dataset by default.
+
+        Raises:
+            NotStoredError: if the release was made without its tasks.
+            OptionError: if Gymnasium or JAX is not installed, or if the release does not have the checkpoint of a
+                learned teammate.
+        """
+        teammate = self.recover_teammate(history_id)
+        task = self.history_task(history_id)
+        known: dict[str, Any] = {
+            "task": asdict(task),
+            "noise": teammate.get("noise", "seeded"),
+            "channels": self.channels,
+            "max_episode_steps": self.info.environment.max_steps,
+        }
+        if task.teammate["kind"] == "rl":
+            name = f"{TEAMMATES}/{task.teammate['theta']['sha256']}"
+            if not self.origin.below(name).is_dir():
+                raise OptionError(
+                    f"{self.root / name}: missing, the checkpoint of the teammate of history {history_id}: this "
+                    f"release was made without it; copy it from the release that it was made of"
+                )
+            known["suite"] = str(self.root / TEAMMATES)
+        return make_environment(**known | options)
+
+    def reset_options(self, history_id: int, episode: int = 0) -> dict[str, np.ndarray]:
+        """Return the options of `reset` that start a recovered environment as a recorded episode.
+
+        The environment then starts at the recorded state, its teammate repeats the recorded actions and a delivery is
+        followed by the recorded recipe. So the ego's recorded actions lead to the recorded states, observations and
+        rewards, also where the keys that the episode was drawn from are not known. After the recorded steps, the
+        teammate's policy acts.
+
+        Args:
+            history_id: a history of the release, whether selected or not.
+            episode: number of the episode in the history, from 0.
+
+        Returns:
+            `state` uint8 (S,), `teammate_actions` int8 (n,) and `recipes` uint8 (n,), for the episode's n kept steps.
+
+        Raises:
+            NotStoredError: for a release of observations.
+            LabelsMissingError: for a history without teammate actions.
+            OptionError: for an episode that the history does not have.
+        """
+        history = self.history(history_id)
+        if check_int("episode", episode, 0) >= history.entry.episodes:
+            raise OptionError(f"episode = {episode}: history {history_id} has episodes 0..{history.entry.episodes - 1}")
+        steps = self.info.environment.kept_steps
+        states = history.read("state", episode * steps, (episode + 1) * steps)
+        after = np.concatenate([states[1:], history.read("episode_end_state", episode, episode + 1)])
+        return {
+            "state": states[0],
+            "teammate_actions": history.read("teammate_actions", episode * steps, (episode + 1) * steps),
+            "recipes": after[:, columns(get_layout(history.entry.layout)).recipe],
+        }
+
+    def environment_parameters(self, history_id: int) -> dict[str, Any]:
         """Return the parameters that rebuild the environment of a history: layout names, map, recipes, episode lengths.
 
         Args:
@@ -154,6 +228,19 @@ class Dataset(Selection):
         Raises:
             NotStoredError: if the release was made without its tasks.
         """
+        task = self.history_task(history_id)
+        provenance = self.provenance.get(task.task_id, Provenance())
+        return task.teammate | (provenance.teammate or {})
+
+    def history_task(self, history_id: int) -> Task:
+        """Return the task of a history.
+
+        Args:
+            history_id: a history of the release, whether selected or not.
+
+        Raises:
+            NotStoredError: if the release was made without its tasks.
+        """
         entry = self.index.entry(history_id)
         if not self.knows_tasks:
             raise NotStoredError(
@@ -162,8 +249,7 @@ class Dataset(Selection):
             )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        provenance = self.provenance.get(entry.task_id, Provenance())
-        return self._tasks[entry.task_id].teammate | (provenance.teammate or {})
+        return self._tasks[entry.task_id]
 
     def ad(
         self,

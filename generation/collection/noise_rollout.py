@@ -102,19 +102,35 @@ def play_noisy_episodes(
     return play(teammate.params, _keys(seed)[1], history.astype(np.int32), episode.astype(np.int32), chance)
 
 
+def noisy_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
+    """Returns the keys of the environments in which some episodes of a task are played, each its first episode.
+
+    Args:
+        seed: the task's seed.
+        history: int (M,), number of each episode's history.
+        episode: int (M,), its number in the history.
+    """
+    return _episode_keys(_keys(seed)[1], history.astype(np.int32), episode.astype(np.int32))
+
+
 def _keys(seed: int) -> Key[Array, " 2"]:
     """Keys of a task: of its schedules, and of its episodes."""
     return jax.random.split(jax.random.key(seed))
 
 
+def _episode_keys(key: Key[Array, ""], history: Any, episode: Any) -> Key[Array, " M"]:
+    fold = jax.vmap(jax.random.fold_in)
+    return fold(fold(jnp.broadcast_to(key, len(history)), history), episode)
+
+
 @lru_cache(maxsize=8)
 def _compiled(layout: Layout, teammate: Policy) -> Callable[..., NoisyEpisodes]:
-    env, fold = Environment(layout), jax.vmap(jax.random.fold_in)
+    env = Environment(layout)
 
     @jax.jit
     def play(params, key: Key[Array, ""], history, episode, chance) -> NoisyEpisodes:
         m = len(history)
-        keys = fold(fold(jnp.broadcast_to(key, m), history), episode)
+        keys = _episode_keys(key, history, episode)
         players = [_noisy_oracle(env, chance), policy_player(env, teammate, params, TEAMMATE, m)]
         # The roll-out's own key is not used: heuristics have keys of their own, and learned teammates act greedily.
         carry, rollout = roll_out(env, players, init_rollout(env, players, keys), KEPT_STEPS, key)

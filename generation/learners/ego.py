@@ -88,9 +88,9 @@ class Learner:
 
     def init(self, key: Key[Array, ""]) -> LearnerState:
         """Returns the state of an untrained ego before the first step."""
-        params_key, env_key, running_key = jax.random.split(key, 3)
+        params_key, _, running_key = jax.random.split(key, 3)
         params = self.network.untrained(params_key, self.env.layout.channels)
-        env_keys = jax.random.split(env_key, self.config.environments)
+        env_keys = stream_keys(key, self.config.environments)
         carry = init_rollout(self.env, self.players(params, self.teammate.params), env_keys)
         optimizer = ppo_optimizer(self.config).init(params)
         return LearnerState(params, optimizer, carry, self.teammate.params, running_key, jnp.int32(0))
@@ -123,6 +123,11 @@ class Learner:
         n = self.config.environments
         ego = network_player(self.env, self.network, params, np.arange(n), jnp.zeros(n, jnp.int32))
         return ego, policy_player(self.env, self.teammate, teammate_params, TEAMMATE, n)
+
+
+def stream_keys(key: Key[Array, ""], environments: int) -> Key[Array, " N"]:
+    """Returns the keys of a learner's N environments, given the key of its `Learner.init`."""
+    return jax.random.split(jax.random.split(key, 3)[1], environments)
 
 
 def compiled_update(learner: Learner) -> Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str, Array]]]:

@@ -149,7 +149,7 @@ def read_tasks(path: Path) -> list[Task]:
     tasks: dict[str, Task] = {}
     for number, line in enumerate(read_lines(path), start=1):
         try:
-            task = _parse(line)
+            task = parse_task(parse_json(line))
             if task.task_id in tasks:
                 raise TaskFormatError(f"duplicate task_id {task.task_id!r}")
         except Icrl4ahtError as error:
@@ -163,8 +163,13 @@ def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
     path.write_text("".join(json.dumps(asdict(task)) + "\n" for task in tasks), encoding="utf-8")
 
 
-def _parse(line: str) -> Task:
-    fields = parse_json(line)
+def parse_task(fields: Any) -> Task:
+    """Return the task of the fields of a manifest's line; `dataclasses.asdict` makes them of a task.
+
+    Raises:
+        TaskFormatError: for fields that are missing, unknown or of impossible content.
+        UnknownNameError: for names that the benchmark does not know.
+    """
     if not isinstance(fields, dict) or fields.keys() != _FIELDS.keys():
         found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
         raise TaskFormatError(f"expected the fields {sorted(_FIELDS)}, found {found}")

@@ -40,7 +40,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import ALL_KINDS, FORMAT_VERSION, OBSERVATIONS
+from icrl4aht_data.format.schema import ALL_KINDS, FORMAT_VERSION, KINDS, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
@@ -49,11 +49,14 @@ from icrl4aht_data.remote.download import repair as repair_files
 from icrl4aht_data.utils.new_file import check_new_file
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.minari import from_minari, is_minari_dataset, to_minari
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.published_index import parse_family_map
 from icrl4aht_data.writing.release_folder import HISTORIES_H5
 from icrl4aht_data.writing.statistics import print_statistics
+
+_FORMS = (*ALL_KINDS, "published", "parquet", "minari")
 
 _root = click.argument("root", required=False, type=Root())
 
@@ -151,7 +154,7 @@ def show(
         dataset = dataset.select([history_id])
         facts = {
             **dataset[0].entry.to_json(),
-            "environment": dataset.recover_environment(history_id),
+            "environment": dataset.environment_parameters(history_id),
         }
         if dataset.knows_tasks:
             facts["teammate"] = dataset.recover_teammate(history_id)
@@ -287,6 +290,7 @@ def _verdict(report: Report) -> str:
     epilog=examples(
         "icrl4aht-data convert path/to/release --to full --layout coord_simple --out full",
         "icrl4aht-data convert path/to/published --out lite",
+        "icrl4aht-data convert path/to/release --layout demo_wide --to minari --out demo_wide-v0",
     )
 )
 @click.argument("root", type=Root(), metavar="SOURCE")
@@ -296,10 +300,12 @@ def _verdict(report: Report) -> str:
     type=click.Path(path_type=Path),
     metavar="PATH",
     required=True,
-    help="Write the release, the folder of published files or the Parquet file here.",
+    help="Write the release, the folder of published files, the Minari dataset or the Parquet file here.",
 )
 @overwrite_option
-@click.option("--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet"]), help="The form to convert to.")
+@click.option(
+    "--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet", "minari"]), help="The form to convert to."
+)
 @click.option(
     "--tasks",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
@@ -322,12 +328,14 @@ def convert(
     quiet: bool,
     **filters: tuple[str, ...],
 ) -> None:
-    """Convert a release, or published files.
+    """Convert a release, published files, or a Minari dataset.
 
-    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. Writes a release
-    folder (full, lite, observations), a folder with the published code's two files (published), or a Parquet file with
-    the index (parquet). Published files become lite by default, or observations where they have no state records; a
-    release of an older format version keeps its kind by default, and becomes one of the current version.
+    SOURCE is a release, a folder with the published code's histories.h5 and histories_index.jsonl, or a Minari dataset
+    that this command wrote. Writes a release folder (full, lite, observations), a folder with the published code's two
+    files (published), a Minari dataset (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens,
+    or a Parquet file with the index (parquet). A Minari dataset becomes lite by default, published files lite or, where
+    they have no state records, observations; a release of an older format version keeps its kind by default, and
+    becomes one of the current version.
     """
     with bars(quiet) as show:
         advance = partial(show, "histories")
@@ -345,12 +353,18 @@ def convert(
                 overwrite=overwrite,
                 advance=advance,
             )
+        elif isinstance(root, Path) and is_minari_dataset(root):
+            if form not in (None, *KINDS) or tasks or family_map or kept_steps != KEPT_STEPS or any(filters.values()):
+                raise click.UsageError("a Minari dataset converts to full or lite, without other options")
+            form = from_minari(root, target, form, overwrite=overwrite, advance=advance)
         else:
             dataset = _load(root, filters)
             if form is None and dataset.info.format_version < FORMAT_VERSION:
                 form = dataset.info.kind
             if form is None:
-                raise click.UsageError("give the form to convert to: --to full, lite, observations, published, parquet")
+                raise click.UsageError(
+                    "give the form to convert to: --to full, lite, observations, published, minari, parquet"
+                )
             if tasks or family_map or kept_steps != KEPT_STEPS:
                 raise click.UsageError(
                     f"{root} is a release: --tasks, --family-map and --kept-steps are for published files"
@@ -359,6 +373,8 @@ def convert(
                 to_release(dataset, target, form, overwrite=overwrite, advance=advance)
             elif form == "published":
                 to_published(dataset, target, overwrite=overwrite, advance=advance)
+            elif form == "minari":
+                to_minari(dataset, target, overwrite=overwrite, advance=advance)
             else:
                 to_parquet(dataset, target, overwrite=overwrite)
     limit = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""

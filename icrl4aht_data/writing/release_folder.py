@@ -29,6 +29,12 @@ HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
 PUBLISHED_FILES = (HISTORIES_H5, HISTORIES_INDEX, "tasks.jsonl", "provenance.json")
 """Files that a conversion to the published format writes."""
 
+MINARI_FILES = ("data/main_data.hdf5", "data/metadata.json")
+"""Files of a Minari dataset."""
+
+CONVERTED_FILES = (*PUBLISHED_FILES, *MINARI_FILES)
+"""Files that conversions write to folders that are not releases."""
+
 LISTING = "files.sha256"
 """Their hashes, in sha256sum's format."""
 
@@ -127,8 +133,8 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
 
 
 def write_listing(folder: Path) -> None:
-    """Write the hashes of converted published files next to them."""
-    names = [name for name in PUBLISHED_FILES if (folder / name).is_file()]
+    """Write the hashes of converted files, published or Minari's, next to them."""
+    names = [name for name in CONVERTED_FILES if (folder / name).is_file()]
     (folder / LISTING).write_text("".join(f"{file_hash(folder / name)}  {name}\n" for name in names), encoding="utf-8")
 
 
@@ -139,8 +145,8 @@ def _read_listing(folder: Path) -> dict[str, str]:
         IndexFormatError: if there is no such file, or if it has another form.
     """
     lines = [line.split("  ", 1) for line in read_text(resolve_inside(folder, LISTING)).splitlines()]
-    if not all(len(line) == 2 and line[1] in PUBLISHED_FILES for line in lines):
-        raise IndexFormatError(f"{folder / LISTING}: expected hashes of {', '.join(PUBLISHED_FILES)}")
+    if not all(len(line) == 2 and line[1] in CONVERTED_FILES for line in lines):
+        raise IndexFormatError(f"{folder / LISTING}: expected hashes of {', '.join(CONVERTED_FILES)}")
     return {name: digest for digest, name in lines}
 
 
@@ -158,7 +164,7 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 def _was_left_by_a_writer(folder: Path) -> bool:
     """Return whether nothing is there, or a folder with files as this package writes them only."""
-    own = {*PUBLISHED_FILES, LISTING, MANIFEST}
+    own = {*CONVERTED_FILES, LISTING, MANIFEST}
     if not os.path.lexists(folder):
         return True
     if folder.is_symlink() or not folder.is_dir():
@@ -182,7 +188,8 @@ def _foreign_content(folder: Path, present: Iterable[str]) -> str | None:
         own, listed = (MANIFEST, read_manifest(folder)) if MANIFEST in present else (LISTING, _read_listing(folder))
     except Icrl4ahtError as error:
         return f"is not a release: {error}"
-    if not {INFO, HISTORIES} <= listed.keys() and not {HISTORIES_H5, HISTORIES_INDEX} <= listed.keys():
+    kinds = ({INFO, HISTORIES}, {HISTORIES_H5, HISTORIES_INDEX}, set(MINARI_FILES))
+    if not any(files <= listed.keys() for files in kinds):
         return f"is not a release: its {own} does not list {INFO}"
     for name in sorted(set(present) - {own}):
         if name not in listed:

@@ -40,7 +40,7 @@ from tests.packaging.test_readme import PROGRAMS, blocks, commands, understand
 
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))}
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES)
-COMPILING = ("extending", "protocol")
+COMPILING = ("adapters", "extending", "protocol")
 """Pages whose snippets compile environments and models."""
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -75,6 +75,7 @@ def rows(page: str, heading: str) -> list[list[str]]:
 @mock.patch.dict(METHODS)
 def test_snippets(page, tmp_path, monkeypatch):
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))  # a page sets it
     monkeypatch.setattr(MemoryFileSystem, "store", {})
     assert run_snippets(page, tmp_path)
 

@@ -20,10 +20,10 @@ from tests.helpers.paths import ROOT
 
 ORDER = {
     "": "icrl4aht_data generation baselines benchmarks tests",
-    "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling dataset interop plotting "
-    "writing checking publishing browsing commands",
-    "generation": "progress plotting env policy paths learners experts teammates profiles collection populations "
-    "releases planning cli",
+    "icrl4aht_data": "errors utils overcooked benchmark format remote reading sampling environments dataset interop "
+    "plotting writing checking publishing browsing commands",
+    "generation": "progress plotting env policy paths learners experts teammates profiles collection adapters "
+    "populations releases planning cli",
     "baselines": "plotting methods training agents evaluate online control report experiments reference demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""

@@ -137,9 +137,9 @@ def test_observations_as_the_option_says(lite_or_full, obs):
     np.testing.assert_array_equal(np.asarray(lazy), expected)
 
 
-def test_recover_environment_and_teammate(lite):
+def test_environment_parameters_and_teammate(lite):
     dataset = load_icrl4aht(lite[0])
-    environment = dataset.recover_environment(8)
+    environment = dataset.environment_parameters(8)
     assert environment["environment_name"] == "demo_cook_wide"
     assert environment["recipes"] == [[0, 0, 0], [1, 1, 1]]
     assert (environment["max_steps"], environment["kept_steps"]) == (400, 20)

@@ -216,7 +216,7 @@ class TestTasks:
             NotStoredError, match=r"tasks\.jsonl: empty: .* family rl and kind some_variant; .* --tasks"
         ):
             dataset.recover_teammate(0)
-        assert dataset.recover_environment(0)["layout"] == "demo_wide"
+        assert dataset.environment_parameters(0)["layout"] == "demo_wide"
         assert len(load_icrl4aht(converted_release, teammate_family="H2", task_id="task_c")) == 1
 
     def test_with_tasks_they_are_known(self, lite, reconverted_release):

@@ -107,7 +107,7 @@ def read(root: Path) -> None:
         for name in FIELDS:
             history.read(name)
         history.returns()
-        dataset.recover_environment(history.entry.history_id)
+        dataset.environment_parameters(history.entry.history_id)
         dataset.recover_teammate(history.entry.history_id)
 
 

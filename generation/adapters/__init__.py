@@ -1,0 +1,1 @@
+"""The environment for other libraries: Gymnasium, PettingZoo and JaxMARL."""

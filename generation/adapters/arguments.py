@@ -1,0 +1,70 @@
+"""Checks of what callers give to the environments of other libraries."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsIndex
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import faults, record_size
+from icrl4aht_data.utils.validation import check_int
+
+
+def check_action(name: str, action: SupportsIndex) -> int:
+    """Return an action as an int.
+
+    Args:
+        name: name of the argument, for the message.
+        action: 0..5.
+
+    Raises:
+        OptionError: for an action that does not exist.
+    """
+    number = check_int(name, action, 0)
+    if number >= len(ACTIONS):
+        raise OptionError(f"{name}: expected 0..{len(ACTIONS) - 1} ({', '.join(ACTIONS)}), found {number}")
+    return number
+
+
+def check_record(layout: Layout, state: Any) -> np.ndarray:
+    """Return a state record of a layout as uint8 (S,).
+
+    Raises:
+        OptionError: for another shape, or values that the layout's states do not have.
+    """
+    record = check_integers("state", state, np.uint8, 255, (record_size(layout),))
+    if wrong := faults(layout, record[None]):
+        raise OptionError(f"state: expected a state record of {layout.name}, found {wrong[0]}")
+    return record
+
+
+def check_integers(
+    name: str, value: Any, dtype: DTypeLike, highest: int, shape: tuple[int, ...] | None = None
+) -> np.ndarray:
+    """Return an array of integers in another dtype.
+
+    Args:
+        name: name of the argument, for the message.
+        value: integers in 0..highest.
+        dtype: dtype of the result.
+        highest: the largest valid integer.
+        shape: the valid shape; any with one axis by default.
+
+    Raises:
+        OptionError: for anything else.
+    """
+    found = np.asarray(value)
+    fits = found.ndim == 1 if shape is None else found.shape == shape
+    numeric = found.dtype.kind in "iu" and found.size > 0
+    if not fits or not (numeric or found.size == 0) or (numeric and not 0 <= found.min() <= found.max() <= highest):
+        values = f" and values {found.min()}..{found.max()}" if numeric else ""
+        wanted = "(n,)" if shape is None else shape
+        raise OptionError(
+            f"{name}: expected integers in 0..{highest} of shape {wanted}, found {found.dtype} of shape "
+            f"{found.shape}{values}"
+        )
+    return found.astype(dtype)

@@ -1,0 +1,84 @@
+"""Gymnasium ids of the benchmark's tasks.
+
+`gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")` makes the environment of a published test task, and
+`gymnasium.make("icrl4aht/task-v0", task=...)` that of any other task. `import icrl4aht_data` registers the ids, since
+Gymnasium loads no plugins since version 1.0; `gymnasium.make("icrl4aht_data:icrl4aht/demo_wide-H4-t0-v0")` imports it.
+The environment itself is `generation.adapters.gymnasium_env.TaskEnv`, which needs JAX.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.errors import OptionError
+
+if TYPE_CHECKING:
+    import gymnasium
+    from gymnasium.envs.registration import EnvSpec
+
+TASK_ENVIRONMENT = "icrl4aht/task-v0"
+"""Gymnasium id of the environment of any task, which is its argument `task`."""
+
+_MODULE = "generation.adapters.gymnasium_env"
+_TRACKS = ("teammate", "layout")
+
+
+def register_environments() -> None:
+    """Register the Gymnasium ids: `TASK_ENVIRONMENT`, and one for each of the 160 published test tasks.
+
+    The id of a test task is `icrl4aht/<layout>-<family>-t<number>-v0`, such as icrl4aht/demo_wide-H4-t0-v0. Episodes
+    have 100 steps, as in the evaluation, unless `gymnasium.make` is given another `max_episode_steps`. Ids that are
+    registered stay as they are; without Gymnasium nothing is done.
+    """
+    try:
+        from gymnasium.envs.registration import register, registry
+    except ImportError:
+        return
+
+    entries: dict[str, tuple[str, dict[str, Any]]] = {TASK_ENVIRONMENT: ("TaskEnv", {})}
+    for task in (task for track in _TRACKS for task in read_tasks(manifest_path(track, "test"))):
+        teammate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
+        name = f"icrl4aht/{task.layout.name}-{teammate.replace('/', '-')}-v0"
+        entries[name] = ("published_environment", {"layout": task.layout.name, "teammate": teammate})
+    for name, (entry_point, arguments) in entries.items():
+        if name not in registry:
+            register(name, f"{_MODULE}:{entry_point}", max_episode_steps=KEPT_STEPS, kwargs=arguments)
+
+
+def environment_spec(max_steps: int, arguments: dict[str, Any]) -> EnvSpec:
+    """Return what Gymnasium and Minari need to make the environment of a task, without making it.
+
+    Args:
+        max_steps: steps of an episode.
+        arguments: arguments of `generation.adapters.gymnasium_env.TaskEnv`.
+
+    Raises:
+        ImportError: if Gymnasium is not installed.
+    """
+    import gymnasium
+
+    register_environments()
+    return replace(gymnasium.spec(TASK_ENVIRONMENT), max_episode_steps=max_steps, kwargs=arguments)
+
+
+def make_environment(**options: Any) -> gymnasium.Env:
+    """Return the Gymnasium environment of a task.
+
+    Args:
+        options: options of `gymnasium.make` and of `generation.adapters.gymnasium_env.TaskEnv`, among them `task`.
+
+    Raises:
+        OptionError: if Gymnasium, JAX or the package `generation` is not installed.
+    """
+    try:
+        import gymnasium
+
+        register_environments()
+        return gymnasium.make(TASK_ENVIRONMENT, **options)
+    except ImportError as error:
+        raise OptionError(
+            f"an environment needs {error.name or error}: pip install 'icrl4aht-data[gym]', in a checkout"
+        ) from error

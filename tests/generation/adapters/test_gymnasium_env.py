@@ -1,0 +1,236 @@
+"""Tasks as Gymnasium environments: the library's own checker, registered ids, and replays of recorded histories."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import asdict
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from generation.adapters.draws import recorded_draws
+from generation.adapters.gymnasium_env import TaskEnv, published_environment
+from generation.teammates.instances import published_task, published_tasks
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.environments import TASK_ENVIRONMENT, make_environment
+from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.overcooked.state import record_size
+from tests.helpers.paths import ROOT
+
+NAME = "icrl4aht/demo_wide-H4-t0-v0"
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
+@pytest.fixture(scope="module")
+def env():
+    return gymnasium.make(NAME)
+
+
+# Gymnasium's advice for images, which observations of 5x5 cells are not.
+@pytest.mark.filterwarnings("ignore:.*resize")
+@pytest.mark.parametrize("channels", ["own", "canonical"])
+def test_check_env(channels):
+    check_env(gymnasium.make(NAME, channels=channels, render_mode="rgb_array").unwrapped)
+
+
+def test_every_published_test_task_has_an_id():
+    ids = {name for name in gymnasium.registry if name.startswith("icrl4aht/")} - {TASK_ENVIRONMENT}
+    tasks = {task.task_id for track in ("teammate", "layout") for task in published_tasks(track)}
+    arguments = [gymnasium.spec(name).kwargs for name in ids]
+    assert {published_task(**these).task_id for these in arguments} == tasks
+    assert len(ids) == len(tasks) == 160
+
+
+def test_an_unregistered_id_is_an_error_with_the_nearest():
+    with pytest.raises(gymnasium.error.NameNotFound, match="Did you mean: `demo_wide-H4-t"):
+        gymnasium.make("icrl4aht/demo_wide-H4-t9-v0")
+
+
+@pytest.mark.parametrize("imports", ["gymnasium, icrl4aht_data", "gymnasium"], ids=["imported", "by its prefix"])
+def test_importing_the_package_registers_the_ids(imports):
+    name = NAME if "icrl4aht_data" in imports else f"icrl4aht_data:{NAME}"
+    code = f"import {imports}; print(gymnasium.make({name!r}).spec.id)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == NAME
+
+
+def test_episodes_are_functions_of_the_seed(env):
+    def play(seed: int) -> list[np.ndarray]:
+        _, info = env.reset(seed=seed)
+        seen = [info["state"]]
+        steps = [env.step(action) for action in np.random.default_rng(0).integers(0, 6, 100)]
+        assert [truncated for *_, truncated, _ in steps] == [False] * 99 + [True]
+        seen += [info["state"] for *_, info in steps]
+        return seen
+
+    first = play(1)
+    np.testing.assert_array_equal(first, play(1))
+    assert not np.array_equal(first, play(2))
+    # The next episode without a seed is another one.
+    assert not np.array_equal(first[0], env.reset()[1]["state"])
+
+
+def bundled(**filters) -> tuple:
+    dataset = load_icrl4aht(obs="uint8", **filters)
+    return dataset, dataset[0]
+
+
+def play_recorded(env, history, start: int, steps: int) -> tuple[list, list, list, list]:
+    """Observations, states, rewards and the teammate's actions that a history's actions lead to."""
+    observations, states, rewards, teammate = [], [], [], []
+    for action in history.actions[start : start + steps]:
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert not terminated and not truncated
+        observations.append(observation)
+        states.append(info["state"])
+        rewards.append(reward)
+        teammate.append(info["teammate_action"])
+    return observations, states, rewards, teammate
+
+
+@pytest.mark.parametrize(
+    "filters",
+    [
+        {"layout": "demo_wide", "source": "noise"},
+        {"layout": "asymm_both", "source": "ppo"},
+        {"layout": "demo_wide", "teammate_family": "rl"},
+    ],
+    ids=str,
+)
+def test_recorded_actions_lead_to_the_recorded_history(filters):
+    dataset, history = bundled(**filters)
+    recovered = dataset.recover_environment(history.entry.history_id)
+    assert recovered.spec.max_episode_steps == 400
+    returns = history.returns()
+    for episode in {0, int(returns.argmax()), len(returns) - 1}:
+        first = 100 * episode
+        observation, info = recovered.reset(options=dataset.reset_options(history.entry.history_id, episode))
+        observations, states, rewards, teammate = play_recorded(recovered, history, first, 100)
+        np.testing.assert_array_equal([observation, *observations[:-1]], history.obs[first : first + 100])
+        np.testing.assert_array_equal([info["state"], *states[:-1]], history.state[first : first + 100])
+        np.testing.assert_array_equal(states[-1], history.episode_end_state[episode])
+        np.testing.assert_array_equal(rewards, history.rewards[first : first + 100])
+        np.testing.assert_array_equal(teammate, history.teammate_actions[first : first + 100])
+    assert returns.max() > 0
+
+
+@pytest.mark.parametrize("source", ["ppo", "noise"])
+def test_heuristics_repeat_what_they_drew(source):
+    """With the keys of a recorded episode, the teammate's policy plays as recorded without a script."""
+    dataset, history = bundled(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
+    recovered = dataset.recover_environment(history.entry.history_id)
+    for episode in (0, int(history.returns().argmax())):
+        _, info = recovered.reset(options=recorded_draws(dataset, history.entry.history_id, episode))
+        first = 100 * episode
+        _, states, rewards, teammate = play_recorded(recovered, history, first, 100)
+        np.testing.assert_array_equal([info["state"], *states[:-1]], history.state[first : first + 100])
+        np.testing.assert_array_equal(rewards, history.rewards[first : first + 100])
+        np.testing.assert_array_equal(teammate, history.teammate_actions[first : first + 100])
+
+
+def test_the_policy_acts_after_the_recorded_steps():
+    dataset, history = bundled(layout="demo_wide", source="noise")
+    recovered = dataset.recover_environment(history.entry.history_id)
+    number = history.entry.history_id
+    scripted = {name: array[:50] for name, array in dataset.reset_options(number).items() if name != "state"}
+    recovered.reset(options=recorded_draws(dataset, number) | scripted | {"teammate_actions": np.full(50, 4)})
+    *_, teammate = play_recorded(recovered, history, 0, 100)
+    assert teammate[:50] == [4] * 50
+    assert set(teammate[50:]) - {4}
+
+
+def test_episodes_of_other_code_have_no_known_keys(lite):
+    dataset = load_icrl4aht(lite[0])
+    with pytest.raises(NotStoredError, match=r"take dataset\.reset_options"):
+        recorded_draws(dataset, 0)
+
+
+def test_a_start_state_alone_keeps_the_draws_free():
+    dataset, history = bundled(layout="demo_wide", source="noise")
+    recovered = dataset.recover_environment(history.entry.history_id)
+    for seed in (1, 2):
+        observation, info = recovered.reset(seed=seed, options={"state": history.state[0]})
+        np.testing.assert_array_equal(observation, history.obs[0])
+        np.testing.assert_array_equal(info["state"], history.state[0])
+
+
+def test_recovered_environments_take_options():
+    dataset, history = bundled(layout="demo_wide", source="noise", channels="canonical")
+    recovered = dataset.recover_environment(history.entry.history_id, max_episode_steps=3, render_mode="rgb_array")
+    assert recovered.observation_space.shape == (5, 5, 46)
+    np.testing.assert_array_equal(recovered.reset(options={"state": history.state[0]})[0], history.obs[0])
+    assert [recovered.step(4)[3] for _ in range(3)] == [False, False, True]
+    assert recovered.render().ndim == 3
+
+
+def test_an_environment_without_its_checkpoint_is_an_error(tmp_path):
+    dataset, history = bundled(layout="demo_wide", teammate_family="rl")
+    with pytest.raises(OptionError):
+        dataset.recover_environment(history.entry.history_id, suite=str(tmp_path))
+
+
+def test_a_release_without_tasks_has_no_environments(converted_release):
+    with pytest.raises(NotStoredError, match="convert again with --tasks"):
+        load_icrl4aht(converted_release).recover_environment(0)
+
+
+def test_episodes_that_do_not_exist_are_errors():
+    dataset, history = bundled(layout="demo_wide", source="noise")
+    with pytest.raises(OptionError, match=r"episode = 60: history \d+ has episodes 0\.\.59"):
+        dataset.reset_options(history.entry.history_id, 60)
+    with pytest.raises(OptionError, match="episode = -1"):
+        dataset.reset_options(history.entry.history_id, -1)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"stat": 0}, UnknownNameError, "Did you mean 'state'"),
+        (
+            {"state": np.zeros(3, np.uint8)},
+            OptionError,
+            r"state: expected integers in 0\.\.255 of shape \(\d+,\)",
+        ),
+        ({"state": np.zeros(99, float)}, OptionError, "found float64"),
+        ({"state": "zeros"}, OptionError, "state: expected a state record of demo_wide, found a position that is not"),
+        ({"key": [1, 2, 3]}, OptionError, r"key: .* of shape \(2,\)"),
+        ({"episode": -1}, OptionError, "episode = -1"),
+        ({"teammate_actions": [0, 6]}, OptionError, r"teammate_actions: expected integers in 0\.\.5 .* values 0\.\.6"),
+        ({"recipes": [1]}, OptionError, "recipes: expected items of demo_wide's recipes"),
+    ],
+    ids=str,
+)
+def test_wrong_options_are_errors(env, options, error, message):
+    if isinstance(options.get("state"), str):
+        options = {"state": np.zeros(record_size(env.unwrapped.layout), np.uint8)}
+    with pytest.raises(error, match=message):
+        env.reset(options=options)
+
+
+def test_wrong_use_is_an_error():
+    fresh = published_environment("demo_wide", "H4/t0")
+    with pytest.raises(OptionError, match="call reset"):
+        fresh.step(0)
+    fresh.reset(seed=0)
+    with pytest.raises(OptionError, match=r"action: expected 0\.\.5 \(up, down, .*\), found 6"):
+        fresh.step(6)
+    task = asdict(published_task("demo_wide", "H4/t0"))
+    with pytest.raises(TaskFormatError, match="expected the fields"):
+        TaskEnv({name: value for name, value in task.items() if name != "seed"})
+    wrong_options: list[dict[str, Any]] = [{"noise": "loud"}, {"channels": "all"}, {"render_mode": "human"}]
+    for wrong in wrong_options:
+        with pytest.raises(UnknownNameError, match=f"unknown {next(iter(wrong))}"):
+            TaskEnv(task, **wrong)
+    with pytest.raises(UnknownNameError, match="unknown teammate 'H9/t0'"):
+        published_environment("demo_wide", "H9/t0")
+
+
+def test_without_gymnasium_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(OptionError, match=r"needs gymnasium: pip install 'icrl4aht-data\[gym\]'"):
+        make_environment(task={})

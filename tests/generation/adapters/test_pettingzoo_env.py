@@ -1,0 +1,76 @@
+"""Both agents as a PettingZoo environment: the library's own test, and recorded histories played again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from generation.adapters.pettingzoo_env import BothAgentsEnv
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.overcooked.observe import observe_both
+
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
+@pytest.mark.parametrize("channels", ["own", "canonical"])
+def test_parallel_api(channels):
+    parallel_api_test(BothAgentsEnv("coord_simple", max_steps=30, channels=channels), num_cycles=100)
+
+
+def test_seeds_decide_episodes():
+    parallel_seed_test(lambda: BothAgentsEnv("coord_ring"))
+
+
+def test_recorded_actions_lead_to_recorded_states_and_rewards():
+    history = load_icrl4aht(layout="cramped_up", source="noise")[0]
+    env = BothAgentsEnv("cramped_up")
+    first = 100 * int(history.returns().argmax())
+    observations, _ = env.reset(options={"state": history.state[first]})
+    pairs = zip(history.actions[first : first + 100], history.teammate_actions[first : first + 100], strict=True)
+    delivered = np.flatnonzero(history.rewards[first : first + 100] > 0)
+    assert len(delivered)
+    # A delivery is followed by a newly drawn recipe, so states are compared up to the first one.
+    for t, (ego, teammate) in enumerate(pairs):
+        if t > delivered[0]:
+            break
+        np.testing.assert_array_equal(env.state(), history.state[first + t])
+        both = observe_both(env.layout, env.state()[None])[0]
+        np.testing.assert_array_equal([observations["ego"], observations["teammate"]], both)
+        observations, rewards, _, truncations, infos = env.step({"ego": ego, "teammate": teammate})
+        assert rewards == dict.fromkeys(("ego", "teammate"), history.rewards[first + t])
+        assert infos.keys() == {"ego", "teammate"} and not any(truncations.values())
+
+
+def test_pictures():
+    env = BothAgentsEnv("demo_wide", render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture is not None and picture.shape[2] == 3
+
+
+def test_wrong_use_is_an_error():
+    env = BothAgentsEnv("demo_wide", max_steps=1)
+    with pytest.raises(OptionError, match="call reset"):
+        env.step({"ego": 0, "teammate": 0})
+    with pytest.raises(OptionError, match="call reset"):
+        env.state()
+    env.reset(seed=0)
+    with pytest.raises(OptionError, match=r"expected those of ego and teammate, found \['ego'\]"):
+        env.step({"ego": 0})
+    with pytest.raises(OptionError, match=r"action of teammate: expected 0\.\.5"):
+        env.step({"ego": 0, "teammate": 6})
+    with pytest.raises(OptionError, match="state: expected integers"):
+        env.reset(options={"state": [0]})
+    env.step({"ego": 4, "teammate": 4})
+    with pytest.raises(OptionError, match="no episode is running"):
+        env.step({"ego": 4, "teammate": 4})
+    wrong_options: list[dict[str, Any]] = [{"layout": "nowhere"}, {"channels": "all"}, {"render_mode": "human"}]
+    for wrong in wrong_options:
+        with pytest.raises(UnknownNameError, match=f"unknown {next(iter(wrong))}"):
+            BothAgentsEnv(**{"layout": "demo_wide", **wrong})
+    with pytest.raises(OptionError, match="max_steps = 0"):
+        BothAgentsEnv("demo_wide", max_steps=0)
