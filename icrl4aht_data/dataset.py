@@ -27,11 +27,12 @@ from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
 from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
 from icrl4aht_data.sampling.ad import ADSampler
-from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
+from icrl4aht_data.sampling.base import Sampler, SamplerOptions, warn_of_mixed_splits
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.html import curve_svg, facts_html
+from icrl4aht_data.utils.signatures import show_types
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 
@@ -338,6 +339,11 @@ class Dataset(Selection):
         """
         warn_of_mixed_splits(self)
         return DPTSampler(self, batch_size=batch_size, context=context, order=order, labels=labels, **options)
+
+
+for _function in (Dataset.ad, Dataset.dpt):
+    show_types(_function, Sampler.__init__)
+show_types(load_icrl4aht)
 
 
 def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:

@@ -196,13 +196,13 @@ class Selection:
         canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
-            f"{self._named_counts('split')}; {self._named_counts('source')}; "
+            f"{self.named_counts('split')}; {self.named_counts('source')}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}{canonical}; "
             f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
         )
 
-    def _named_counts(self, name: str) -> str:
-        """The values of an index field in words, such as "source ppo" or "sources ppo (120), noise (64)"."""
+    def named_counts(self, name: str) -> str:
+        """Return the values of an index field in words, such as "source ppo" or "sources ppo (120), noise (64)"."""
         counts = self.counts(name)
         if len(counts) == 1:
             return f"{name} {next(iter(counts))}"

@@ -14,6 +14,7 @@ from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.signatures import show_types
 from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
@@ -234,3 +235,6 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch
+
+
+show_types(ADSampler.__init__, Sampler.__init__)

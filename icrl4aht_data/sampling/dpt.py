@@ -15,6 +15,7 @@ from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.signatures import show_types
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
@@ -222,3 +223,6 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
         """Numbers of steps from numbers of transitions, both counted from the first one of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
+
+
+show_types(DPTSampler.__init__, Sampler.__init__)

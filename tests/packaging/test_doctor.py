@@ -236,7 +236,7 @@ def test_dependencies_come_from_the_metadata(monkeypatch):
 
 
 def test_every_extra_for_users_installs_something():
-    extras = {"plot", "generation", "tensorboard", "hf", "s3", "grain", "torch", "cluster"}
+    extras = {"plot", "generation", "tensorboard", "hf", "pandas", "s3", "grain", "torch", "cluster"}
     assert {one.extra for one in dependencies()} == {None, *extras}
     assert extra_with("PIL.Image") == "plot"
 
