@@ -82,7 +82,7 @@ def test_batches_print_shapes_wherever_their_arrays_are(bundled):
     assert repr(on_device) == repr(sampler[0])
     (tensors,) = torch_loader(sampler, stop=1)
     assert repr(tensors).replace("int64", "int32") == repr(sampler[0])
-    assert "PartitionSpec" in repr(ADBatch(*[jax.sharding.PartitionSpec("data")] * 6))
+    assert "obs             P('data',)" in repr(ADBatch(*[jax.sharding.PartitionSpec("data")] * 6))
 
 
 def test_html_has_a_learning_curve_and_counts(bundled):
