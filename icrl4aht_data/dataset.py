@@ -342,7 +342,7 @@ class Dataset(Selection):
 
 
 for _function in (Dataset.ad, Dataset.dpt):
-    show_types(_function, Sampler.__init__)
+    show_types(_function, Sampler.__init__, SamplerOptions.__annotations__)
 show_types(load_icrl4aht)
 
 

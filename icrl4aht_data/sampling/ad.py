@@ -237,4 +237,4 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
         return batch
 
 
-show_types(ADSampler.__init__, Sampler.__init__)
+show_types(ADSampler.__init__, Sampler.__init__, SamplerOptions.__annotations__)

@@ -225,4 +225,4 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
 
 
-show_types(DPTSampler.__init__, Sampler.__init__)
+show_types(DPTSampler.__init__, Sampler.__init__, SamplerOptions.__annotations__)

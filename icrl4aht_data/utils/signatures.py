@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, TypeVar, get_type_hints
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def show_types(function: F, options_of: Callable[..., Any] | None = None) -> F:
+def show_types(function: F, options_of: Callable[..., Any] | None = None, names: Collection[str] = ()) -> F:
     """Give a function the signature that `help()` prints: real types, and the options behind its `**options`.
 
     Args:
         function: it is changed in place and returned.
-        options_of: function with the options that `function` passes on; those that `function` itself does not have are
-            listed in place of its `**options`, with their types and defaults.
+        options_of: function with the options that `function` passes on, which are listed in place of its `**options`,
+            with their types and defaults.
+        names: names of these options.
     """
     found = inspect.signature(function)
     parameters = list(_with_types(function))
     if options_of is not None:
-        own = {one.name for one in parameters}
-        named = [one for one in _with_types(options_of) if one.kind is one.KEYWORD_ONLY and one.name not in own]
-        renamed = {"length"}  # `DPTSampler` calls it `context`
         parameters = [one for one in parameters if one.kind is not one.VAR_KEYWORD]
-        parameters += [one for one in named if one.name not in renamed]
+        parameters += [one for one in _with_types(options_of) if one.name in names]
     result = get_type_hints(function).get("return", found.return_annotation)
     signature = found.replace(parameters=parameters, return_annotation=type(None) if result is None else result)
     function.__signature__ = signature  # type: ignore[attr-defined]
