@@ -12,6 +12,7 @@ from icrl4aht_data.environments import register_environments
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_data.reading.episodes import Episode, Episodes
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.sampling.batches import Batches
@@ -35,6 +36,8 @@ __all__ = [
     "DPTBatch",
     "DPTSampler",
     "Dataset",
+    "Episode",
+    "Episodes",
     "History",
     "Icrl4ahtError",
     "Layout",

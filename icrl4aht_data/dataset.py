@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import numpy as np
 
-from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.benchmark.tasks import Task, read_tasks, teammate_id
 from icrl4aht_data.environments import make_environment
-from icrl4aht_data.errors import NotStoredError, OptionError, unknown
+from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import INFO, TASKS, TEAMMATES
+from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.plotting import Picture, plot_layout_curves
+from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
+from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
 from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
 from icrl4aht_data.sampling.ad import ADSampler
-from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
+from icrl4aht_data.sampling.base import Sampler, SamplerOptions, warn_of_mixed_splits
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
+from icrl4aht_data.sampling.draws import draw_subset
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.html import curve_svg, facts_html
+from icrl4aht_data.utils.signatures import show_types
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 
@@ -37,6 +43,8 @@ if TYPE_CHECKING:
 
 MINI = Path(__file__).parent / "mini"
 """Path of the bundled mini release."""
+
+_CURVES_SHOWN, _CURVE_POINTS = 12, 25  # histories of a source that a notebook's curve is the mean of, and its points
 
 
 def load_icrl4aht(
@@ -121,13 +129,139 @@ class Dataset(Selection):
     """A selection of learning histories that can be sampled; `load_icrl4aht` opens one.
 
     `len(dataset)` is the number of histories, `dataset[i]` the i-th `History`, `dataset[a:b]` a smaller selection;
-    iteration yields the histories in order. `filter` and `select` narrow a selection, `ad` and `dpt` sample it.
+    iteration yields the histories in order. `filter`, `select` and `split` narrow a selection, `sort` orders it, `ad`
+    and `dpt` sample batches, `sample_episodes` episodes.
     """
 
     @property
     def knows_tasks(self) -> bool:
         """Whether the release has its tasks; a release of observations may have been made without them."""
         return self.has_states or bool(self._tasks)
+
+    def sort(self, *names: str, reverse: bool = False) -> Self:
+        """Return this selection ordered by index fields; histories that are equal in all of them keep their order.
+
+        Args:
+            names: fields of `Entry`, such as "return_end"; the first one matters most. Names are ordered
+                alphabetically.
+            reverse: from the largest value to the smallest. Histories without a value are last in either order.
+
+        Raises:
+            OptionError: if no field is given.
+            UnknownNameError: for a field that does not exist; names the nearest one.
+        """
+        if not names:
+            raise OptionError('sort: expected the name of an index field, such as ds.sort("return_end")')
+        keys = []
+        for name in names:
+            values = self.column(name)
+            rank = np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)
+            absent = values == -1 if ENTRY_HINTS.get(name) == int | None else values != values  # NaN differs from NaN
+            rank = np.where(absent, len(self), -rank if reverse else rank) if values.ndim == 1 else rank
+            keys.append(rank)
+        return self.select(self.ids[np.lexsort(keys[::-1])])
+
+    def split(self, validation: float = 0.1, seed: int = 0, by: SplitBy = "teammate") -> tuple[Self, Self]:
+        """Divide this selection into histories to train on and histories to validate with.
+
+        The choice depends on names and the seed alone, not on the order of the selection, and is the one that
+        `python -m baselines train` makes where a release has no histories of split validation.
+
+        Args:
+            validation: share of the teammates, or of the histories, that is held out; at least one is.
+            seed: seed of the choice.
+            by: "teammate" holds out teammates with all their histories, on the layouts of the selection one by one, so
+                that no validation teammate was seen in training; "history" holds out histories and keeps at least one
+                of every task in training.
+
+        Returns:
+            The histories to train on, and those to validate with; together they are the selection.
+
+        Raises:
+            UnknownNameError: if `by` is neither of both.
+            OptionError: if `validation` is not between 0 and 1, or there is only one teammate, or every task has one
+                history only.
+        """
+        if by not in SPLIT_BY:
+            raise unknown("split by", by, SPLIT_BY)
+        if isinstance(validation, bool) or not isinstance(validation, (int, float, np.floating)):
+            raise OptionError(f"validation = {validation!r}: expected the share that is held out, such as 0.1")
+        seed = check_int("seed", seed, 0)
+        if by == "history":
+            held = choose_histories(self, validation, seed)
+        else:
+            held = choose_teammates(teammate_names(self), validation, seed)
+            if not held.any():
+                raise OptionError(
+                    f'by = "teammate": {self!r} has one teammate, so none can be held out; take by="history", or '
+                    f"select more tasks"
+                )
+        return self.select(~held), self.select(held)
+
+    def sample_episodes(self, n: int, seed: int = 0) -> list[Episode]:
+        """Draw different episodes uniformly from all episodes of the selected histories.
+
+        Args:
+            n: number of episodes.
+            seed: seed of the draw: the same seed, selection and number give the same episodes.
+
+        Returns:
+            The episodes, in the order of the selection and of their histories.
+
+        Raises:
+            OptionError: if `n` is not an integer from 1, or larger than the number of episodes.
+        """
+        count, ends = check_int("n", n, 1), np.cumsum(self.column("episodes"))
+        if count > ends[-1]:
+            raise OptionError(
+                f"n = {count}: the selection has {ends[-1]:,} episodes; take fewer, or select more histories"
+            )
+        drawn = draw_subset(check_int("seed", seed, 0), int(ends[-1]), count)
+        rows = np.searchsorted(ends, drawn, side="right")
+        before = np.concatenate([[0], ends])[rows]
+        chosen = []
+        for row in np.unique(rows).tolist():
+            episodes = self[row].episodes
+            chosen += [episodes[number] for number in (drawn - before)[rows == row].tolist()]
+        return chosen
+
+    def plot(self) -> Picture:
+        """Draw the returns over the course of the histories, by layout and source, as a picture that notebooks show.
+
+        Reads the rewards of all selected histories. `plotting.plot_learning_curves` draws tasks.
+
+        Raises:
+            OptionError: if matplotlib is not installed.
+        """
+        return Picture(f"Returns of {len(self)} histories by layout and source", plot_layout_curves(self))
+
+    def _repr_html_(self) -> str:
+        """The selection's counts and learning curve, for notebooks."""
+        named = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
+        counts = {name: ", ".join(f"{value} ({n})" for value, n in self.counts(name).items()) for name in named}
+        tasks = len(self.counts("task_id"))
+        lengths = f"{int(self.column('T').sum()):,} steps, {int(self.column('episodes').sum()):,} episodes"
+        facts = {
+            "transitions": lengths,
+            **{name.replace("_", " "): text or "none" for name, text in counts.items()},
+            "observations": f"{self.obs}, {self.channels} channels",
+            "release": f"{self.info.kind} {self.info.data_version} at {self.origin}",
+        }
+        return facts_html(f"{len(self)} histories of {tasks} tasks", facts, self._curves_svg())
+
+    def _curves_svg(self) -> str:
+        """Mean returns of a few histories of each source that are on this machine, as SVG; or nothing."""
+        curves, sources = {}, self.column("source")
+        here = {shard for shard in self.shards if self.origin.is_here(shard)}
+        for source in self.counts("source"):
+            rows = np.flatnonzero(sources == source)
+            rows = rows[np.linspace(0, len(rows) - 1, min(_CURVES_SHOWN, len(rows))).astype(int)]
+            found = [self[row].returns() for row in rows.tolist() if self.index.entry(int(self.ids[row])).shard in here]
+            if found:
+                parts = min(_CURVE_POINTS, *map(len, found))
+                means = [[part.mean() for part in np.array_split(returns, parts)] for returns in found]
+                curves[f"{source} ({len(found)} of {(sources == source).sum()})"] = np.mean(means, axis=0)
+        return curve_svg(curves, "share of a history") if curves else ""
 
     @cached_property
     def _tasks(self) -> dict[str, Task]:
@@ -288,3 +422,33 @@ class Dataset(Selection):
         """
         warn_of_mixed_splits(self)
         return DPTSampler(self, batch_size=batch_size, context=context, order=order, labels=labels, **options)
+
+
+for _function in (Dataset.ad, Dataset.dpt):
+    show_types(_function, Sampler.__init__, SamplerOptions.__annotations__)
+show_types(load_icrl4aht)
+
+
+def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
+    """Return the sorted ids of the teammates of some histories, or None if the release does not describe them all.
+
+    See `tasks.teammate_id`.
+    """
+    try:
+        return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
+    except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
+        return None
+
+
+def teammate_names(dataset: Dataset) -> np.ndarray:
+    """Return a name for each history's teammate, strings (H,): histories with one policy on one layout share it.
+
+    The name consists of the layout and the teammate's id; it is the task's id where the release does not describe the
+    teammate.
+    """
+    codes, first, number = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
+    values, names = dataset.index.values("task_id"), []
+    for code, history_id in zip(codes.tolist(), dataset.ids[first].tolist(), strict=True):
+        ids = teammate_ids(dataset, [history_id])
+        names.append(values[code] if ids is None else f"{dataset.index.entry(history_id).layout} {ids[0]}")
+    return np.array(names)[number]

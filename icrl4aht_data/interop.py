@@ -11,24 +11,50 @@ A sampler is a sequence of batches, each a pure function of its number, so most 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from icrl4aht_data.errors import NotStoredError, OptionError
 from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.sampling.ad import ADBatch
+from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.sampling.base import Sampler
+from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import datasets
+    import torch
     from torch.utils.data import DataLoader
 
 IGNORED = -100
 """The target of padding in `torch_loader` and `hf_windows`: the number that PyTorch's cross entropy ignores."""
+
+
+@overload
+def torch_loader(
+    sampler: ADSampler,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    workers: int = 0,
+    context: str = "spawn",
+    **options: Any,
+) -> DataLoader[ADBatch[torch.Tensor]]: ...
+
+
+@overload
+def torch_loader(
+    sampler: DPTSampler,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    workers: int = 0,
+    context: str = "spawn",
+    **options: Any,
+) -> DataLoader[DPTBatch[torch.Tensor]]: ...
 
 
 def torch_loader(
@@ -39,7 +65,7 @@ def torch_loader(
     workers: int = 0,
     context: str = "spawn",
     **options: Any,
-) -> DataLoader:
+) -> DataLoader[Any]:
     """Return a DataLoader over batches start..stop as named tuples of tensors, in order for any number of workers.
 
     The tensors are what PyTorch's losses and embeddings take: integers are int64 (observations keep their dtype), and

@@ -1,24 +1,29 @@
-"""Figures of datasets, layouts and reference returns. Needs the extra `plot`."""
+"""Figures of datasets, histories, layouts and reference returns, and animated episodes. Needs the extra `plot`.
+
+Every function that draws a figure returns it, and writes it to a file if a path is given.
+"""
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from html import escape
 from importlib.util import find_spec
+from io import BytesIO
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import SOURCES
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, Cell, has_headroom
-from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.render import draw_frame
+from icrl4aht_data.overcooked.render import draw_frame, encode_episode
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
@@ -37,7 +42,123 @@ MOST_PANELS = 12
 """Tasks of which each has a panel of its own; more are drawn together, by layout."""
 
 
-def plot_learning_curves(dataset: Dataset, path: Path) -> None:
+class RecordedCurve(Protocol):
+    """A history as the figures need it: its entry of the index, and the returns of its episodes."""
+
+    entry: Entry
+
+    def returns(self) -> np.ndarray:
+        """Return each episode's return, float64 (E,)."""
+        ...
+
+
+class RecordedCurves(Protocol):
+    """Histories in order, such as a `Dataset`, as the figures need them."""
+
+    def __iter__(self) -> Iterator[RecordedCurve]: ...
+
+    def counts(self, name: str) -> dict[str, int]:
+        """Return the number of histories with each value of an index field."""
+        ...
+
+
+class Picture:
+    """A figure or an animation. Notebooks show it, `save` writes it to a file.
+
+    Args:
+        title: what the picture shows, in words.
+        content: a matplotlib figure, or the content of a GIF file.
+
+    Attributes:
+        title: what the picture shows, in words.
+        figure: the matplotlib figure; None for an animation.
+    """
+
+    def __init__(self, title: str, content: Figure | bytes) -> None:
+        self.title = title
+        self._content = content
+
+    @property
+    def figure(self) -> Figure | None:
+        """The matplotlib figure, to be changed before the picture is shown; None for an animation."""
+        return None if isinstance(self._content, bytes) else self._content
+
+    def __repr__(self) -> str:
+        suffixes = ", ".join(PICTURES) if self.figure else ".gif"
+        return f"Picture({self.title}; notebooks show it, .save(path) writes it: {suffixes})"
+
+    def _repr_html_(self) -> str:
+        """The picture as an HTML element that contains it."""
+        content, kind = self._content, "gif"
+        if not isinstance(content, bytes):
+            stream, kind = BytesIO(), "png"
+            content.savefig(stream, dpi=110, format=kind)
+            content = stream.getvalue()
+        data = b64encode(content).decode()
+        return f'<img alt="{escape(self.title)}" style="max-width:100%" src="data:image/{kind};base64,{data}">'
+
+    def save(self, path: str | Path) -> None:
+        """Write the picture to a file; an existing file is replaced at once.
+
+        Raises:
+            OptionError: unless the path ends in .gif for an animation, in .png, .svg or .pdf for a figure.
+        """
+        target = Path(path)
+        if not isinstance(self._content, bytes):
+            _check_suffix(target, PICTURES)
+            save_figure(self._content, target)
+            return
+        _check_suffix(target, (".gif",))
+        with atomic_write(target) as partial:
+            partial.write_bytes(self._content)
+
+
+def plot_history(returns: np.ndarray, title: str, expert_return: float | None = None) -> Figure:
+    """Plot a history's learning curve: the return of each episode, and its mean over a twentieth of the episodes.
+
+    Args:
+        returns: real (E,), each episode's return.
+        title: title of the figure.
+        expert_return: what the policy behind the expert actions earns per episode, drawn as a line; None to omit it.
+
+    Raises:
+        OptionError: if matplotlib is not installed.
+    """
+    figure, (axes,) = _panels(None, 1, (5.6, 3.3))
+    episodes, window = np.arange(1, len(returns) + 1), max(1, len(returns) // 20)
+    axes.plot(episodes, returns, color="C0", alpha=0.3, linewidth=0.8, label="each episode")
+    means = np.convolve(returns, np.full(window, 1 / window), mode="valid")
+    axes.plot(episodes[window - 1 :], means, color="C0", label=f"mean of the last {window}")
+    if expert_return is not None:
+        axes.axhline(expert_return, color="C1", linestyle="--", linewidth=1, label="expert, acting greedily")
+    axes.set_title(title, fontsize=9)
+    axes.set_xlabel("episode")
+    axes.set_ylabel("return of the kept steps")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def animate_episode(
+    layout: Layout, records: np.ndarray, rewards: np.ndarray, title: str, *, cell: int = 32, fps: int = 8
+) -> Picture:
+    """Return an episode as an animated GIF, which notebooks play.
+
+    Args:
+        layout: the layout.
+        records: state records uint8 (T, S) in order.
+        rewards: real (T,), the reward of the step from each record.
+        title: what the animation shows, in words.
+        cell: side of a map cell in pixels, at least 16.
+        fps: frames per second, 1 to 50.
+
+    Raises:
+        OptionError: for an impossible `cell` or `fps`, or if Pillow is not installed.
+    """
+    return Picture(title, encode_episode(layout, records, rewards, cell=cell, fps=fps))
+
+
+def plot_learning_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
     """Plot the return per episode of every task in a selection: mean over streams, band from 10th to 90th percentile.
 
     More than 12 tasks are drawn as `plot_layout_curves` does, by layout and source.
@@ -46,12 +167,11 @@ def plot_learning_curves(dataset: Dataset, path: Path) -> None:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
     if len(dataset.counts("task_id")) > MOST_PANELS:
-        plot_layout_curves(dataset, path)
-        return
-    _plot_histories(dataset, path, lambda e: (e.task_id, f"{e.layout} with {e.teammate_kind}"), lambda e: "mean")
+        return plot_layout_curves(dataset, path)
+    return _plot_histories(dataset, path, lambda e: (e.task_id, f"{e.layout} with {e.teammate_kind}"), lambda e: "mean")
 
 
-def plot_layout_curves(dataset: Dataset, path: Path) -> None:
+def plot_layout_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
     """Plot the return over the course of a history on every layout in a selection, see `plot_source_curves`.
 
     Raises:
@@ -60,7 +180,7 @@ def plot_layout_curves(dataset: Dataset, path: Path) -> None:
     curves: SourceCurves = {}
     for history in dataset:
         add_curve(curves, history.entry.layout, history.entry.source, history.entry.split, history.returns())
-    plot_source_curves(curves, path)
+    return plot_source_curves(curves, path)
 
 
 def _curve_order(label: str) -> tuple[int, str]:
@@ -77,7 +197,7 @@ def add_curve(curves: SourceCurves, layout: str, source: str, split: str, return
     curves.setdefault(layout, {}).setdefault(source if split == "train" else f"{source}, {split}", []).append(returns)
 
 
-def plot_source_curves(curves: SourceCurves, path: Path) -> None:
+def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure:
     """Plot small panels, one per layout, of returns over the course of a history: mean over histories, band from 10th
     to 90th percentile.
 
@@ -103,12 +223,15 @@ def plot_source_curves(curves: SourceCurves, path: Path) -> None:
     what = "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
     figure.suptitle(what, fontsize=8)
     legend_below(figure)
-    save_figure(figure, path, dpi=80)
+    return _saved(figure, path, dpi=80)
 
 
 def _plot_histories(
-    dataset: Dataset, path: Path, panel: Callable[[Entry], tuple[str, str]], curve: Callable[[Entry], str]
-) -> None:
+    dataset: RecordedCurves,
+    path: Path | None,
+    panel: Callable[[Entry], tuple[str, str]],
+    curve: Callable[[Entry], str],
+) -> Figure:
     """Plot one panel per key and title that `panel` returns, in it one curve per label that `curve` returns."""
     panels: dict[tuple[str, str], dict[str, list[np.ndarray]]] = {}
     for history in dataset:
@@ -123,14 +246,14 @@ def _plot_histories(
             length = min(map(len, members))  # streams of one curve may differ in length
             streams[f"{label} of {len(members)} streams"] = np.stack([member[:length] for member in members])
         drawn.append((title + number, streams))
-    plot_curves(path, drawn)
+    return plot_curves(path, drawn)
 
 
-def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> None:
+def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> Figure:
     """Plot panels of learning curves, each as the mean over streams and a band from 10th to 90th percentile.
 
     Args:
-        path: the file to write.
+        path: the file to write; None to write none.
         panels: for each panel its title, and label -> returns, float (streams, episodes).
 
     Raises:
@@ -148,10 +271,10 @@ def plot_curves(path: Path, panels: Sequence[tuple[str, dict[str, np.ndarray]]])
         axes.set_ylabel("return of the kept steps")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
-    save_figure(figure, path, dpi=120)
+    return _saved(figure, path, dpi=120)
 
 
-def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
+def plot_layouts(layouts: Sequence[Layout], path: Path | None = None) -> Figure:
     """Draw the layouts at the start of an episode: agents on their cells in the map, ego blue, teammate red.
 
     Raises:
@@ -164,16 +287,18 @@ def plot_layouts(layouts: Sequence[Layout], path: Path) -> None:
         axes.imshow(draw_frame(layout, record, view=False))
         axes.set_title(f"{layout.name} ({layout.alias})", fontsize=9)
         axes.set_axis_off()
-    save_figure(figure, path, dpi=120)
+    return _saved(figure, path, dpi=120)
 
 
-def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path) -> None:
+def plot_headroom(
+    cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path | None = None
+) -> Figure:
     """Plot the oracle's mean return minus that of an ego that stays, for each test layout and teammate family.
 
     Args:
         cells: the reference returns, see `reference_returns.read_headroom`.
         layouts: names of the layouts, one column each.
-        path: the file to write.
+        path: the file to write; None to write none.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -190,13 +315,20 @@ def plot_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[s
     axes.set_yticks(range(len(HEURISTICS)), HEURISTICS)
     axes.set_ylabel("test teammates")
     axes.set_title("Return of the oracle minus that of an ego that stays", fontsize=9)
-    save_figure(figure, path, dpi=120)
+    return _saved(figure, path, dpi=120)
 
 
-def _panels(path: Path, count: int, size: tuple[float, float], columns: int | None = None) -> tuple[Figure, list[Any]]:
+def _check_suffix(path: Path, suffixes: Collection[str]) -> None:
+    if path.suffix not in suffixes:
+        raise OptionError(f"{path}: expected a name that ends in {', '.join(suffixes)}")
+
+
+def _panels(
+    path: Path | None, count: int, size: tuple[float, float], columns: int | None = None
+) -> tuple[Figure, list[Any]]:
     """Return a figure and its `count` axes, each `size` inches (width, height); checks the suffix of `path`."""
-    if path.suffix not in PICTURES:
-        raise OptionError(f"{path}: expected a name that ends in {', '.join(PICTURES)}")
+    if path is not None:
+        _check_suffix(path, PICTURES)
     columns = columns or (2 if count == 4 else min(3, count))
     rows = -(-count // columns)
     figure = new_figure(size[0] * columns, size[1] * rows)
@@ -245,6 +377,13 @@ def legend_below(figure: Figure) -> None:
         if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
             return
         legend.remove()
+
+
+def _saved(figure: Figure, path: Path | None, dpi: int) -> Figure:
+    """Write the figure if a path is given, and return it."""
+    if path is not None:
+        save_figure(figure, path, dpi)
+    return figure
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from baselines.agents.host import HostPolicy
 from baselines.evaluate.protocols import Protocol
 from baselines.evaluate.results import Result, find_result, write_result
-from baselines.evaluate.rollout import Episode, EvaluationRollout, RolloutState, task_key
+from baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, task_key
 from generation.policy import Policy
 from generation.teammates.registry import build_teammate, check_theta
 from icrl4aht_data.benchmark.tasks import Task
@@ -156,7 +156,7 @@ class PreparedRollout(NamedTuple):
 
     rollout: EvaluationRollout
     state: RolloutState
-    episode: Callable[..., tuple[RolloutState, Episode]]
+    episode: Callable[..., tuple[RolloutState, EpisodeBatch]]
 
 
 def prepare_rollout(
@@ -203,20 +203,20 @@ def play_tasks(
     protocol: Protocol,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
-) -> Iterator[Episode]:
+) -> Iterator[EpisodeBatch]:
     """Play tasks that share a layout and a teammate family.
 
     Yields:
-        One `Episode` after another with B = tasks x seeds; seeds vary fastest.
+        One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
     """
     yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
 
 
-def play_episodes(prepared: PreparedRollout, episodes: int) -> Iterator[Episode]:
+def play_episodes(prepared: PreparedRollout, episodes: int) -> Iterator[EpisodeBatch]:
     """Play episodes of prepared tasks.
 
     Yields:
-        One `Episode` after another.
+        One `EpisodeBatch` after another.
 
     Raises:
         OptionError: if an ego outside JAX fails.

@@ -41,7 +41,7 @@ class RolloutState(NamedTuple):
     before: Percept
 
 
-class Episode(NamedTuple):
+class EpisodeBatch(NamedTuple):
     """One episode of B tasks.
 
     Attributes:
@@ -99,7 +99,7 @@ class EvaluationRollout:
         egos = self.batched_ego.init(self.ego.params, _fold_all(keys, EGO))
         return RolloutState(self.env.init(keys), egos, no_outcome(batch))
 
-    def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, Episode]:
+    def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
         """Returns the state after one episode of every task, and the episode. To be jitted by the caller."""
         mate = self.teammates[0]
         # Teammates start each episode afresh from its key; egos keep their memory, and only their keys are new.
@@ -124,7 +124,7 @@ class EvaluationRollout:
         start = (state, memories, state.env.record)
         (state, _, end), played = jax.lax.scan(step, start, jnp.arange(self.protocol.steps))
         record, actions, reward = (jnp.swapaxes(leaf, 0, 1) for leaf in played)
-        return state, Episode(record, actions, reward, end)
+        return state, EpisodeBatch(record, actions, reward, end)
 
     def ego_view(self, state: RolloutState) -> Any:
         """Returns the input of the egos, with a leading axis (B,): state records, observations or percepts."""

@@ -18,13 +18,13 @@ from baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_
 from baselines.online.teammates import check_heuristics
 from baselines.training.histories import filter_histories, history_settings, training_cells
 from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
-from baselines.training.seen import TASKS_SOURCE, teammate_id
+from baselines.training.seen import TASKS_SOURCE
 from baselines.training.trainer import TrainingData
 from generation.policy import Policy
 from generation.teammates.draws import find_draw
 from generation.teammates.registry import build_teammate, recover_teammate
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
-from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.provenance import read_provenance

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from baselines.evaluate.protocols import get_protocol
-from baselines.evaluate.rollout import Episode, EvaluationRollout, RolloutState, no_outcome
+from baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, no_outcome
 from baselines.methods.method import Method
 from baselines.methods.tokens import StepInput, percept_step
 from baselines.methods.view_change import ViewChange, no_change
@@ -184,7 +184,7 @@ class _GroupPlayer:
         return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
 
     def _sequences(
-        self, params: Any, state: RolloutState, after: RolloutState, played: Episode, ended: Bool[Array, " B"]
+        self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
     ) -> Sequences:
         layout, change = self.group.layout, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))

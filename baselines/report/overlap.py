@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from baselines.training.seen import SeenInTraining, teammate_id
-from icrl4aht_data.benchmark.tasks import Task
+from baselines.training.seen import SeenInTraining
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
 
 
 class OverlapKind(NamedTuple):

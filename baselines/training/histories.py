@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -19,16 +18,17 @@ from baselines.methods.tokens import BatchView, plain_view
 from baselines.methods.view_change import changed_view, mirrored_action
 from baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
-from baselines.training.seen import TRAINED_ON, teammate_ids
+from baselines.training.seen import TRAINED_ON
 from baselines.training.trainer import TrainingData
 from generation.learners.config import EncoderKind
 from generation.learners.resume import Checkpoints
-from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
+from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
 from icrl4aht_data.sampling.draws import Curriculum
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
@@ -218,8 +218,8 @@ def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[
 
     An entry has these five names, the `labels`, None for a method that uses none, the numbers of `tasks` and
     `histories`, `tasks_hash`, a hash of the task ids, and `teammates`, the ids of the teammates, see
-    `seen.teammate_ids`; None if the release does not describe them. Histories that are held out for validation do not
-    belong to `dataset`.
+    `dataset.teammate_ids`; None if the release does not describe them. Histories that are held out for validation do
+    not belong to `dataset`.
     """
     columns = [dataset.column(field) for field in _CELL_FIELDS.values()]
     tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
@@ -393,7 +393,7 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
 
     Every task with a teammate that is not held out keeps at least one history. The choice depends on names and the seed
-    alone.
+    alone, see `splitting`; `Dataset.split` makes the same choice of teammates or of histories.
 
     Args:
         dataset: the histories to divide.
@@ -405,52 +405,13 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     Raises:
         OptionError: if the share is not between 0 and 1, or every task has one history only.
     """
-    if not 0 < share < 1:
-        raise OptionError(f"share = {share}: expected a number between 0 and 1")
-    names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
-    streams, of_task = _stream_names(dataset), defaultdict(list)
-    for row, code in enumerate(codes.tolist()):
-        of_task[code].append((_rank(seed, names[code], *streams[row]), row))
-    mates = {code: _teammate_name(dataset, ranked[0][1]) for code, ranked in of_task.items()}
-    ranked_mates = sorted(set(mates.values()), key=lambda mate: _rank(seed, mate))
-    held_mates = ranked_mates[: _count(share, len(ranked_mates)) if len(ranked_mates) > 1 and validation is None else 0]
-    held_tasks = [code for code, mate in mates.items() if mate in held_mates]
-    others = [sorted(ranked) for code, ranked in of_task.items() if code not in held_tasks]
-    candidates = sorted(one for ranked in others for one in ranked[:-1])  # its last one stays with a task
-    if not candidates:
-        raise OptionError(
-            f"every task of {dataset!r} has one history: expected a task with two or more, one to train on and one to "
-            f"hold out"
-        )
-    held = np.zeros(len(dataset), bool)
-    held[[row for _, row in candidates[: _count(share, sum(map(len, others)))]]] = True
-    in_held_task = np.isin(codes, held_tasks)
-    return HistorySplit(
-        train=dataset.select(~held & ~in_held_task),
-        histories=dataset.select(held),
-        teammates=dataset.select(in_held_task) if len(held_tasks) else validation,
-    )
-
-
-def _teammate_name(dataset: Dataset, row: int) -> str:
-    """Returns what a history's teammate shares with no other: its layout and id, or the task where it is not known."""
-    history_id, entry = int(dataset.ids[row]), dataset[row].entry
-    ids = teammate_ids(dataset, [history_id])
-    return entry.task_id if ids is None else f"{entry.layout} {ids[0]}"
-
-
-def _stream_names(dataset: Dataset) -> list[tuple[int, ...]]:
-    """Returns what tells each history from the others of its task: its stream, and its learner after the first one."""
-    pairs = zip(dataset.column("env_idx").tolist(), dataset.column("learner").tolist(), strict=True)
-    return [(stream, learner) if learner else (stream,) for stream, learner in pairs]
-
-
-def _count(share: float, total: int) -> int:
-    return max(1, min(round(share * total), total - 1))
-
-
-def _rank(seed: int, *name: object) -> bytes:
-    return hashlib.blake2b(repr((seed, *name)).encode(), digest_size=8).digest()
+    teammates = validation
+    if validation is None:
+        with_held = choose_teammates(teammate_names(dataset), share, seed)
+        if with_held.any():
+            dataset, teammates = dataset.select(~with_held), dataset.select(with_held)
+    held = choose_histories(dataset, share, seed)
+    return HistorySplit(train=dataset.select(~held), histories=dataset.select(held), teammates=teammates)
 
 
 class TrainedModel(NamedTuple):

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from icrl4aht_data.benchmark.facts import FAMILIES, KIND_FAMILIES
-from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import json_hash
 
 TRAINED_ON = "trained_on"
 """Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
@@ -27,33 +23,12 @@ class SeenInTraining(NamedTuple):
 
     Attributes:
         layouts: short names.
-        teammates: teammate kind, such as "utility_greedy" or "fcp" -> ids of its teammates, see `teammate_id`; None if
-            they are not known.
+        teammates: teammate kind, such as "utility_greedy" or "fcp" -> ids of its teammates, see `tasks.teammate_id`;
+            None if they are not known.
     """
 
     layouts: tuple[str, ...] = ()
     teammates: Mapping[str, tuple[str, ...] | None] = {}
-
-
-def teammate_id(teammate: Mapping[str, Any]) -> str:
-    """Returns 16 hexadecimal digits that are the same for teammates of one kind with one policy.
-
-    Args:
-        teammate: kind and theta, as in a task. The numbers of a heuristic are compared in single precision, since some
-            manifests round them.
-    """
-    theta = teammate["theta"]
-    if teammate["kind"] == "rl":
-        return theta["sha256"][:16]
-    return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
-
-
-def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
-    """Returns the sorted ids of the teammates of some histories, or None if the release does not describe them all."""
-    try:
-        return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
-    except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
-        return None
 
 
 def read_trained_on(entries: Any, where: str) -> SeenInTraining:
@@ -61,8 +36,8 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
 
     Args:
         entries: JSON list of entries with `layout` and `family`, usually also `algorithm` (the kind of a heuristic, or
-            the algorithm of a learned teammate) and `teammates` (ids, see `teammate_id`); empty for an agent that was
-            not trained.
+            the algorithm of a learned teammate) and `teammates` (ids, see `tasks.teammate_id`); empty for an agent that
+            was not trained.
         where: origin of the record, for the message.
 
     Raises:

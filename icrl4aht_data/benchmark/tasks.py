@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS, SPLITS, TRACKS, check_membership
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.actions import TEAMMATE
@@ -98,6 +100,19 @@ def named_task(line: Mapping[str, Any]) -> NamedTask:
         raise unknown("teammate_family", line["teammate_family"], FAMILIES)
     teammate = {name: line[name] for name in ("teammate_kind", "teammate_family")}
     return NamedTask(line["task_id"], line["track"], line["split"], layout.alias, -1, teammate)
+
+
+def teammate_id(teammate: Mapping[str, Any]) -> str:
+    """Return 16 hexadecimal digits that are the same for teammates of one kind with one policy.
+
+    Args:
+        teammate: kind and theta, as in a task. The numbers of a heuristic are compared in single precision, since some
+            manifests round them.
+    """
+    theta = teammate["theta"]
+    if teammate["kind"] == "rl":
+        return theta["sha256"][:16]
+    return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
 
 
 def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:

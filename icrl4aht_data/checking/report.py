@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from typing import Any, Literal
 
 Level = Literal["quick", "full", "deep"]
@@ -13,6 +14,7 @@ NamedProgress = Callable[[str, int, int], None]
 """Called with the name of a stage, the number of items done, and their total."""
 
 _FINDINGS = 100_000  # a report keeps at most this many
+_SHOWN = 5  # findings that a repr shows
 _LONG = 2000  # characters of a finding
 
 
@@ -29,7 +31,7 @@ class Finding:
     problem: str
 
 
-@dataclass
+@dataclass(repr=False)
 class Report:
     """The result of `verify_release`.
 
@@ -60,6 +62,14 @@ class Report:
     transitions: int = 0
     fetched_bytes: int = 0
     requests: int = 0
+
+    def __repr__(self) -> str:
+        number = len(self.findings)
+        state = "ok" if self.ok else f"{number:,} problem{'s' * (number != 1)}"
+        lines = [f"Report({self.root}, level {self.level}: {state}; {self.files:,} files, {self.histories:,} histories"]
+        lines += [f"    {finding.file}: {finding.problem:.200}" for finding in islice(self.findings, _SHOWN)]
+        lines += [f"    and {number - _SHOWN:,} more: see .findings"] * (number > _SHOWN)
+        return "\n".join(lines) + ")"
 
     @property
     def ok(self) -> bool:

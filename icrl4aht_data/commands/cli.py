@@ -28,6 +28,7 @@ from icrl4aht_data.commands.options import (
     examples,
     family_map_option,
     filter_options,
+    is_terminal,
     json_option,
     overwrite_option,
     quiet_option,
@@ -35,7 +36,14 @@ from icrl4aht_data.commands.options import (
     version_option,
     wanted_filters,
 )
-from icrl4aht_data.commands.summaries import summarize_selection, summarize_tasks, task_table
+from icrl4aht_data.commands.summaries import (
+    facts_table,
+    layout_table,
+    summarize_selection,
+    summarize_tasks,
+    tab_separated,
+    task_table,
+)
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
@@ -106,16 +114,19 @@ def cli() -> None:
 def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
     """List the tasks of a release.
 
-    Prints one line per task: layout, teammate, source, histories, their learners, transitions, the mean return of an
-    episode at the start and at the end of learning, and the labels: expert, with what the policy earns that they come
-    from, acting greedily (if it was measured), and oracle.
+    Prints one row per task: layout, split, teammate, source, histories, transitions, the mean return of an episode at
+    the start and at the end of learning, and the labels: expert, with what the policy earns that they come from, acting
+    greedily (if it was measured), and oracle. Where the output is not a terminal, prints all facts of a task on one
+    line, separated by tabs, below a line with their names.
     """
     tasks = summarize_tasks(_load(root, filters).entries)
     if as_json:
         click.echo(json.dumps(tasks, indent=2))
         return
-    # As wide as the table, also on a narrower terminal: a task is one line, and its id can be copied.
-    Console(width=1000, markup=False).print(task_table(tasks))
+    if not is_terminal():
+        click.echo(tab_separated([tasks[0], *(task.values() for task in tasks)]))
+        return
+    Console(markup=False).print(task_table(tasks))
 
 
 @cli.command()
@@ -140,8 +151,9 @@ def show(
 ) -> None:
     """Show a release, a part of it or one history.
 
-    Prints kind, versions, counts, layouts, splits, sources and labels; for one history everything in its index entry.
-    Only --plot writes a file.
+    Prints a summary, a table of the layouts with totals, versions, counts, splits, sources and labels; for one history
+    everything in its index entry. Where the output is not a terminal, prints each fact on one line, after its name and
+    a tab. Only --plot writes a file.
     """
     if overwrite and plot is None:
         raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
@@ -164,10 +176,16 @@ def show(
     if as_json:
         click.echo(json.dumps(facts, indent=2))
         return
+    if not is_terminal():
+        click.echo(tab_separated(facts.items()))
+        return
+    console = Console(markup=False, highlight=False)
     if history_id is None:
-        click.echo(repr(dataset))
-    for name, value in facts.items():
-        click.echo(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
+        console.print(facts.pop("summary"), "", layout_table(dataset), "", sep="\n")
+        del facts["layouts"]  # the table has them
+    else:
+        console.print(repr(dataset[0]), "", sep="\n")
+    console.print(facts_table(facts))
 
 
 cli.add_command(browse)

@@ -217,6 +217,11 @@ def wanted_filters(filters: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     return {name: list(values) or None for name, values in filters.items()}
 
 
+def is_terminal() -> bool:
+    """Whether a person reads the output: on a terminal, not in a file or a pipe."""
+    return sys.stdout is not None and sys.stdout.isatty()
+
+
 def examples(*lines: str) -> str:
     """Return a help epilog that shows command lines."""
     return "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -42,18 +43,112 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
-    """Return a table of what `summarize_tasks` returned, with a row for each task."""
-    names = ("layout", "split", "teammate", "source", "histories", "learners")
-    table = Table(box=None, pad_edge=False)
-    for name in (*names, "transitions", "return", "labels", "task"):
-        table.add_column(name, no_wrap=True)
+    """Return a table of what `summarize_tasks` returned, one row a task and a last one with totals.
+
+    Texts fold, so that it fits 80 columns. The column `task` has the end of the id, by which lines of `list | cat`,
+    which have the complete one, can be found.
+    """
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_footer=True, row_styles=("", "dim"))
+    steps, histories = (sum(task[name] for task in tasks) for name in ("transitions", "histories"))
+    table.add_column("layout", footer=counted_noun(len(tasks), "task"), overflow="fold")
+    table.add_column("teammate", overflow="fold")
+    table.add_column("source", no_wrap=True)
+    table.add_column("hist.", footer=f"{histories:,}", justify="right", no_wrap=True)
+    table.add_column("steps", footer=f"{steps:,}", justify="right", no_wrap=True)
+    table.add_column("return", no_wrap=True)
+    table.add_column("labels", overflow="fold")
+    table.add_column("task", no_wrap=True)
     for task in tasks:
-        returns = f"{task['return_start']:.1f} -> {task['return_end']:.1f}"
         earned = "" if task["expert_return"] is None else f" {task['expert_return']:.1f}"
-        labels = ", ".join(kind + earned * (kind == "expert") for kind in task["labels"]) or "-"
-        facts = [str(task[name]) for name in names]
-        table.add_row(*facts, f"{task['transitions']:,}", returns, labels, task["task_id"])
+        labels = " ".join(kind + earned * (kind == "expert") for kind in task["labels"]) or "none"
+        table.add_row(
+            f"{task['layout']} {task['split']}",
+            task["teammate"].replace("/", " ").replace("_", " "),
+            task["source"],
+            f"{task['histories']:,}",
+            f"{task['transitions']:,}",
+            f"{task['return_start']:.1f}→{task['return_end']:.1f}",
+            labels,
+            task["task_id"][-8:],
+        )
     return table
+
+
+def layout_table(dataset: Dataset) -> Table:
+    """Return a table of a selection, one row a layout and a last one with totals, that fits 80 columns."""
+    table = Table(box=None, pad_edge=False, show_footer=True)
+    columns = [dataset.column(name) for name in ("return_start", "return_end", "T", "episodes")]
+    numbers, tasks = dataset.layout_numbers, dataset.column_codes("task_id")
+    rows = []
+    for name, members in [
+        *((layout.name, numbers == number) for number, layout in enumerate(dataset.layouts)),
+        ("total", np.ones(len(dataset), bool)),
+    ]:
+        start, end, steps, episodes = (column[members] for column in columns)
+        counts = [len(np.unique(tasks[members])), int(members.sum()), int(episodes.sum()), int(steps.sum())]
+        rows.append([name, *(f"{count:,}" for count in counts), f"{start.mean():.1f}", f"{end.mean():.1f}"])
+    headings = ("layout", "tasks", "histories", "episodes", "steps", "return at start", "at end")
+    for heading, total in zip(headings, rows[-1], strict=True):
+        table.add_column(heading, footer=total, justify="left" if heading == "layout" else "right", overflow="fold")
+    for row in rows[:-1]:
+        table.add_row(*row)
+    return table
+
+
+def facts_table(facts: Mapping[str, Any]) -> Table:
+    """Return a table of names and values, one row each, whose values fold."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
+        table.add_row(name.replace("_", " "), _in_words(value))
+    return table
+
+
+def _in_words(value: Any) -> str:
+    """A value of JSON as text: lists and mappings with commas, those that contain others as JSON."""
+    if isinstance(value, dict) and not any(isinstance(one, dict | list) for one in value.values()):
+        return ", ".join(f"{name} {_in_words(one)}" for name, one in value.items())
+    if isinstance(value, list) and not any(isinstance(one, dict | list) for one in value):
+        return ", ".join(map(_in_words, value))
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "unknown" if value is None else value if isinstance(value, str) else json.dumps(value)
+
+
+def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
+    """Return rows as lines of tab-separated values, of which those that are neither text nor number are JSON."""
+    texts = (["" if one is None else one if isinstance(one, str) else json.dumps(one) for one in row] for row in rows)
+    return "\n".join("\t".join(row) for row in texts)
+
+
+def counted_noun(number: int, noun: str, plural: str | None = None) -> str:
+    """A number with a noun in the singular or plural; by default the plural has an s."""
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
+
+
+def describe_selection(dataset: Dataset) -> str:
+    """Return a paragraph about a selection: what it has, how much of it, and how the returns rise."""
+    info, (start, end) = dataset.info, (dataset.column(name).mean() for name in ("return_start", "return_end"))
+    sizes = ", ".join(
+        (
+            counted_noun(len(dataset), "history", "histories"),
+            counted_noun(int(dataset.column("episodes").sum()), "episode"),
+            counted_noun(int(dataset.column("T").sum()), "step"),
+        )
+    )
+    tasks, layouts, kinds = (
+        len(np.unique(dataset.column_codes(name))) for name in ("task_id", "layout", "teammate_kind")
+    )
+    spans = f"{counted_noun(tasks, 'task')} on {counted_noun(layouts, 'layout')}"
+    spans += f" with {counted_noun(kinds, 'kind of teammate', 'kinds of teammates')}"
+    labels = [f"{name} actions ({n:,})" for name, n in dataset.counts("labels").items()]
+    return (
+        f"{sizes} of a {info.kind} release, data version {info.data_version}, format {info.format_version}: "
+        f"{spans}; {dataset.named_counts('split')}; {dataset.named_counts('source')}. "
+        f"The mean return of an episode rises from {start:.1f} at the start of a history to {end:.1f} at its end. "
+        f"Labels: {' and '.join(labels) or 'none'}."
+    )
 
 
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
@@ -63,6 +158,7 @@ def summarize_selection(dataset: Dataset) -> dict[str, Any]:
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
     ).to_json()
     return {
+        "summary": describe_selection(dataset),
         "root": str(dataset.origin),
         **({"revision": remote.revision, "folder": str(dataset.root)} if remote else {}),
         **content,

@@ -23,7 +23,7 @@ ALIASES = {"algorithm": "teammate_kind"}
 _KNOWN_VALUES = {"split": SPLITS, "track": tuple(TRACKS), "teammate_family": FAMILIES, "source": SOURCES}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Index:
     """A release's index.
 
@@ -36,6 +36,9 @@ class Index:
     root: Path
     info: ReleaseInfo
     entries: Columns
+
+    def __repr__(self) -> str:
+        return f"Index({len(self.entries):,} histories at {self.root})"
 
     def entry(self, history_id: int) -> Entry:
         """The entry of one history.

@@ -139,7 +139,7 @@ class LeftOutTask:
     reason: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReleaseInfo:
     """The content of meta/info.json.
 
@@ -168,6 +168,13 @@ class ReleaseInfo:
     shards: dict[str, _Bytes] = field(default_factory=dict)
     statistics: dict[str, LayoutStatistics] = field(default_factory=dict)
     left_out: list[LeftOutTask] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return (
+            f"ReleaseInfo({self.kind} release {self.data_version} of format {self.format_version}: "
+            f"{self.histories:,} histories and {self.transitions:,} transitions on {', '.join(self.layouts)}; "
+            f"{len(self.shards)} shards, {len(self.left_out)} tasks left out)"
+        )
 
     @property
     def has_chunk_hashes(self) -> bool:

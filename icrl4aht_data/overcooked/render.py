@@ -9,6 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +54,8 @@ def draw_frame(
 def save_frame(path: str | Path, layout: Layout, record: np.ndarray, **options: Any) -> None:
     """Write the picture of one state as PNG; record uint8 (S,), options and errors as in `draw_frame`."""
     frame = draw_frame(layout, record, **options)
-    _write(Path(path), _pillow()[0].fromarray(frame), format="PNG")
+    with atomic_write(Path(path)) as partial:
+        _pillow()[0].fromarray(frame).save(partial, format="PNG")
 
 
 def save_episode(
@@ -69,6 +71,19 @@ def save_episode(
 
     Args:
         path: the file to write.
+        layout, records, rewards, cell, fps: see `encode_episode`, also for the errors.
+    """
+    content = encode_episode(layout, records, rewards, cell=cell, fps=fps)
+    with atomic_write(Path(path)) as partial:
+        partial.write_bytes(content)
+
+
+def encode_episode(
+    layout: Layout, records: np.ndarray, rewards: np.ndarray | None = None, *, cell: int = 32, fps: int = 8
+) -> bytes:
+    """Return an episode as the content of a GIF file of T frames that loops endlessly.
+
+    Args:
         layout: the layout.
         records: state records uint8 (T, S) in order.
         rewards: real (T,), the reward of the step from each record; the captions then show the return so far.
@@ -91,7 +106,9 @@ def save_episode(
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
     other = {"duration": round(1000 / fps), "loop": 0, "comment": MARK.encode()}
     palette = bytes(colours.getpalette() or [])  # passed explicitly, it is written once instead of once per frame
-    _write(Path(path), first, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **other)
+    content = BytesIO()
+    first.save(content, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **other)
+    return content.getvalue()
 
 
 def _pillow():
@@ -116,11 +133,6 @@ def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) ->
     _require(not wrong, f"possible states of layout {layout.name}", "; ".join(wrong))
     _require(cell >= _SMALLEST_CELL, f"cell of at least {_SMALLEST_CELL} pixels", cell)
     return records
-
-
-def _write(path: Path, image: Image.Image, **options: Any) -> None:
-    with atomic_write(path) as partial:
-        image.save(partial, **options)
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:

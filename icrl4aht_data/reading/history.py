@@ -8,13 +8,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import DTypeLike
 
-from icrl4aht_data.errors import LabelsMissingError, NotStoredError, unknown
+from icrl4aht_data.errors import LabelsMissingError, NotStoredError, OptionError, unknown
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import Picture, animate_episode, plot_history
+from icrl4aht_data.reading.episodes import Episodes
 from icrl4aht_data.reading.lazy_array import LazyArray
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
+from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.html import curve_svg, facts_html
 from icrl4aht_data.utils.memory import new_array
 
 Obs = Literal["float32", "uint8", "state"]
@@ -34,6 +38,8 @@ class History:
 
     `history.actions`, `.rewards`, `.obs` and so on are lazy arrays, which behave as NumPy arrays: indexing them reads
     only the chunks it needs, anything else (`history.actions == history.expert_actions`) reads the field.
+    `history["actions"]` is the same as `history.actions`, and `history.episodes[-1].actions` are those of the last
+    episode.
 
     Args:
         entry: the history's entry of the index.
@@ -63,6 +69,29 @@ class History:
             + f", source {e.source}"
             + (f", learner {e.learner})" if e.learner else ")")
         )
+
+    def _repr_html_(self) -> str:
+        """The history's facts and learning curve, for notebooks."""
+        e = self.entry
+        facts = {
+            "layout": f"{e.layout}, {e.split}",
+            "teammate": f"{e.teammate_family}, {e.teammate_kind}",
+            "source": e.source + (f", learner {e.learner}" if e.learner else ""),
+            "length": f"{e.T:,} steps, {e.episodes:,} episodes",
+            "return": f"{e.return_start:.1f} to {e.return_end:.1f}",
+            "labels": ", ".join(name for name in LABELS if e.has(FIELDS[f"{name}_actions"])) or "none",
+            "expert return": "unknown" if e.expert_return is None else f"{e.expert_return:.1f}",
+            "task": e.task_id,
+        }
+        return facts_html(f"History {e.history_id}", facts, curve_svg({e.source: self.returns()}))
+
+    def __getitem__(self, name: str) -> LazyArray:
+        if name == "obs":
+            return self.obs
+        return self._lazy(name)
+
+    __iter__ = None
+    """Disabled: Python would otherwise count through `history[0]`, `history[1]`, which are no fields."""
 
     @property
     def kind(self) -> Kind:
@@ -195,3 +224,45 @@ class History:
     def returns(self) -> np.ndarray:
         """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
         return episode_returns(self.read("rewards"), self.read("dones"))
+
+    @property
+    def episodes(self) -> Episodes:
+        """The episodes, a sequence: `history.episodes[-1].actions` are the actions of the last one."""
+        return Episodes(self.entry, self.__getitem__, lambda: self._ends)
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        """int64 (E,): the step after each episode."""
+        return np.flatnonzero(self.read("dones")) + 1
+
+    def plot(self) -> Picture:
+        """Draw the learning curve, each episode's return, as a picture that notebooks show.
+
+        Raises:
+            OptionError: if matplotlib is not installed.
+        """
+        e = self.entry
+        title = f"History {e.history_id}: {e.layout} with {e.teammate_kind}, source {e.source}"
+        return Picture(f"{title}, return by episode", plot_history(self.returns(), title, e.expert_return))
+
+    def animate(self, episode: int = -1, *, cell: int = 32, fps: int = 8) -> Picture:
+        """Draw an episode as an animated GIF, a picture that notebooks play.
+
+        Args:
+            episode: number of the episode, from 0, or from the end if negative; the last one by default.
+            cell: side of a map cell in pixels, at least 16.
+            fps: frames per second, 1 to 50.
+
+        Raises:
+            OptionError: for an episode that the history does not have, an impossible `cell` or `fps`, or if Pillow is
+                not installed.
+            NotStoredError: for a release without state records, from which nothing can be drawn.
+        """
+        count = self.entry.episodes
+        if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or not -count <= episode < count:
+            raise OptionError(
+                f"episode = {episode!r}: history {self.entry.history_id} has {count} episodes; expected a number from "
+                f"{-count} to {count - 1}"
+            )
+        chosen = self.episodes[int(episode)]
+        return animate_episode(self._shard.layout, chosen.state, chosen.rewards, repr(chosen), cell=cell, fps=fps)

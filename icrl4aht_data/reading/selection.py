@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
@@ -196,13 +196,13 @@ class Selection:
         canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
             f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
-            f"{self._named_counts('split')}; {self._named_counts('source')}; "
+            f"{self.named_counts('split')}; {self.named_counts('source')}; "
             f"{int(self.column('T').sum()):,} transitions, obs {self.obs}{canonical}; "
             f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
         )
 
-    def _named_counts(self, name: str) -> str:
-        """The values of an index field in words, such as "source ppo" or "sources ppo (120), noise (64)"."""
+    def named_counts(self, name: str) -> str:
+        """Return the values of an index field in words, such as "source ppo" or "sources ppo (120), noise (64)"."""
         counts = self.counts(name)
         if len(counts) == 1:
             return f"{name} {next(iter(counts))}"
@@ -292,7 +292,7 @@ class Selection:
         try:
             import pandas
         except ImportError as error:
-            raise OptionError("a data frame needs pandas: pip install pandas") from error
+            raise OptionError("a data frame needs pandas: pip install 'icrl4aht-data[pandas]'") from error
         columns: dict[str, Any] = {}
         for name, hint in ENTRY_HINTS.items():
             if hint is str:
@@ -382,6 +382,8 @@ class Selection:
 
     def filter(
         self,
+        predicate: Callable[[Entry], bool] | None = None,
+        /,
         *,
         min_expert_return: float | None = None,
         learner: int | Sequence[int] | None = None,
@@ -390,6 +392,9 @@ class Selection:
         """Return the histories of this selection whose index fields have one of the wanted values.
 
         Args:
+            predicate: only histories for whose index entry this function returns true, such as
+                `lambda entry: entry.return_end > 30`. It reads no arrays; to choose by their content, give `select` one
+                bool for each history: `ds.select([history.returns().max() > 40 for history in ds])`.
             min_expert_return: only histories whose labels come from a policy that earned at least this much, acting
                 greedily: `Entry.expert_return`.
             learner: only histories of these learners, numbered from 0 within each task: `Entry.learner`.
@@ -399,9 +404,15 @@ class Selection:
         Raises:
             UnknownNameError: for a field or value that does not exist.
             EmptySelectionError: if no history is left.
-            OptionError: if `min_expert_return` is not a number, or `learner` not an integer or several.
+            OptionError: if `predicate` is not a function, `min_expert_return` not a number, or `learner` not an integer
+                or several.
             NotStoredError: for `min_expert_return`, if of some history that is left it is not known.
         """
+        if predicate is not None and not callable(predicate):
+            raise OptionError(
+                f"filter: expected a function of an index entry, such as lambda entry: entry.return_end > 30, found "
+                f"{predicate!r}; values have names: filter(layout={str(predicate)!r})"
+            )
         matching = self.index.query(**wanted)
         ids = self.ids[np.isin(self.ids, matching)]
         if not len(ids):
@@ -409,7 +420,16 @@ class Selection:
         found = type(self)(self.origin, self.index, self._shards, self.options, ids)
         if learner is not None:
             found = found._of_learners(learner)
-        return found if min_expert_return is None else found._earning(min_expert_return)
+        if min_expert_return is not None:
+            found = found._earning(min_expert_return)
+        return found if predicate is None else found._passing(predicate)
+
+    def _passing(self, predicate: Callable[[Entry], bool]) -> Self:
+        """The histories whose index entries pass; see `filter`."""
+        kept = np.array([bool(predicate(self.index.entry(i))) for i in self.ids.tolist()], bool)
+        if not kept.any():
+            raise EmptySelectionError(f"{self.root}: no history of this selection passes the function; it is {self!r}")
+        return self.select(kept)
 
     def _of_learners(self, wanted: int | Sequence[int]) -> Self:
         """The histories of some learners; see `filter`."""

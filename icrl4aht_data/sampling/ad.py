@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, Unpack, cast
 
 import numpy as np
 
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
-from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
+from icrl4aht_data.sampling.base import Sampler, SamplerOptions, batch_repr, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.signatures import show_types
 from icrl4aht_data.utils.validation import check_int
 
+if TYPE_CHECKING:
+    import jax  # noqa: F401 - in the sampler's base class
 
-class ADBatch(NamedTuple):
+A = TypeVar("A")
+"""The type of a batch's arrays: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
+
+
+class ADBatch(NamedTuple, Generic[A]):
     """Windows of learning histories (paper, App. D.4).
 
     Rows are padded with zeros if the history, or the part selected by `episodes` or `curriculum`, is shorter than L.
@@ -37,23 +44,25 @@ class ADBatch(NamedTuple):
             first step; None unless the sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
-        is_first: bool (B, L): True at a history's first step, where the `prev_*` fields are fillers. Samplers always
-            set it.
+        is_first: bool (B, L): True at a history's first step, where the `prev_*` fields are fillers.
     """
 
-    obs: np.ndarray
-    prev_actions: np.ndarray
-    prev_rewards: np.ndarray
-    target_actions: np.ndarray
-    dones: np.ndarray
-    attention_mask: np.ndarray
-    prev_teammate_actions: np.ndarray | None = None
-    layouts: np.ndarray | None = None
-    is_first: np.ndarray | None = None
+    obs: A
+    prev_actions: A
+    prev_rewards: A
+    target_actions: A
+    dones: A
+    attention_mask: A
+    prev_teammate_actions: A | None = None
+    layouts: A | None = None
+    is_first: A = cast(Any, None)  # needs a default after others; samplers always set it
 
     def describe(self) -> str:
         """Return the fields with dtypes and shapes as text, one per line."""
         return describe_batch(self)
+
+    def __repr__(self) -> str:
+        return batch_repr(self)
 
 
 class _Windows(NamedTuple):
@@ -74,7 +83,7 @@ class _Windows(NamedTuple):
     previous: np.ndarray
 
 
-class ADSampler(Sampler[ADBatch]):
+class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     """Windows for Algorithm Distillation: a sequence of batches, each a pure function of (selection, options, seed, i).
 
     A history is drawn uniformly from the selection (or by `weights`), a start uniformly from 0..T - L. Windows cross
@@ -192,7 +201,7 @@ class ADSampler(Sampler[ADBatch]):
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]  # nothing of the window precedes its first step
         return _Windows(position, rows[:, 1], np.minimum(total - start, self.length), rows[:, 1:], rows[:, :-1])
 
-    def batch(self, i: int, out: ADBatch | None = None) -> ADBatch:
+    def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
         batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         position, starts, valid, rows, previous = self._draw(i)
         if self.every > 1:
@@ -214,7 +223,6 @@ class ADSampler(Sampler[ADBatch]):
         self._observer.observe(position, records, batch.obs)
         if batch.layouts is not None:
             batch.layouts[...] = self.dataset.layout_numbers[position]
-        assert batch.is_first is not None
         batch.is_first[...] = False
         batch.is_first[:, 0] = starts == 0
         if self.every > 1:
@@ -227,3 +235,6 @@ class ADSampler(Sampler[ADBatch]):
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch
+
+
+show_types(ADSampler.__init__, Sampler.__init__, SamplerOptions.__annotations__)

@@ -5,21 +5,25 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Iterator
-from typing import Any, Generic, TypedDict, TypeVar
+from textwrap import indent
+from typing import Any, Generic, SupportsIndex, TypedDict, TypeVar, overload
 
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, MixedSplitsWarning, OptionError
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.batches import Batches
-from icrl4aht_data.sampling.draws import Curriculum, Episodes, HistoryDraws, Weights, random_uint32
+from icrl4aht_data.sampling.draws import Curriculum, EpisodeRange, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.memory import array_bytes, fits, free_memory, gigabytes
 from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B", bound=tuple)
-"""A batch: a named tuple of arrays, some of which may be None."""
+"""A batch: a named tuple of NumPy arrays, some of which may be None."""
+
+D = TypeVar("D", bound=tuple)
+"""A batch on a device: the named tuple with JAX arrays."""
 
 
 class SamplerOptions(TypedDict, total=False):
@@ -28,13 +32,13 @@ class SamplerOptions(TypedDict, total=False):
     seed: int
     teammate_actions: bool
     weights: Weights
-    episodes: Episodes | None
+    episodes: EpisodeRange | None
     curriculum: Curriculum | None
     process_index: int
     process_count: int
 
 
-class Sampler(Generic[B]):
+class Sampler(Generic[B, D]):
     """A sequence of batches, each a pure function of its number; see `ADSampler` and `DPTSampler` for the options.
 
     `len(sampler)` is the number of batches that together have as many steps as the selection; larger batch numbers are
@@ -65,7 +69,7 @@ class Sampler(Generic[B]):
         seed: int = 0,
         teammate_actions: bool = False,
         weights: Weights = "uniform",
-        episodes: Episodes | None = None,
+        episodes: EpisodeRange | None = None,
         curriculum: Curriculum | None = None,
         process_index: int = 0,
         process_count: int = 1,
@@ -92,8 +96,18 @@ class Sampler(Generic[B]):
     def __len__(self) -> int:
         return max(1, int(self._draws.lengths.sum()) // (self.batch_size * self.length))
 
-    def __getitem__(self, i: int) -> B:
-        return self.batch(i)
+    def __getitem__(self, index: SupportsIndex) -> B:
+        return self.batch(check_int("batch", index, 0))
+
+    def __repr__(self) -> str:
+        layouts = ", ".join(layout.name for layout in self.layouts)
+        width = max(map(len, self.specs))
+        arrays = [f"{name:<{width}}  {spec.dtype:<8} {spec.shape}" for name, spec in self.specs.items()]
+        return (
+            f"{type(self).__name__}({len(self):,} batches, batch_size {self.batch_size}, {self.length_option} "
+            f"{self.length}, seed {self.seed}, of {len(self.dataset):,} histories on {layouts}; each has\n"
+            f"{indent(chr(10).join(arrays), '    ')}\n)"
+        )
 
     def __iter__(self) -> Iterator[B]:
         return (self[i] for i in range(len(self)))
@@ -123,9 +137,31 @@ class Sampler(Generic[B]):
         except MemoryError as error:  # a limit of the process, or memory that was taken meanwhile
             raise self._too_large() from error
 
+    @overload
     def batches(
-        self, start: int = 0, stop: int | None = None, *, prefetch: int = 2, device: Any = None, reuse: bool = False
-    ) -> Batches[B]:
+        self, start: int = 0, stop: int | None = None, *, prefetch: int = 2, device: None = None, reuse: bool = False
+    ) -> Batches[B]: ...
+
+    @overload
+    def batches(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        *,
+        prefetch: int = 2,
+        device: Any,
+        reuse: bool = False,
+    ) -> Batches[D]: ...
+
+    def batches(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        *,
+        prefetch: int = 2,
+        device: Any = None,
+        reuse: bool = False,
+    ) -> Batches[Any]:
         """Return an iterator over batches start, start + 1, .. that prefetches on a thread; see `Batches`."""
         return Batches(self, start, stop, prefetch=prefetch, device=device, reuse=reuse)
 
@@ -213,7 +249,18 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
 
 
 def describe_batch(batch: Any) -> str:
-    """Fields, dtypes and shapes of a batch's arrays, one per line."""
+    """Fields, dtypes and shapes of a batch's arrays, of NumPy, JAX or PyTorch, one per line."""
     present = {name: array for name, array in batch._asdict().items() if array is not None}
-    width = max(map(len, present))
-    return "\n".join(f"{name:<{width}}  {a.dtype!s:<8} {a.shape}" for name, a in present.items())
+    width = max(map(len, present), default=0)
+    return "\n".join(f"{name:<{width}}  {_describe_array(array)}" for name, array in present.items())
+
+
+def _describe_array(array: Any) -> str:
+    if not hasattr(array, "dtype") or not hasattr(array, "shape"):  # a tree of something else, such as shardings
+        return repr(array)
+    return f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}"
+
+
+def batch_repr(batch: Any) -> str:
+    """A batch's type, and its fields with dtypes and shapes in place of the arrays' numbers."""
+    return f"{type(batch).__name__}(\n{indent(describe_batch(batch), '    ')}\n)"

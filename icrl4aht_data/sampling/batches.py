@@ -83,6 +83,11 @@ class Batches(Iterator[B], Generic[B]):
     def __iter__(self) -> Batches[B]:
         return self
 
+    def __repr__(self) -> str:
+        end = "" if self._stop is None else f" of those below {self._stop}"
+        state = "closed" if self._closed else f"next is batch {self.next}{end}"
+        return f"Batches({state}; {self.served} taken, waited {self.waited:.1f} s) of {self._sampler!r}"
+
     def __next__(self) -> B:
         if self._closed or (self._stop is not None and self.next >= self._stop):
             self.close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, Unpack
 
 import numpy as np
 
@@ -10,18 +10,25 @@ from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
-from icrl4aht_data.sampling.base import Sampler, SamplerOptions, describe_batch
+from icrl4aht_data.sampling.base import Sampler, SamplerOptions, batch_repr, describe_batch
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.signatures import show_types
+
+if TYPE_CHECKING:
+    import jax  # noqa: F401 - in the sampler's base class
+
+A = TypeVar("A")
+"""The type of a batch's arrays: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
 """Valid orders of a context's transitions: consecutive steps (as published), or independent draws."""
 
 
-class DPTBatch(NamedTuple):
+class DPTBatch(NamedTuple, Generic[A]):
     """Queries with contexts (paper, App. D.4).
 
     With obs="state", observations are state records: uint8 (B, S) and (B, K, S) instead of (B, 5, 5, C) and
@@ -41,21 +48,24 @@ class DPTBatch(NamedTuple):
             several layouts.
     """
 
-    query_obs: np.ndarray
-    query_target: np.ndarray
-    context_obs: np.ndarray
-    context_actions: np.ndarray
-    context_next_obs: np.ndarray
-    context_rewards: np.ndarray
-    context_teammate_actions: np.ndarray | None = None
-    layouts: np.ndarray | None = None
+    query_obs: A
+    query_target: A
+    context_obs: A
+    context_actions: A
+    context_next_obs: A
+    context_rewards: A
+    context_teammate_actions: A | None = None
+    layouts: A | None = None
 
     def describe(self) -> str:
         """Return the fields with dtypes and shapes as text, one per line."""
         return describe_batch(self)
 
+    def __repr__(self) -> str:
+        return batch_repr(self)
 
-class DPTSampler(Sampler[DPTBatch]):
+
+class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
     """Queries with contexts: a sequence of batches, each a pure function of (selection, options, seed, i).
 
     For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for
@@ -129,7 +139,7 @@ class DPTSampler(Sampler[DPTBatch]):
             **self._layout_specs(),
         }
 
-    def batch(self, i: int, out: DPTBatch | None = None) -> DPTBatch:
+    def batch(self, i: int, out: DPTBatch[np.ndarray] | None = None) -> DPTBatch[np.ndarray]:
         batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
         query, query_step, context, steps = self._draw(i)
 
@@ -213,3 +223,6 @@ class DPTSampler(Sampler[DPTBatch]):
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
         """Numbers of steps from numbers of transitions, both counted from the first one of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
+
+
+show_types(DPTSampler.__init__, Sampler.__init__, SamplerOptions.__annotations__)

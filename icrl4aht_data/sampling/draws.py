@@ -20,7 +20,7 @@ Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
 WEIGHTS = ("uniform", "length")
 """Named weights of histories in a draw: equal, or proportional to the steps to draw from. Other weights are numbers."""
 
-Episodes = tuple[int | None, int | None]
+EpisodeRange = tuple[int | None, int | None]
 """The first episode and the one after the last, as in a slice: (None, 10) the first ten, (-10, None) the last ten."""
 
 
@@ -67,6 +67,19 @@ def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
     return (raw >> np.uint64(32)).reshape(count, batch_size)
 
 
+def draw_subset(seed: int, total: int, count: int) -> np.ndarray:
+    """int64 (count,): different integers below `total`, ascending; every subset of that size is equally likely.
+
+    This is Floyd's algorithm (Bentley and Floyd 1987): one random integer for each member, whatever the total.
+    """
+    raw = Philox(key=np.array([seed, total], np.uint64)).random_raw(count)
+    chosen: set[int] = set()
+    for last, random in zip(range(total - count, total), raw.tolist(), strict=True):
+        drawn = random % (last + 1)
+        chosen.add(last if drawn in chosen else drawn)
+    return np.array(sorted(chosen), np.int64)
+
+
 def scale_to_range(random: np.ndarray, n: Any) -> np.ndarray:
     """int64: random integers below 2**32 scaled to 0..n - 1."""
     return (random * np.asarray(n).astype(np.uint64) >> np.uint64(32)).astype(np.int64)
@@ -94,7 +107,7 @@ class HistoryDraws:
     Args:
         selection: the histories.
         weights: see `WEIGHTS`.
-        episodes: see `Episodes`; None for all.
+        episodes: see `EpisodeRange`; None for all.
         curriculum: None for all of these episodes at every batch.
 
     Attributes:
@@ -106,7 +119,7 @@ class HistoryDraws:
     """
 
     def __init__(
-        self, selection: Selection, weights: Weights, episodes: Episodes | None, curriculum: Curriculum | None
+        self, selection: Selection, weights: Weights, episodes: EpisodeRange | None, curriculum: Curriculum | None
     ) -> None:
         self.lengths, self._counts = selection.column("T"), selection.column("episodes")
         self.kept_steps: int = selection.info.environment.kept_steps
@@ -168,7 +181,7 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
     return numbers
 
 
-def _episode_range(episodes: Episodes | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First episode and the one after the last in histories of `counts` episodes: int64 (H,) each.
 
     Raises:

@@ -237,7 +237,7 @@ def test_dependencies_come_from_the_metadata(monkeypatch):
 
 
 def test_every_extra_for_users_installs_something():
-    extras = {"plot", "jax", "tensorboard", "hf", "s3", "grain", "torch", "cluster"}
+    extras = {"plot", "jax", "tensorboard", "hf", "pandas", "s3", "grain", "torch", "cluster"}
     extras |= {"gym", "pettingzoo", "jaxmarl", "minari"}
     assert {one.extra for one in dependencies()} == {None, *extras}
     assert extras_with("PIL.Image") == ["plot", "baselines", "generation"]

@@ -33,11 +33,11 @@ from baselines.online.rl2 import (
 from baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
 from baselines.training.histories import read_trained
 from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
-from baselines.training.seen import read_trained_on, teammate_id
+from baselines.training.seen import read_trained_on
 from baselines.training.trainer import TrainingData, train
 from generation.teammates.instances import published_task
 from generation.teammates.registry import build_teammate, sample_teammate
-from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY

@@ -18,9 +18,8 @@ from baselines.report.overlap import OVERLAPS
 from baselines.report.results import GROUP_TEXTS, EvaluationRun, merge
 from baselines.report.summary import csv_text, markdown, rows
 from baselines.report.tables import PAPER_TABLES, fill_table, score_cells, sweep_points
-from baselines.training.seen import teammate_id
 from icrl4aht_data.benchmark.reference_returns import read_headroom
-from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.benchmark.tasks import Task, make_task, teammate_id
 from icrl4aht_data.errors import OptionError
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 

@@ -23,7 +23,6 @@ from jax.experimental import multihost_utils
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
 from baselines.methods.registry import get_method
-from baselines.training import histories
 from baselines.training.histories import hold_out, prepare
 from baselines.training.options import HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS
@@ -38,6 +37,7 @@ from baselines.training.trainer import (
     training_optimizer,
 )
 from generation.learners.resume import Checkpoints
+from icrl4aht_data import dataset as dataset_module
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
 from icrl4aht_data.utils.installation import install_command
@@ -258,7 +258,7 @@ class TestHeldOut:
         """Where a release does not describe teammates, each task counts as one."""
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
-        monkeypatch.setattr(histories, "teammate_ids", lambda dataset, ids: None)
+        monkeypatch.setattr(dataset_module, "teammate_ids", lambda dataset, ids: None)
         split = hold_out(dataset, 0.25)
         assert split.teammates is not None
         parts = (split.train, split.histories, split.teammates)
@@ -300,7 +300,7 @@ class TestHeldOut:
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
         mates = {name: f"mate {number % 2}" for number, name in enumerate(dataset.index.values("task_id"))}
         monkeypatch.setattr(
-            histories, "teammate_ids", lambda dataset, ids: [mates[dataset.index.entry(ids[0]).task_id]]
+            dataset_module, "teammate_ids", lambda dataset, ids: [mates[dataset.index.entry(ids[0]).task_id]]
         )
         for seed in range(5):
             split = hold_out(dataset, 0.3, seed)

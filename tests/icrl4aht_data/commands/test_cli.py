@@ -62,11 +62,61 @@ def test_list_and_show_say_sources_learners_and_labels(two_sources):
     assert facts == [("train", "ppo", 2, 4)] * 2 + [("train", "noise", 1, 3)] * 2 + [("validation", "noise", 1, 3)] * 2
     assert {tuple(row["labels"]) for row in rows} == {("expert", "oracle")}
     text = say("list", root, "--source", "noise", "--split", "validation")
-    assert "ppo" not in text and text.count("expert 5.0, oracle") == 4
+    names, *lines = [line.split("\t") for line in text.splitlines()]
+    found = [dict(zip(names, line, strict=True)) for line in lines]
+    assert [(row["source"], row["labels"], row["expert_return"]) for row in found] == [
+        ("noise", '["expert", "oracle"]', "5.0")
+    ] * 4
     shown = json.loads(say("show", root, "--json"))
     assert (shown["splits"], shown["sources"]) == ({"train": 28, "validation": 12}, {"ppo": 16, "noise": 24})
     assert (shown["learners"], shown["labels"]) == (2, {"expert": 40, "oracle": 40})
     assert "sources ppo (16), noise (24)" in say("show", root)
+
+
+@pytest.fixture
+def on_terminal(monkeypatch):
+    """Run a command as on a terminal of 80 columns; returns the lines that it prints."""
+
+    def say(*arguments: str) -> list[str]:
+        monkeypatch.setenv("COLUMNS", "80")
+        monkeypatch.setattr("icrl4aht_data.commands.cli.is_terminal", lambda: True)
+        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result.output.splitlines()
+
+    return say
+
+
+def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
+    root = str(two_sources[0])
+    tasks = load_icrl4aht(root).counts("task_id")
+    listed = on_terminal("list", root)
+    for task_id in tasks:
+        assert sum(line.rstrip().endswith(f" {task_id[-8:]}") for line in listed) == 1
+    assert listed[-1].split() == [str(len(tasks)), "tasks", "40", "4,800"]
+    assert all(" 5.0" in line for line in listed if line.startswith(("coord_simple", "demo_wide")) and "noise" in line)
+    shown = on_terminal("show", root)
+    paragraph = " ".join(" ".join(shown[: shown.index("")]).split())
+    assert paragraph.startswith("40 histories, 240 episodes, 4,800 steps of a lite release, data version ")
+    assert "12 tasks on 2 layouts with " in paragraph and "sources ppo (16), noise (24)" in paragraph
+    (total,) = [line.split() for line in shown if line.startswith("total")]
+    assert total[1:5] == [str(len(tasks)), "40", "240", "4,800"]
+    one = on_terminal("show", root, "--history", "3")
+    assert "history id" in " ".join(one) and "seed" in " ".join(one)
+    for line in (*listed, *shown, *one):
+        assert len(line) <= 80, line
+
+
+def test_piped_output_is_tab_separated_and_complete(lite):
+    release = load_icrl4aht(lite[0])
+    lines = CliRunner().invoke(cli, ["list", str(lite[0])]).output.splitlines()
+    names = lines[0].split("\t")
+    assert [line.split("\t")[names.index("task_id")] for line in lines[1:]] == list(release.counts("task_id"))
+    shown = CliRunner().invoke(cli, ["show", str(lite[0])]).output.splitlines()
+    facts = dict(line.split("\t") for line in shown)
+    assert facts["transitions"] == "1440"
+    assert json.loads(facts["layouts"])["demo_wide"]["histories"] == 6
+    assert json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)["summary"] == facts["summary"]
 
 
 def test_filters_by_source_reach_every_command(two_sources, tmp_path):

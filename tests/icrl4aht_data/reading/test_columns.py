@@ -83,7 +83,7 @@ def test_data_frame(measured):
 
 def test_a_data_frame_without_pandas(lite, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(OptionError, match="pip install pandas"):
+    with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[pandas\]'"):
         load_icrl4aht(lite[0]).to_pandas()
 
 

@@ -1,0 +1,37 @@
+"""Signatures for `help()`: with the types themselves in place of their source text, and every option by its name."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection
+from typing import Any, TypeVar, get_type_hints
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def show_types(function: F, options_of: Callable[..., Any] | None = None, names: Collection[str] = ()) -> F:
+    """Give a function the signature that `help()` prints: real types, and the options behind its `**options`.
+
+    Args:
+        function: it is changed in place and returned.
+        options_of: function with the options that `function` passes on, which are listed in place of its `**options`,
+            with their types and defaults.
+        names: names of these options.
+    """
+    found = inspect.signature(function)
+    parameters = list(_with_types(function))
+    if options_of is not None:
+        parameters = [one for one in parameters if one.kind is not one.VAR_KEYWORD]
+        parameters += [one for one in _with_types(options_of) if one.name in names]
+    result = get_type_hints(function).get("return", found.return_annotation)
+    signature = found.replace(parameters=parameters, return_annotation=type(None) if result is None else result)
+    function.__signature__ = signature  # type: ignore[attr-defined]
+    return function
+
+
+def _with_types(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    hints = get_type_hints(function)
+    return [
+        one.replace(annotation=hints.get(one.name, one.annotation))
+        for one in inspect.signature(function).parameters.values()
+    ]

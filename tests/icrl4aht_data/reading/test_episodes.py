@@ -1,0 +1,210 @@
+"""Episodes of histories; splits, samples, order and predicates of selections."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import Dataset, load_icrl4aht
+from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.writing.convert import to_release
+
+STEPS = 20
+"""Steps of an episode in the releases of these tests."""
+
+
+@pytest.fixture(scope="module")
+def dataset(lite) -> Dataset:
+    return load_icrl4aht(lite[0], obs="uint8")
+
+
+@pytest.fixture(scope="module")
+def two_sourced(two_sources) -> Dataset:
+    return load_icrl4aht(two_sources[0])
+
+
+class TestEpisodes:
+    @pytest.mark.parametrize("name", ["actions", "rewards", "dones", "teammate_actions", "expert_actions", "state"])
+    def test_arrays_are_those_that_were_written(self, lite, dataset, name):
+        written = lite[1][7][name]
+        for number, episode in enumerate(dataset.history(7).episodes):
+            expected = written[number * STEPS : (number + 1) * STEPS]
+            assert len(episode) == STEPS
+            np.testing.assert_array_equal(getattr(episode, name), expected)
+            np.testing.assert_array_equal(episode[name], expected)
+
+    def test_observations_are_those_of_the_history(self, dataset):
+        history = dataset[8]
+        for chosen in (history, dataset.with_options(obs="state", channels="canonical")[8]):
+            episode = chosen.episodes[2]
+            np.testing.assert_array_equal(episode.obs, chosen.obs[2 * STEPS : 3 * STEPS], strict=True)
+            np.testing.assert_array_equal(episode.episode_end_state, chosen.episode_end_state[2], strict=True)
+
+    def test_indices_and_slices(self, dataset):
+        history = dataset[0]
+        episodes = history.episodes
+        assert len(episodes) == history.entry.episodes == 6
+        assert [(one.number, one.start, one.stop) for one in episodes[-2:]] == [(4, 80, 100), (5, 100, 120)]
+        assert [one.number for one in episodes[::-2]] == [5, 3, 1]
+        assert episodes[-1].number == episodes[1:][-1].number == 5
+        np.testing.assert_array_equal(episodes.returns(), history.returns())
+        np.testing.assert_array_equal(episodes[::-2].returns(), history.returns()[::-2])
+        assert [one.total_return for one in episodes] == history.returns().tolist()
+        for wrong in (6, -7):
+            with pytest.raises(IndexError):
+                episodes[wrong]
+
+    def test_fields_by_name(self, dataset):
+        history = dataset[0]
+        np.testing.assert_array_equal(history["actions"], history.actions[:])
+        np.testing.assert_array_equal(history["obs"][:3], history.obs[:3])
+        for holder in (history, history.episodes[0]):
+            with pytest.raises(UnknownNameError, match=r"unknown field 'action'; valid: .* mean 'actions'"):
+                holder["action"]
+            with pytest.raises(TypeError, match="not iterable"):
+                iter(holder)  # type: ignore[call-overload]
+
+
+class TestPictures:
+    def test_an_animation(self, dataset, tmp_path):
+        history = dataset[6]
+        picture = history.animate(2, cell=16)
+        picture.save(tmp_path / "episode.gif")
+        content = (tmp_path / "episode.gif").read_bytes()
+        assert content.startswith(b"GIF89a")
+        assert "data:image/gif;base64," in picture._repr_html_()
+        assert picture.figure is None
+        assert "Episode(2 of 6 of history 6" in repr(picture)
+        with pytest.raises(OptionError, match=r"x\.png: expected a name that ends in \.gif"):
+            picture.save(tmp_path / "x.png")
+
+    @pytest.mark.parametrize("episode", [6, -7, 1.0, True])
+    def test_episodes_that_do_not_exist(self, dataset, episode):
+        with pytest.raises(
+            OptionError, match=r"episode = .*: history 6 has 6 episodes; expected a number from -6 to 5"
+        ):
+            dataset[6].animate(episode)
+
+    def test_nothing_is_drawn_from_observations(self, full, tmp_path):
+        to_release(load_icrl4aht(full[0]), tmp_path / "o", "observations")
+        with pytest.raises(NotStoredError, match="this release has observations only"):
+            load_icrl4aht(tmp_path / "o")[0].animate()
+
+    def test_figures(self, dataset, tmp_path):
+        for number, holder in enumerate((dataset, dataset[0])):
+            picture = holder.plot()
+            assert picture.figure is not None
+            assert any(axes.get_lines() for axes in picture.figure.axes)
+            picture.save(tmp_path / f"{number}.svg")
+            assert (tmp_path / f"{number}.svg").read_bytes().startswith(b"<?xml ")
+            assert "data:image/png;base64," in picture._repr_html_()
+
+
+class TestSplit:
+    @pytest.mark.parametrize("by", ["teammate", "history"])
+    def test_parts_are_disjoint_and_do_not_depend_on_order(self, two_sourced, by):
+        train, validation = two_sourced.split(0.25, seed=3, by=by)
+        assert sorted([*train.ids, *validation.ids]) == sorted(two_sourced.ids)
+        shuffled = two_sourced.select(np.random.default_rng(0).permutation(two_sourced.ids))
+        assert set(shuffled.split(0.25, seed=3, by=by)[1].ids) == set(validation.ids)
+        others = {tuple(two_sourced.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
+        assert len(others) > 1
+
+    def test_by_teammate_no_teammate_is_in_both(self, two_sourced):
+        train, validation = (set(part.column("task_id")) for part in two_sourced.split(0.3))
+        assert train and validation and not train & validation
+
+    def test_by_history_every_task_is_trained_on(self, two_sourced):
+        train, validation = two_sourced.split(0.9, by="history")
+        assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(two_sourced.column("task_id"))
+
+    def test_what_cannot_be_divided(self, two_sourced):
+        one = two_sourced.filter(task_id=str(two_sourced.column("task_id")[0]))
+        with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; take by="history"'):
+            one.split()
+        with pytest.raises(OptionError, match=r"every task of .* has one history"):
+            one[:1].split(by="history")
+        for share in (0, 1, 1.5):
+            with pytest.raises(OptionError, match=rf"share = {share}: expected a number between 0 and 1"):
+                two_sourced.split(share)
+        with pytest.raises(OptionError, match="validation = True: expected the share"):
+            two_sourced.split(True)
+        with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
+            two_sourced.split(by="task")  # type: ignore[arg-type]
+
+
+class TestSampling:
+    def test_episodes_are_different_and_a_function_of_the_seed(self, dataset):
+        found = [(one.entry.history_id, one.number) for one in dataset.sample_episodes(30, seed=2)]
+        assert len(set(found)) == 30
+        assert found == sorted(found)
+        assert found == [(one.entry.history_id, one.number) for one in dataset.sample_episodes(30, seed=2)]
+        assert found != [(one.entry.history_id, one.number) for one in dataset.sample_episodes(30, seed=3)]
+        assert len(dataset.sample_episodes(72)) == 12 * 6
+
+    def test_every_episode_is_equally_likely(self, dataset):
+        part = dataset[:2]
+        counts = np.zeros((2, 6))
+        for seed in range(600):
+            for one in part.sample_episodes(4, seed=seed):
+                counts[one.entry.history_id, one.number] += 1
+        assert counts.sum() == 2400
+        assert np.abs(counts - 200).max() < 60  # five standard deviations
+
+    @pytest.mark.parametrize(
+        ("n", "message"), [(73, "the selection has 72 episodes"), (0, "at least 1"), (1.5, "integer")]
+    )
+    def test_impossible_numbers(self, dataset, n, message):
+        with pytest.raises(OptionError, match=f"n = {n}: .*{message}"):
+            dataset.sample_episodes(n)
+
+
+class TestOrder:
+    def test_numbers_and_names(self, two_sourced):
+        ordered = two_sourced.sort("return_end")
+        assert (np.diff(ordered.column("return_end")) >= 0).all()
+        assert (np.diff(two_sourced.sort("return_end", reverse=True).column("return_end")) <= 0).all()
+        by_both = two_sourced[::-1].sort("layout", "history_id")
+        assert by_both.ids.tolist() == [
+            row for _, row in sorted(zip(two_sourced.column("layout"), two_sourced.ids.tolist(), strict=True))
+        ]
+        assert len(by_both.sort("obs_shape")) == len(two_sourced)
+
+    def test_equal_histories_keep_their_order(self, two_sourced):
+        for reverse in (False, True):
+            again = two_sourced.sort("action_dim", reverse=reverse)
+            assert again.ids.tolist() == two_sourced.ids.tolist()
+
+    def test_unknown_values_are_last(self, two_sourced):
+        steps = two_sourced.column("expert_step")
+        assert (steps == -1).any()
+        known = int((steps != -1).sum())
+        for reverse in (False, True):
+            assert (two_sourced.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
+
+    def test_wrong_names(self, two_sourced):
+        with pytest.raises(UnknownNameError, match="unknown column 'return'"):
+            two_sourced.sort("return")
+        with pytest.raises(OptionError, match="expected the name of an index field"):
+            two_sourced.sort()
+
+
+class TestPredicates:
+    def test_entries_that_pass(self, two_sourced):
+        found = two_sourced.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
+        assert 0 < len(found) < len(two_sourced)
+        assert (found.column("env_idx") > 0).all()
+        assert set(found.column("source")) == {"noise"}
+        whole = two_sourced.filter(source="noise", split="train")
+        assert found.ids.tolist() == whole.ids[whole.column("env_idx") > 0].tolist()
+
+    def test_by_content(self, dataset):
+        best = max(history.returns().max() for history in dataset)
+        found = dataset.select([history.returns().max() == best for history in dataset])
+        assert 0 < len(found) <= len(dataset)
+
+    def test_nothing_passes_or_no_function(self, two_sourced):
+        with pytest.raises(EmptySelectionError, match="no history of this selection passes the function"):
+            two_sourced.filter(lambda entry: False)
+        with pytest.raises(OptionError, match=r"filter: expected a function .*found 'demo_wide'"):
+            two_sourced.filter("demo_wide")

@@ -1,0 +1,146 @@
+"""What people see: `repr`, HTML in notebooks, `help()`, and the types that a checker finds in a user's script."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import jax
+import numpy as np
+import pytest
+
+import icrl4aht_data
+from icrl4aht_data import ADBatch, ADSampler, Curriculum, Dataset, DPTSampler, Report, get_layout, load_icrl4aht
+from icrl4aht_data.checking.report import Finding
+from icrl4aht_data.interop import torch_loader
+from icrl4aht_data.utils.html import curve_svg, facts_html
+from tests.helpers.paths import ROOT
+
+
+@pytest.fixture(scope="module")
+def bundled() -> Dataset:
+    return load_icrl4aht()
+
+
+def shown(dataset: Dataset) -> dict[str, object]:
+    """One object of every public class, and those that their attributes lead to."""
+    selection = dataset.filter(layout="demo_wide")
+    sampler, contexts, history = (
+        selection.ad(batch_size=2, length=30),
+        selection.dpt(batch_size=2, context=20),
+        dataset[0],
+    )
+    report = Report("release", findings=[Finding(f"file {number}", "x" * 1000) for number in range(300)])
+    return {
+        "ADBatch": sampler[0],
+        "ADSampler": sampler,
+        "Batches": sampler.batches(stop=3),
+        "Curriculum": Curriculum(10),
+        "DPTBatch": contexts[0],
+        "DPTSampler": contexts,
+        "Dataset": dataset,
+        "Episode": history.episodes[0],
+        "Episodes": history.episodes,
+        "History": history,
+        "Layout": get_layout("demo_wide"),
+        "Report": report,
+        "actions": history.actions,
+        "cache": dataset.cache,
+        "entry": history.entry,
+        "index": dataset.index,
+        "info": dataset.info,
+        "picture": history.plot(),
+    }
+
+
+def test_every_public_object_fits_one_screen(bundled):
+    objects = shown(bundled)
+    public = [name for name in icrl4aht_data.__all__ if inspect.isclass(getattr(icrl4aht_data, name))]
+    assert set(public) - {"Icrl4ahtError"} <= set(objects)
+    for name, value in objects.items():
+        text = repr(value)
+        lines = sum(-(-len(line) // 80) for line in text.splitlines())
+        assert 1 <= lines <= 24, f"{name}: {lines} lines of 80 columns"
+        assert not re.search(r" object at 0x", text), name
+
+
+def test_batches_print_shapes_wherever_their_arrays_are(bundled):
+    sampler = bundled.filter(layout="demo_wide").with_options(obs="uint8").ad(batch_size=2, length=30)
+    lines = repr(sampler[0]).splitlines()
+    assert lines[0] == "ADBatch("
+    assert [line.split() for line in lines[1:3]] == [
+        ["obs", "uint8", "(2,", "30,", "5,", "5,", "45)"],
+        ["prev_actions", "int32", "(2,", "30)"],
+    ]
+    with sampler.batches(stop=1, device=jax.devices()[0]) as batches:
+        (on_device,) = batches
+    assert repr(on_device) == repr(sampler[0])
+    (tensors,) = torch_loader(sampler, stop=1)
+    assert repr(tensors).replace("int64", "int32") == repr(sampler[0])
+    assert "obs             P('data',)" in repr(ADBatch(*[jax.sharding.PartitionSpec("data")] * 6))
+
+
+def test_html_has_a_learning_curve_and_counts(bundled):
+    for value, words in ((bundled, ["532 histories", "noise (456)", "demo_wide"]), (bundled[0], ["History 0", "H3"])):
+        html = value._repr_html_()
+        tree = ElementTree.fromstring(html)
+        assert tree.findall(".//{*}polyline") or tree.findall(".//polyline")
+        for word in words:
+            assert word in html
+        assert len(html) < 20_000
+
+
+def test_html_escapes_names():
+    html = facts_html("<b>", {"<i>": "a & b"}, curve_svg({"<s>": np.array([1.0, 3.0])}))
+    assert "<b>" not in html and "<i>" not in html and "<s>" not in html
+    assert ElementTree.fromstring(html).find("strong") is not None
+
+
+def test_a_constant_curve_of_one_value_is_drawn():
+    (line,) = ElementTree.fromstring(curve_svg({"ppo": np.array([2.0])})).iter("polyline")
+    assert line.get("points")
+
+
+@pytest.mark.parametrize("function", [Dataset.ad, Dataset.dpt, ADSampler, DPTSampler], ids=lambda f: f.__qualname__)
+def test_help_lists_the_options_with_their_types(function):
+    signature = inspect.signature(function)
+    for name, annotation, default in (("seed", int, 0), ("teammate_actions", bool, False), ("process_count", int, 1)):
+        assert (signature.parameters[name].annotation, signature.parameters[name].default) == (annotation, default)
+    assert "options" not in signature.parameters
+    assert not any(isinstance(one.annotation, str) for one in signature.parameters.values())
+    assert ("length" in signature.parameters) != ("context" in signature.parameters)
+    assert "weights" in signature.parameters and "Unpack" not in str(signature)
+
+
+def test_help_of_loading_shows_types():
+    assert inspect.signature(load_icrl4aht).return_annotation is Dataset
+
+
+SCRIPT = Path(__file__).with_name("user_script.py")
+
+
+def test_a_users_script_has_no_type_errors(tmp_path):
+    """Checks Grain, PyTorch and JAX device batches; a wrong line shows that the checker sees the types."""
+    settings = {"typeCheckingMode": "standard", "pythonVersion": "3.11", "extraPaths": [str(ROOT)]}
+    settings |= {"venvPath": str(Path(sys.prefix).parent), "venv": Path(sys.prefix).name}
+    wrong = "\nfrom icrl4aht_data import load_icrl4aht as load\nload().ad(batch_size=2, length=3)[0].obs.at\n"
+    (tmp_path / "right.py").write_text(SCRIPT.read_text())
+    (tmp_path / "wrong.py").write_text(wrong)
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    checker = Path(sys.executable).with_name("basedpyright")
+    done = subprocess.run([checker, "--outputjson", "-p", tmp_path], capture_output=True, text=True, check=False)
+    found = json.loads(done.stdout)["generalDiagnostics"]
+    errors = [(Path(one["file"]).name, one["message"]) for one in found if one["severity"] == "error"]
+    assert [name for name, _ in errors] == ["wrong.py"], errors
+    assert '"at"' in errors[0][1]
+
+
+def test_the_users_script_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(SCRIPT.read_text(), str(SCRIPT), "exec"), {})
+    assert (tmp_path / "episode.gif").read_bytes().startswith(b"GIF89a")
