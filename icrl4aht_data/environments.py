@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.installation import install_command
 
 if TYPE_CHECKING:
     import gymnasium
@@ -71,7 +72,7 @@ def make_environment(**options: Any) -> gymnasium.Env:
         options: options of `gymnasium.make` and of `generation.adapters.gymnasium_env.TaskEnv`, among them `task`.
 
     Raises:
-        OptionError: if Gymnasium, JAX or the package `generation` is not installed.
+        OptionError: if Gymnasium or JAX is not installed.
     """
     try:
         import gymnasium
@@ -79,6 +80,4 @@ def make_environment(**options: Any) -> gymnasium.Env:
         register_environments()
         return gymnasium.make(TASK_ENVIRONMENT, **options)
     except ImportError as error:
-        raise OptionError(
-            f"an environment needs {error.name or error}: pip install 'icrl4aht-data[gym]', in a checkout"
-        ) from error
+        raise OptionError(f"an environment needs {error.name or error}: {install_command('gym')}") from error

@@ -30,6 +30,7 @@ from icrl4aht_data.reading.sources import (
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 
@@ -292,7 +293,7 @@ class Selection:
         try:
             import pandas
         except ImportError as error:
-            raise OptionError("a data frame needs pandas: pip install 'icrl4aht-data[pandas]'") from error
+            raise OptionError(f"a data frame needs pandas: {install_command('pandas')}") from error
         columns: dict[str, Any] = {}
         for name, hint in ENTRY_HINTS.items():
             if hint is str:
