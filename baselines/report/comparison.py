@@ -392,6 +392,8 @@ def ablation_table(stored: StoredResults, name: str) -> str:
         comparable = entry is not ABLATIONS[name].entries[0] and mean.shape == first.shape
         difference = _with_interval(mean - first, "+") if comparable else ""
         rows.append([_code(entry.name), entry.about, _with_interval(mean), difference, _with_interval(gain, "+")])
+    if not rows:
+        return f"No results of `{name}` are stored."
     return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], rows)
 
 

@@ -34,6 +34,7 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import MINARI_FILES, atomic_folder, check_target, write_listing
 from icrl4aht_data.writing.stored import HistoryProgress, with_source
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
 _LABELS = {"expert_actions": "expert_action", "oracle_actions": "oracle_action"}
-_INSTALL = "Minari is needed: pip install 'icrl4aht-data[minari]'"
 
 
 class _History(msgspec.Struct):
@@ -94,7 +94,7 @@ def to_minari(
         from gymnasium import spaces
         from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
-        raise OptionError(_INSTALL) from error
+        raise OptionError(f"Minari is needed: {install_command('minari')}") from error
     if not dataset.has_states:
         raise NotStoredError(
             f"{dataset.root}: has observations only, without those after the last steps of episodes, which a Minari "
@@ -256,7 +256,7 @@ def _open(source: Path) -> _Opened:
     try:
         from minari import MinariDataset
     except ImportError as error:
-        raise OptionError(_INSTALL) from error
+        raise OptionError(f"Minari is needed: {install_command('minari')}") from error
     try:
         dataset = MinariDataset(source / "data")
         metadata = dataset.storage.metadata
