@@ -427,7 +427,9 @@ def plot_comparison(stored: StoredResults, protocol: str, agents: Sequence[str],
     for number, agent in enumerate(agents):
         cells = stored.cells.get((agent, protocol), {})
         heights = [cells[cell].mean.mean() if cell in cells else np.nan for cell in chosen]
-        axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=agent)
+        met = _marks(one for found in cells.values() for one in found.overlaps if one != "family")
+        label = f"{agent}{met} (see the marks)" if met else agent
+        axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=label)
     for name, style in (("oracle", "k_"), ("stay", "rx")):
         axes.plot(numbers, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
     axes.set_xticks(numbers, [f"{layout}\n{family}" for layout, family in chosen], rotation=60, fontsize=8)

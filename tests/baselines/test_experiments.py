@@ -313,6 +313,7 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
         "filters": {"teammate_family": ("rl",), "algorithm": ("fcp", "brdiv")},
         "acting": None,
         "save_minutes": 0.5,
+        "batch_size": 8,  # the default of a CPU; the given one takes precedence
         "layouts": ("cramped_up",),
         "values": ("ta",),
         "train": {"steps": 1, "batch_size": 2, "warmup": 0.5},

@@ -240,8 +240,9 @@ def test_every_extra_for_users_installs_something():
     extras = {"plot", "jax", "tensorboard", "hf", "pandas", "s3", "grain", "torch", "cluster"}
     extras |= {"gym", "pettingzoo", "jaxmarl", "minari"}
     assert {one.extra for one in dependencies()} == {None, *extras}
-    assert extras_with("PIL.Image") == ["plot", "baselines", "generation"]
-    assert extras_with("optax") == ["jax", "baselines", "generation"]
+    adapters = ["gym", "jaxmarl", "pettingzoo"]
+    assert extras_with("PIL.Image") == ["plot", "baselines", "generation", *adapters]
+    assert extras_with("optax") == ["jax", "baselines", "generation", *adapters]
 
 
 def test_package_that_is_not_installed(elsewhere, monkeypatch):

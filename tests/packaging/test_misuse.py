@@ -62,7 +62,7 @@ reader: show --plot empty | 'empty' is a directory
 reader: download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 reader: download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 reader: download s3://a/b --to file | 'file' is a file
-reader: convert {MINI} --out out | give the form to convert to: --to full, lite, observations, published, parquet
+reader: convert {MINI} --out out | give the form to convert to: --to full, lite, observations, published,
 reader: convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
 reader: convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 reader: convert {MINI} --out out --to lite --tasks none | 'none' does not exist
@@ -90,7 +90,7 @@ baselines: train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only 
 baselines: collect --agent none --out c | A trained model is named by its folder
 baselines: collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
 baselines: collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<=x<=1
-baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, ad-noise,
+baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-tests, ad-noise,
 baselines: reference --name rl2 --no-evaluate --bundle-as x | its card states its results
 baselines: results empty | Missing option '--out'
 baselines: collect --agent stay --out file | 'file' is a file

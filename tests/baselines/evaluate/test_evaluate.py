@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -295,9 +296,15 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     tasks = [make_task("teammate", "validation", "coord_simple", task.teammate, 5) for task in SIMPLE[:2]]
     write_tasks(tmp_path / "teammate_validation.jsonl", tasks)
     write_tasks(tmp_path / "teammate_test.jsonl", SIMPLE)
-    monkeypatch.setattr(
-        "baselines.evaluate.protocols.manifest_path", lambda track, split: tmp_path / f"{track}_{split}.jsonl"
-    )
+
+    def path(track: str, split: str, teammates: str = "") -> Path:
+        return tmp_path / ("_".join(filter(None, (track, teammates, split))) + ".jsonl")
+
+    for track in TRACKS:
+        write_tasks(path(track, "validation", "diverse"), [])
+    write_tasks(path("layout", "validation"), [])
+    write_tasks(path("layout", "test"), [])
+    monkeypatch.setattr("baselines.evaluate.protocols.manifest_path", path)
     monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name)))
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import asdict
@@ -19,6 +20,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.environments import TASK_ENVIRONMENT, make_environment
 from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.utils.installation import install_command
 from tests.helpers.paths import ROOT
 
 NAME = "icrl4aht/demo_wide-H4-t0-v0"
@@ -232,5 +234,5 @@ def test_wrong_use_is_an_error():
 
 def test_without_gymnasium_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(OptionError, match=r"needs gymnasium: pip install 'icrl4aht-data\[gym\]'"):
+    with pytest.raises(OptionError, match=re.escape("needs gymnasium: " + install_command("gym"))):
         make_environment(task={})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,17 @@ def open_page(file) -> Iterator[OpenPage]:
         yield opened
         browser.close()
         assert not problems
+
+
+def wait_until(page: Any, condition: str) -> None:
+    """Wait until a JavaScript expression is true, for ten seconds at most.
+
+    Playwright's own function of this kind calls `eval` in the page, which the page's security policy forbids.
+    """
+    end = time.monotonic() + 10
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, condition
+        page.wait_for_timeout(20)
 
 
 def table_of(page) -> dict[str, str]:
@@ -138,7 +150,7 @@ def test_choosing_and_keys(open_page, dataset):
     page = open_page("#history=0&episode=3&step=0")
     shown = "document.querySelector('.pane figcaption').textContent.split(',')[0]"
     page.keyboard.press("n")
-    page.wait_for_function(f"{shown} === 'Episode 4 of 6'")
+    wait_until(page, f"{shown} === 'Episode 4 of 6'")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
     assert table_of(page)["Step"] == "2 of 20"
@@ -146,22 +158,22 @@ def test_choosing_and_keys(open_page, dataset):
     assert table_of(page)["Step"] == "13 of 20"
     page.focus("#curve")
     page.keyboard.press("Home")
-    page.wait_for_function(f"{shown} === 'Episode 1 of 6'")
+    wait_until(page, f"{shown} === 'Episode 1 of 6'")
     page.keyboard.press("f")
-    page.wait_for_function("document.querySelectorAll('.pane').length === 2")
+    wait_until(page, "document.querySelectorAll('.pane').length === 2")
     assert [text[:14] for text in page.locator("figcaption").all_inner_texts()] == ["Episode 1 of 6", "Episode 6 of 6"]
     page.keyboard.press("f")
-    page.wait_for_function("document.querySelectorAll('.pane').length === 1")
+    wait_until(page, "document.querySelectorAll('.pane').length === 1")
     curve = page.locator("#curve")
     curve.click(position={"x": curve.bounding_box()["width"] / 2, "y": 60})
-    page.wait_for_function(f"['Episode 3 of 6', 'Episode 4 of 6'].includes({shown})")
+    wait_until(page, f"['Episode 3 of 6', 'Episode 4 of 6'].includes({shown})")
     page.select_option("#layout", "test_wide")
-    page.wait_for_function("currentFacts().layout === 'test_wide'")
+    wait_until(page, "currentFacts().layout === 'test_wide'")
     kind = dataset.entries[0].teammate_kind
     teammates = page.locator("#teammate option").all_text_contents()
     assert [name.partition("/")[2] for name in teammates] == [f"{kind} t0", f"{kind} t1"]
     page.select_option("#teammate", teammates[1])
-    page.wait_for_function(f"currentFacts().teammate === '{teammates[1]}'")
+    wait_until(page, f"currentFacts().teammate === '{teammates[1]}'")
     assert page.locator("#history option").count() == 2
     page.close()
 
@@ -170,7 +182,7 @@ def test_playing_ends_with_the_episode_and_can_pause(open_page):
     page = open_page("#history=0&episode=1&step=0")
     page.select_option("#speed", "50")
     page.keyboard.press(" ")
-    page.wait_for_function("chosen.step === 20 && playing === null")
+    wait_until(page, "chosen.step === 20 && playing === null")
     assert page.inner_text("#play") == "Play"
     page.select_option("#speed", "1")
     page.keyboard.press("Home")
@@ -210,6 +222,6 @@ def test_a_damaged_page_says_so(open_page, file, tmp_path):
     at = text.index('"histories": ["') + 200
     (tmp_path / "damaged.html").write_text(text[:at] + "AAAA" + text[at + 4 :])
     page = open_page("", tmp_path / "damaged.html")
-    page.wait_for_function("!document.getElementById('problem').hidden")
+    wait_until(page, "!document.getElementById('problem').hidden")
     assert page.inner_text("#problem").startswith("This page is damaged")
     page.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import warnings
 
@@ -19,6 +20,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.provenance import ExpertLabels
 from icrl4aht_data.format.schema import ENTRY_HINTS
+from icrl4aht_data.utils.installation import install_command
 from tests.helpers.random_releases import random_release
 
 
@@ -83,7 +85,7 @@ def test_data_frame(measured):
 
 def test_a_data_frame_without_pandas(lite, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[pandas\]'"):
+    with pytest.raises(OptionError, match=re.escape("" + install_command("pandas"))):
         load_icrl4aht(lite[0]).to_pandas()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 import gymnasium
@@ -17,6 +18,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.environments import TASK_ENVIRONMENT
 from icrl4aht_data.errors import MinariFormatError, NotStoredError, OptionError
 from icrl4aht_data.format.schema import FIELDS
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.writing.minari import from_minari, is_minari_dataset, to_minari
 
 EPISODES, STEPS = 6, 20
@@ -163,7 +165,7 @@ class TestWrongDatasets:
 
     def test_without_minari(self, made, lite, monkeypatch):
         monkeypatch.setitem(sys.modules, "minari", None)
-        with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[minari\]'"):
+        with pytest.raises(OptionError, match=re.escape("" + install_command("minari"))):
             to_minari(load_icrl4aht(lite[0]), made.with_name("x-v0"))
-        with pytest.raises(OptionError, match=r"pip install 'icrl4aht-data\[minari\]'"):
+        with pytest.raises(OptionError, match=re.escape("" + install_command("minari"))):
             from_minari(made, made.with_name("back"))
