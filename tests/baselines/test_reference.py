@@ -19,6 +19,7 @@ from baselines.training.options import HistoryOptions, TrainOptions
 from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import UnknownNameError
 
@@ -59,6 +60,10 @@ def small(monkeypatch, tmp_path) -> Path:
         monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
     monkeypatch.setattr(reference, "TEACHER_HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
+    monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
+    diverse = read_tasks(manifest_path("layout", "train", "diverse"))
+    few = [next(task for task in diverse if task.layout.name == layout) for layout in TRACKS["layout"]["train"]]
+    monkeypatch.setattr(reference, "read_tasks", lambda path: few)
     (tmp_path / "noise").mkdir()
     (tmp_path / "noise" / "lite").symlink_to(MINI)
     return tmp_path
