@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test test-slow check format bench-env bench-eval bench-learner bench-curves bench-collect bench-gpu bench-loader bench-remote bench-faults bench-train clean
+.PHONY: help install demo generate teammates verify control test test-slow check docs format bench-env bench-eval bench-learner bench-curves bench-collect bench-gpu bench-loader bench-remote bench-faults bench-train clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -49,6 +49,9 @@ test: check ## lint, types and the default tests (8 minutes on 2 cores): WORKERS
 test-slow: install ## the slow tests: wheels, killed processes, Ray, several devices, long series of faults
 	$(PYTEST) -m slow
 
+docs: install ## build the documentation into build/docs; fails on broken links and names
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 check: install ## lint, formatting and types
 	$(BIN)/ruff check $(CODE)
 	$(BIN)/ruff format --check $(CODE)
@@ -58,8 +61,8 @@ format: install ## format the code and apply the linter's fixes
 	$(BIN)/ruff check --fix $(CODE)
 	$(BIN)/ruff format $(CODE)
 
-bench-env: install ## environment steps/s, compared with JaxMARL's, JSON lines
-	$(BIN)/python -m benchmarks.bench_env
+bench-env: install ## steps/s of environments, and of IPPO in them, compared with JaxMARL's, JSON lines; PEER= takes its IPPO
+	$(BIN)/python -m benchmarks.bench_env $(if $(PEER),--peer $(PEER))
 
 bench-eval: install ## evaluation steps/s per teammate family, compared with the environment alone, JSON lines
 	$(BIN)/python -m benchmarks.bench_eval

@@ -28,6 +28,7 @@ from baselines.report.lead import (
 )
 from baselines.report.overlap import overlap_legend
 from baselines.report.page import write_page_with_episodes
+from baselines.report.rendering import check_can_render
 from baselines.report.results import EvaluationRun, note_results, read_run, shipped_validation_tasks
 from baselines.training.histories import prepare
 from baselines.training.options import HistoryOptions, TrainOptions
@@ -91,9 +92,10 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     Raises:
         ReleaseError: if the release is damaged.
-        OptionError: if matplotlib is not installed.
+        OptionError: if matplotlib or Jinja2 is not installed.
     """
     check_can_draw()
+    check_can_render()
     started = time.perf_counter()
     settings = settings or DemoSettings()
     model, training = settings.model, settings.training

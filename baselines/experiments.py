@@ -25,8 +25,9 @@ from baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from baselines.methods.registry import get_method
 from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
 from baselines.report.page import write_page_with_episodes
+from baselines.report.rendering import check_can_render
 from baselines.report.results import merge, note_results, read_run
-from baselines.report.summary import REPORT_BEGINS, write_report
+from baselines.report.summary import report_begins, write_report
 from baselines.training.ablations import ABLATIONS, ExperimentEntry
 from baselines.training.histories import TrainingTask, filter_histories, prepare
 from baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
@@ -209,6 +210,7 @@ def run_experiment(
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
     check_can_draw()  # before the long work, not after it
+    check_can_render()
     if name not in EXPERIMENTS:
         raise unknown("experiment", name, EXPERIMENTS)
     experiment = EXPERIMENTS[name]
@@ -219,7 +221,7 @@ def run_experiment(
     chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
     if any(histories["channels"] == "canonical" for histories in chosen):
         notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
-    check_new_files(out / "report", overwrite=True, begins={**REPORT_BEGINS, "report.html": None})  # of a stopped run
+    check_new_files(out / "report", overwrite=True, begins={**report_begins(), "report.html": None})  # of a stopped run
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
@@ -228,7 +230,9 @@ def run_experiment(
         _evaluate_entry(experiment, entry, tasks[layout], plan, run, folder / "results", progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
-    check_new_files(out / "report", overwrite=True, begins={card_name(run): CARD_BEGINS for run in runs})
+    check_new_files(
+        out / "report", overwrite=True, begins=report_begins(runs) | {card_name(run): CARD_BEGINS for run in runs}
+    )
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"

@@ -5,92 +5,130 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from icrl4aht_data.benchmark.facts import FAMILIES, LAYOUT_NAMES, TRACKS
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, Cell
-from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import legend_below, new_figure, save_figure
+from icrl4aht_data.benchmark.reference_returns import Cell
+from icrl4aht_data.plotting import MOST_PANELS, legend_below, new_figure, return_limits, running_mean, save_figure
 
+LogCurves = dict[str, dict[str, dict[int, list[float]]]]
+"""Panel -> curve -> training step -> values."""
 
-class SweepPoint(NamedTuple):
-    """One run of a sweep on one layout.
-
-    Attributes:
-        value: of what is varied.
-        mean: return, over the cells played.
-        std: of the cells' means; None for a single cell.
-        published: the paper's mean, if it states one for these conditions.
-    """
-
-    value: Any
-    mean: float
-    std: float | None
-    published: float | None
+_RETURN = "return"
+"""First word of the names of returns in a log, "return <layout> [<variant>] <kind of teammate>"."""
 
 
 def plot_training_log(metrics: Path, path: Path, title: str) -> None:
-    """Plot every number of a run's metrics.jsonl over the training steps: a panel each, a line per part of the data."""
-    lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
-    names = list(dict.fromkeys(name for line in lines for name in line if name not in ("step", "part")))
-    parts = list(dict.fromkeys(line["part"] for line in lines))
-    columns = min(3, len(names))
-    rows = -(-len(names) // columns)
-    figure = new_figure(4.6 * columns, 3.1 * rows)
-    panels: list[Any] = [*figure.subplots(rows, columns, squeeze=False).flat]
-    for axes, name in zip(panels, names, strict=False):
-        for part in parts:
-            points = [(line["step"], line[name]) for line in lines if line["part"] == part and name in line]
-            if points:
-                axes.plot(*np.transpose(points), "-" if part == "train" else ".-", label=part, linewidth=1.2)
-        axes.set_title(name.replace("_", " "), fontsize=9)
-        axes.set_xlabel("training step", fontsize=8)
-        axes.grid(alpha=0.3)
-    for axes in panels[len(names) :]:
-        axes.set_axis_off()
-    figure.suptitle(title, fontsize=10)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(parts), frameon=False)
-    save_figure(figure, path)
+    """Plot the numbers of a run's metrics.jsonl over the training steps, in at most `MOST_PANELS` panels.
 
-
-def plot_return_curves(runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]], path: Path) -> None:
-    """Plot the return per episode: a panel per cell, a line per run, with the range over several instances as a band.
-
-    Args:
-        runs: (label, cell -> returns (instances, episodes)); the second part of a cell starts with its family.
-        path: PNG file to write.
+    Each number has a panel with a line per part of the data; returns have a panel per layout with a line per kind of
+    teammate, on one axis. Thick lines are running means over a twentieth of the points, thin ones the points.
     """
-    cells = {cell for _, returns in runs for cell in returns}
-    layouts = [layout for layout in LAYOUT_NAMES if any(cell[0] == layout for cell in cells)]
-    groups = {cell[1] for cell in cells}
-    families = sorted(groups, key=lambda group: (FAMILIES.index(group.partition(" ")[0]), group))
-    figure = new_figure(2.5 * len(layouts) + 1, 2.1 * len(families) + 0.6)
-    axes = figure.subplots(len(families), len(layouts), squeeze=False, sharex=True)
-    for i, family in enumerate(families):
-        for j, layout in enumerate(layouts):
-            for label, returns in runs:
-                if (layout, family) in returns:
-                    _plot_band(axes[i, j], label, returns[layout, family])
-            axes[i, j].grid(alpha=0.3)
-    for j, layout in enumerate(layouts):
-        axes[0, j].set_title(layout, fontsize=9)
-        axes[-1, j].set_xlabel("episode", fontsize=8)
-    for i, family in enumerate(families):
-        axes[i, 0].set_ylabel(family)
+    lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
+    panels = _log_curves(lines, by_layout=True)
+    if len(panels) > MOST_PANELS:
+        panels = _log_curves(lines, by_layout=False)
+    labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
+    of_returns = [curve for name, curves in panels.items() if name.startswith(_RETURN) for curve in curves.values()]
+    limits = return_limits(float(np.mean(values)) for curve in of_returns for values in curve.values())
+    columns = min(4 if len(panels) > 9 else 3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = new_figure(4.2 * columns, 2.6 * rows + 0.4)
+    grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False).flat]
+    for axes, (name, curves) in zip(grid, panels.items(), strict=False):
+        for label, points in curves.items():
+            _plot_log_curve(axes, label, f"C{labels.index(label)}", points)
+        if name.startswith(_RETURN):
+            axes.set_ylim(*limits)
+        axes.set_title(name if name.startswith(_RETURN) else name.replace("_", " "), fontsize=9)
+        axes.grid(alpha=0.3)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    for axes in grid[max(0, len(panels) - columns) : len(panels)]:
+        axes.set_xlabel("training step", fontsize=8)
+    figure.suptitle(title, fontsize=10)
     legend_below(figure)
     save_figure(figure, path)
 
 
-def _plot_band(axis: Any, label: str, returns: np.ndarray, smooth: int = 10) -> None:
-    window = min(smooth, returns.shape[1])
-    kernel = np.ones(window) / window
-    curves = np.stack([np.convolve(row, kernel, mode="valid") for row in returns])
-    episodes = np.arange(window, returns.shape[1] + 1)
-    (line,) = axis.plot(episodes, curves.mean(axis=0), label=label)
-    axis.fill_between(episodes, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.2, linewidth=0)
+def _log_curves(lines: Sequence[Mapping[str, Any]], by_layout: bool) -> LogCurves:
+    """Returns the curves of a log, with a panel of returns for each layout, or one for all."""
+    found: LogCurves = {}
+    for line in lines:
+        for name in (name for name in line if name not in ("step", "part")):
+            panel, label = name, line["part"]
+            if name.startswith(f"{_RETURN} "):
+                words = name.split()
+                panel = f"{_RETURN}, {words[1]}" if by_layout else f"{_RETURN}, mean over layouts"
+                label = words[-1].replace("_", " ") + ("" if label == "train" else f", {label}")
+            found.setdefault(panel, {}).setdefault(label, {}).setdefault(line["step"], []).append(line[name])
+    return found
+
+
+def _plot_log_curve(axes: Any, label: str, color: str, points: Mapping[int, Sequence[float]]) -> None:
+    steps, values = list(points), np.array([np.mean(of_step) for of_step in points.values()])
+    window = len(values) // 20
+    if window > 1:
+        axes.plot(steps, values, color=color, alpha=0.35, linewidth=0.7)
+    marker = "" if len(values) > 20 else "."
+    axes.plot(steps, running_mean(values, window), color=color, marker=marker, label=label, linewidth=1.4)
+
+
+SMOOTHING = 10
+"""Most episodes in the running mean of a curve of returns; of few episodes a tenth."""
+
+
+def smooth_returns(returns: Float[np.ndarray, " E"]) -> Float[np.ndarray, " E"]:
+    """Returns the running mean of a task's returns over up to `SMOOTHING` episodes."""
+    return running_mean(returns, min(SMOOTHING, len(returns) // 10))
+
+
+def plot_return_curves(
+    runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]], cells: Sequence[Cell], path: Path
+) -> None:
+    """Plot the return per episode on shared axes: a panel per cell, a line per run.
+
+    Lines are running means of the mean over a cell's instances, bands the range of the instances' running means, and
+    thin lines the mean of each single episode.
+
+    Args:
+        runs: (label, cell -> returns (instances, episodes)).
+        cells: the cells to draw, at most `MOST_PANELS`.
+        path: file to write, of a type in `icrl4aht_data.plotting.PICTURES`.
+    """
+    columns = min(4, len(cells))
+    rows = -(-len(cells) // columns)
+    figure = new_figure(2.7 * columns + 0.5, 1.9 * rows + 0.7)
+    panels: list[Any] = [*figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat]
+    limits = []
+    for axes, cell in zip(panels, cells, strict=False):
+        for number, (label, returns) in enumerate(runs):
+            if cell in returns:
+                limits += _plot_curve(axes, label, f"C{number}", returns[cell])
+        axes.set_title(f"{cell[0]}, {cell[1]}", fontsize=9)
+        axes.grid(alpha=0.3)
+    for axes in panels[len(cells) :]:
+        axes.set_axis_off()
+    panels[0].set_ylim(*return_limits(limits))
+    for axes in panels[-columns:]:
+        axes.set_xlabel("episode", fontsize=9)
+    for axes in panels[::columns]:
+        axes.set_ylabel("return", fontsize=9)
+    legend_below(figure)
+    save_figure(figure, path)
+
+
+def _plot_curve(axes: Any, label: str, color: str, returns: np.ndarray) -> list[float]:
+    """Plots the curve of a run in a cell. Returns the lowest and the highest return drawn."""
+    curves = np.stack([smooth_returns(row) for row in returns])
+    low, high, raw = curves.min(axis=0), curves.max(axis=0), returns.mean(axis=0)
+    episodes = np.arange(1, returns.shape[1] + 1)
+    axes.fill_between(episodes, low, high, color=color, alpha=0.15, linewidth=0)
+    axes.plot(episodes, raw, color=color, alpha=0.35, linewidth=0.7)
+    axes.plot(episodes, curves.mean(axis=0), color=color, label=label, linewidth=1.6)
+    return [float(min(low.min(), raw.min())), float(max(high.max(), raw.max()))]
 
 
 _AGENT_COLOUR = "#1f5fa8"
@@ -131,59 +169,3 @@ def plot_family_curves(
     figure.suptitle(title, fontsize=11)
     legend_below(figure)
     save_figure(figure, path, dpi=130)
-
-
-def plot_sweep(panels: Mapping[str, Mapping[str, Sequence[SweepPoint]]], quantity: str, path: Path) -> None:
-    """Plot the return over the varied quantity: a panel per layout, a line per agent, hollow diamonds for the paper."""
-    figure = new_figure(3.4 * len(panels) + 1, 3.2)
-    axes: Any = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axis, (layout, lines) in zip(axes, panels.items(), strict=True):
-        names = list(dict.fromkeys(str(point.value) for points in lines.values() for point in points))
-        for agent, points in lines.items():
-            x = [names.index(str(point.value)) for point in points]
-            bars = [np.nan if p.std is None else p.std for p in points]
-            drawn = axis.errorbar(x, [p.mean for p in points], bars, label=agent, marker="o", capsize=3, linewidth=1.3)
-            stated = [(k, p.published) for k, p in zip(x, points, strict=True) if p.published is not None]
-            if stated:
-                colour = drawn.lines[0].get_color()
-                axis.plot(*np.transpose(stated), "D", markerfacecolor="none", color=colour, label=f"{agent}, paper")
-        axis.set_xticks(range(len(names)), names)
-        axis.set_title(layout, fontsize=9)
-        axis.set_xlabel(quantity)
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("mean return over families")
-    legend_below(figure)
-    save_figure(figure, path)
-
-
-def plot_adaptation_gain(runs: Sequence[tuple[str, Mapping[Cell, float]]], path: Path) -> None:
-    """Plot the adaptation gain per track (paper, App. F): mean over cells as a bar, a dot per cell.
-
-    Args:
-        runs: (label, cell -> gain).
-        path: PNG file to write.
-
-    Raises:
-        OptionError: if there is no run.
-    """
-    if not runs:
-        raise OptionError("no run to draw the adaptation gain of; give at least one folder of results")
-    figure = new_figure(4.2 + 0.5 * len(runs), 3.2)
-    axis = figure.add_subplot()
-    width = 0.8 / len(runs)
-    for number, (label, cells) in enumerate(runs):
-        for position, track in enumerate(TRACKS):
-            tested = TRACKS[track]["test"]
-            gains = [gain for cell, gain in cells.items() if cell[0] in tested and cell[1] in HEURISTICS]
-            if gains:
-                x = position + (number - (len(runs) - 1) / 2) * width
-                shown = label if label not in axis.get_legend_handles_labels()[1] else None
-                axis.bar(x, np.mean(gains), width * 0.9, color=f"C{number}", alpha=0.6, label=shown)
-                axis.plot(np.full(len(gains), x), gains, ".", color=f"C{number}", markersize=4)
-    axis.axhline(0, color="black", linewidth=0.8)
-    axis.set_xticks(range(len(TRACKS)), [f"track {track}" for track in TRACKS])
-    axis.set_xlim(-0.5, len(TRACKS) - 0.5)
-    axis.set_ylabel("last 20 - first 20 episodes")
-    axis.grid(alpha=0.3, axis="y")
-    legend_below(figure)
-    save_figure(figure, path)

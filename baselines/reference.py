@@ -2,20 +2,25 @@
 
     OUT/noise/lite              release of noise histories, as `generation generate --profile noise` makes it
     OUT/rl2-TRACK               RL^2, trained by playing with the training teammates of that release
-    OUT/histories-TRACK         histories of RL^2 whose noise falls, source `student`
+    OUT/student-TRACK           histories of RL^2 whose noise falls, source `student`
+    OUT/rising-TRACK            such histories that begin at random, see `RL2_HISTORIES`
     OUT/NAME-TRACK              run folder of a model
     OUT/NAME-TRACK-first        its first training, before it was labelled on histories of its own
     OUT/NAME-TRACK-own          these histories, and OUT/NAME-TRACK-mixed with the others
     OUT/results/NAME-TRACK/...  results on validation tasks and on test tasks
+    OUT/times.jsonl             wall seconds of each part that was made, and the number of cores
 
 Everything resumes: finished parts are kept, stopped ones continue.
 """
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -30,20 +35,24 @@ from baselines.online.student import collect_release, release_teammates
 from baselines.report.comparison import cells_with_headroom
 from baselines.report.model_card import model_card
 from baselines.report.results import merge, note_results, read_run
-from baselines.training.histories import prepare, read_trained, start_from
+from baselines.training.histories import prepare, start_from
 from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
+from baselines.training.run_folder import CHECKPOINTS
 from baselines.training.trainer import format_loss, train
+from generation.learners.resume import Checkpoints
 from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import MINI, load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.writing.combine import combine_releases
 
-Data = Literal["tasks", "noise", "ppo", "both", "student"]
+Data = Literal["tasks", "noise", "ppo", "both", "student", "rising"]
 """What a model learns from: playing, noise histories, those of PPO learners of the bundled release, both, or histories
-of RL^2."""
+of RL^2, see `RL2_HISTORIES`."""
 
 PROFILE = "noise"
 """Profile of the release that everything starts from."""
@@ -59,7 +68,9 @@ class Recipe:
         model: values of `ModelOptions`.
         train: values of `TrainOptions`.
         histories: values of `HistoryOptions`.
-        rounds: number of further trainings, each with histories that the model plays and RL^2 labels.
+        rounds: number of further trainings, each with histories that the model plays and RL^2 labels, in addition to
+            all earlier ones. After one round, 2 of 10 histories with each teammate are own ones (`OWN_HISTORIES`); they
+            are shorter, a ninth of all episodes.
         mode: way in which the model plays.
         protocols: protocol of the evaluation on test tasks -> number of seeds.
         forgets: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
@@ -82,7 +93,19 @@ class Recipe:
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
+_DPT_STEPS: dict[str, Any] = {**_STEPS, "steps": 2000}
+_QUERIES: dict[str, Any] = {"queries": _STEPS["context"] + 1}  # another one after every part of a context
 _TEACHER: dict[str, Any] = {**RL2_SETTINGS["train"], "steps": 1600}
+
+RL2_HISTORIES = {
+    "student": NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8)),
+    "rising": NoiseConfig(8, 40, start=(0.8, 1.0), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.4, 0.9)),
+}
+"""Kind of data -> noise of histories of RL^2 with each teammate. The end of every history is without noise. Those of
+`rising` begin at random or nearly so, as learners begin, for a model that imitates how they improve."""
+
+OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
+"""Histories that a model plays itself."""
 
 RECIPES = {
     "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER, mode=PlayMode(greedy=False)),
@@ -96,16 +119,29 @@ RECIPES = {
         meets_tests=True,
     ),
     "ad-noise": Recipe("ad", "noise", _TINY, _STEPS, {"labels": "oracle"}),
-    "dpt-noise": Recipe("dpt", "noise", _TINY, _STEPS, {"labels": "oracle"}),
+    "dpt-noise": Recipe("dpt", "noise", _TINY, _DPT_STEPS, {"labels": "oracle", **_QUERIES}),
     "ad-ppo": Recipe("ad", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
-    "dpt-ppo": Recipe("dpt", "ppo", _TINY, _STEPS, {"labels": "oracle"}),
+    "dpt-ppo": Recipe("dpt", "ppo", _TINY, _DPT_STEPS, {"labels": "oracle", **_QUERIES}),
     "ad-both": Recipe("ad", "both", _TINY, _STEPS, {"labels": "oracle"}),
-    "dpt-both": Recipe("dpt", "both", _TINY, _STEPS, {"labels": "oracle"}),
+    "dpt-both": Recipe("dpt", "both", _TINY, _DPT_STEPS, {"labels": "oracle", **_QUERIES}),
     "ad-learned": Recipe("ad", "both", _TINY, _STEPS, {"labels": "oracle", "teammate_family": ("rl",)}),
     "ad-student": Recipe("ad", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
-    "dpt-student": Recipe("dpt", "student", _TINY, _STEPS, {"labels": "expert"}, rounds=1),
+    "dpt-student": Recipe(
+        "dpt",
+        "student",
+        _TINY,
+        _DPT_STEPS,
+        {"labels": "expert", **_QUERIES},
+        rounds=1,
+        mode=PlayMode(greedy=False),
+    ),
     "ad-rising": Recipe(
-        "ad", "student", _TINY, _STEPS, {"every": 3}, mode=PlayMode(greedy=False), protocols={"seeded": 3}, forgets=True
+        "ad",
+        "rising",
+        _TINY,
+        {**_STEPS, "steps": 3000, "batch_size": 4, "context": 1000},
+        mode=PlayMode(greedy=False),
+        forgets=True,
     ),
 }
 """Reference models by name."""
@@ -124,11 +160,11 @@ TRACK_PLAY: dict[str, dict[str, Any]] = {
 }
 """Track -> values of `PlayOptions` for its models that learn by playing."""
 
-TEACHER_HISTORIES = NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8))
-"""Histories of RL^2 with each teammate: the last fifth of a history, or more, is without noise."""
+TIMES = "times.jsonl"
+"""File name of the times of parts, see this module's docstring."""
 
-OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
-"""Histories that a model plays itself."""
+VALIDATION_KINDS = ("validation", "diverse")
+"""Kinds of tasks that models are chosen by."""
 
 OWN_SHARE = 0.5
 """Learning rate of a training on own histories, as a share of the first training's."""
@@ -151,7 +187,7 @@ class ReferenceOutcome(NamedTuple):
 
 
 def write_bundled_card(name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS) -> Path:
-    """Write the card of a bundled model, with its results on test tasks. Returns its path.
+    """Write the card of a bundled model, with its results on test and validation tasks. Returns its path.
 
     Args:
         name: of the bundled model.
@@ -160,8 +196,19 @@ def write_bundled_card(name: str, outcomes: Sequence[ReferenceOutcome], folder: 
     """
     (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
     path = folder / name / MODEL_CARD
-    path.write_text(model_card(run), encoding="utf-8")
+    validation = merge([read_run(found.results[kind]) for found in outcomes for kind in VALIDATION_KINDS])
+    command = f"python -m baselines reference --name {outcomes[0].name} --bundle-as {name}"
+    path.write_text(model_card(run, name, command, validation), encoding="utf-8")
     return path
+
+
+def describe_times(out: Path) -> str:
+    """Returns a sentence on the total time of the parts in a folder; empty if none was timed."""
+    path = out / TIMES
+    lines = [parse_json(line) for line in read_text(path).splitlines()] if path.exists() else []
+    hours = sum(line["seconds"] for line in lines) / 3600
+    cores = " or ".join(map(str, sorted({line["cores"] for line in lines})))
+    return f"everything in {out} took {hours:.2f} hours on {cores} cores; see {path}" if lines else ""
 
 
 Show = Callable[..., None]
@@ -193,6 +240,11 @@ def make_reference(name: str, track: str, out: Path, show: Show, evaluates: bool
     return ReferenceOutcome(name, track, run, made.evaluate(name, run, recipe) if evaluates else {})
 
 
+def _is_trained(folder: Path, options: TrainOptions) -> bool:
+    """Returns whether the training in a run folder has reached its last step."""
+    return Checkpoints(folder / CHECKPOINTS).latest == options.steps
+
+
 @dataclass(frozen=True)
 class _Making:
     """The steps towards the reference models of a track."""
@@ -201,20 +253,35 @@ class _Making:
     track: str
     show: Show
 
+    @contextmanager
+    def timed(self, part: str, was_done: bool = False) -> Iterator[None]:
+        """Add the wall time of a part to the file of times; nothing for a part that was done before."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:  # a part that was stopped has a line for each time that it ran
+            if not was_done:
+                self.out.mkdir(parents=True, exist_ok=True)
+                line = {"part": part, "seconds": round(time.perf_counter() - start, 1), "cores": usable_cores()}
+                with (self.out / TIMES).open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+
     @property
     def layouts(self) -> tuple[str, ...]:
         return TRACKS[self.track]["train"]
 
-    def diverse(self, split: str) -> list[Task]:
-        """Returns the tasks with diverse teammates, of split "train" or "validation"."""
-        return read_tasks(manifest_path(self.track, split, "diverse"))
+    def diverse(self) -> list[Task]:
+        """Returns the training tasks with diverse teammates."""
+        return read_tasks(manifest_path(self.track, "train", "diverse"))
 
     def noise_release(self) -> Path:
         """Returns the release of noise histories, which is made if it is missing."""
         folder = self.out / "noise"
         if not (folder / "lite").is_dir():
             command = ["-m", "generation", "generate", "--profile", PROFILE, "--out", str(folder)]
-            if subprocess.run([sys.executable, *command], check=False).returncode:
+            with self.timed(folder.name):
+                failed = subprocess.run([sys.executable, *command], check=False).returncode
+            if failed:
                 raise OptionError(f"{folder}: `python {' '.join(command)}` failed; its messages are above")
         return folder / "lite"
 
@@ -222,37 +289,32 @@ class _Making:
         """Returns the run folder of RL^2."""
         recipe, folder = RECIPES[name], self.out / f"{name}-{self.track}"
         options = TrainOptions(**recipe.train)
-        layouts, tasks, play = self.layouts, self.diverse("train"), PlayOptions(**TRACK_PLAY[self.track])
+        layouts, tasks, play = self.layouts, self.diverse(), PlayOptions(**TRACK_PLAY[self.track])
         if recipe.meets_tests:
             tasks, play = self._tasks("test"), PlayOptions()
             layouts = tuple(dict.fromkeys(task.layout.name for task in tasks))
         choice = HistoryOptions(layouts, str(self.noise_release()), **TRACK_VIEWS[self.track])
-        job = prepare_play(recipe.method, ModelOptions(**recipe.model), options, play, choice, tasks)
-        train(
-            job.method,
-            job.data,
-            options,
-            folder,
-            job.about,
-            trainer=job.trainer,
-            done=self._progress(folder.name, options.steps),
-        )
+        done = self._progress(folder.name, options.steps)
+        with self.timed(folder.name, was_done=_is_trained(folder, options)):
+            job = prepare_play(recipe.method, ModelOptions(**recipe.model), options, play, choice, tasks)
+            train(job.method, job.data, options, folder, job.about, trainer=job.trainer, done=done)
         return folder
 
-    def histories(self) -> Path:
-        """Returns the release with histories of RL^2."""
-        folder = self.out / f"histories-{self.track}"
+    def histories(self, kind: str) -> Path:
+        """Returns the release with histories of RL^2 of a kind, one of `RL2_HISTORIES`."""
+        folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
             agent = find_agent(str(self.play()), PlayMode(greedy=False))
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
-            teammates = release_teammates(dataset, tasks=self.diverse("train"))
-            collect_release(agent, teammates, TEACHER_HISTORIES, folder, progress=self.show)
+            teammates = release_teammates(dataset, tasks=self.diverse())
+            with self.timed(folder.name):
+                collect_release(agent, teammates, RL2_HISTORIES[kind], folder, progress=self.show)
         return folder
 
     def root(self, recipe: Recipe) -> Path:
         """Returns the release that a model is first trained on."""
-        if recipe.data == "student":
-            return self.histories()
+        if recipe.data in RL2_HISTORIES:
+            return self.histories(recipe.data)
         return MINI if recipe.data in ("ppo", "both") else self.noise_release()
 
     def train(self, name: str, recipe: Recipe) -> Path:
@@ -260,27 +322,34 @@ class _Making:
         folder, root = self.out / f"{name}-{self.track}", self.root(recipe)
         first = folder if not recipe.rounds else folder.with_name(f"{folder.name}-first")
         self._train_once(recipe, root, first, TrainOptions(**recipe.train))
+        data = root
         for number in range(1, recipe.rounds + 1):
             end = "" if number == recipe.rounds else f"-{number}"
             target = folder.with_name(folder.name + end)
-            self._train_on_own(recipe, root, first, target, number)
+            data = self._train_on_own(recipe, data, first, target, number)
             first = target
         return folder
 
-    def _train_on_own(self, recipe: Recipe, root: Path, before: Path, target: Path, number: int) -> None:
-        """Train a model further, on histories that it plays itself and RL^2 labels besides those of RL^2."""
+    def _train_on_own(self, recipe: Recipe, data: Path, before: Path, target: Path, number: int) -> Path:
+        """Train a model further, on the release `data` and histories that it plays itself and RL^2 labels.
+
+        Returns:
+            The release of all these histories.
+        """
         own, mixed = (target.with_name(f"{target.name}-{kind}") for kind in ("own", "mixed"))
         if not mixed.is_dir():
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
             labeller = find_agent(str(self.play()))
-            teammates = release_teammates(dataset, number, self.diverse("train"))
+            teammates = release_teammates(dataset, number, self.diverse())
             agent = find_agent(str(before), PlayMode(greedy=False))
             if not own.is_dir():
-                collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
-            combine_releases(mixed, [root, own])
+                with self.timed(own.name):
+                    collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
+            combine_releases(mixed, [data, own])
         options = TrainOptions(**recipe.train)
         rate = OWN_SHARE * options.learning_rate
         self._train_once(recipe, mixed, target, replace(options, learning_rate=rate), before)
+        return mixed
 
     def _train_once(
         self, recipe: Recipe, root: Path, folder: Path, options: TrainOptions, before: Path | None = None
@@ -290,40 +359,40 @@ class _Making:
         histories = HistoryOptions(
             self.layouts, str(root), source=sources, channels="canonical", **recipe.histories, **views
         )
-        job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
-        params = None
-        if before is not None:
-            trained = read_trained(before)
-            params = start_from(trained, job.about)
         done = self._progress(folder.name, options.steps)
-        train(job.method, job.data, job.options, folder, job.about, params=params, done=done)
+        with self.timed(folder.name, was_done=_is_trained(folder, options)):
+            job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
+            params = None if before is None else start_from(before, job.method, job.about)
+            train(job.method, job.data, job.options, folder, job.about, params=params, done=done)
 
     def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
         """Returns the folders of a model's results, by the kind of tasks."""
         found = {}
-        kinds = [("validation", "seeded", 1, False), ("diverse", "seeded", 1, False)]
+        kinds = [(kind, "seeded", 1, False) for kind in VALIDATION_KINDS]
         kinds += [(f"test-{protocol}", protocol, seeds, False) for protocol, seeds in recipe.protocols.items()]
         kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
         for kind, protocol, seeds, forgets in kinds:
             tasks, folder = self._tasks(kind), self.out / "results" / f"{name}-{self.track}" / kind
             agent = find_agent(str(run), recipe.mode._replace(forget=forgets))
             played = get_protocol(protocol)
-            evaluate(
-                name + FORGETS * forgets,
-                agent.make,
-                tasks,
-                played,
-                seeds=range(seeds),
-                out=folder,
-                details=agent.details,
-                played=counted(self.show, f"{name}, {kind}", len(tasks) * seeds * played.episodes),
-            )
+            was_done = len(list((folder / "tasks").glob("*.json"))) >= len(tasks)
+            with self.timed(f"results/{name}-{self.track}/{kind}", was_done=was_done):
+                evaluate(
+                    name + FORGETS * forgets,
+                    agent.make,
+                    tasks,
+                    played,
+                    seeds=range(seeds),
+                    out=folder,
+                    details=agent.details,
+                    played=counted(self.show, f"{name}, {kind}", len(tasks) * seeds * played.episodes),
+                )
             note_results(folder, run, () if kind.startswith("test") else tasks)
             found[kind] = folder
         return found
 
     def _tasks(self, kind: str) -> list[Task]:
-        if kind in ("validation", "diverse"):
+        if kind in VALIDATION_KINDS:
             return bundled_tasks(self.track, kind)
         headroom = {layout for layout, _ in cells_with_headroom("seeded")}
         return [task for task in bundled_tasks(self.track, "test") if task.layout.name in headroom]

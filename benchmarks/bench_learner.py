@@ -6,20 +6,15 @@
 
 One JSON line each. XLA takes the threads that the profiles fix. The peer is JaxMARL's
 `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which its package does not contain: give the path of a copy. Both learn on
-the same map with the same network, environments and hyper-parameters, in turn in one process. Modules that the peer
-imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by stubs; it also needs distrax, from
-the extra `peers`.
+the same map with the same network, environments and hyper-parameters, in turn in one process.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import statistics
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import click
@@ -27,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from benchmarks.common import elapsed, print_line, rates_in_turn, ratio_facts
+from benchmarks.common import compiled_call, elapsed, print_line, rates_in_turn, ratio_facts
 from benchmarks.flops import compile_measured
 from generation.env import Environment
 from generation.learners.config import PPOConfig
@@ -215,54 +210,6 @@ def _descend(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda point: jax.tree.map(lambda x, slope: x - 1e-6 * slope, point, jax.grad(function)(point))
 
 
-def load_peer(path: Path) -> ModuleType:
-    """Import the peer's file as a module."""
-    silent: Any = ModuleType("silent")
-    silent.main = lambda **_: lambda function: function
-    silent.log = lambda metric: None
-    silent.OmegaConf = None
-    for name in ("hydra", "omegaconf", "wandb"):
-        sys.modules.setdefault(name, silent)
-    spec = importlib.util.spec_from_file_location("jaxmarl_ippo", path)
-    if spec is None or spec.loader is None:
-        raise click.UsageError(f"{path}: not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def peer_training(module: ModuleType, layout: Layout, config: PPOConfig) -> Callable[[], None]:
-    """A compiled call of the peer's training: initialisation and `_PEER_UPDATES` updates."""
-    from benchmarks.peers import jaxmarl_environment  # only the peer needs JaxMARL
-
-    module.jaxmarl.make = lambda name, **options: jaxmarl_environment(layout)
-    options = {
-        "ENV_NAME": "overcooked_v2",
-        "ENV_KWARGS": {},
-        "LR": config.learning_rate,
-        "ANNEAL_LR": True,
-        "LR_WARMUP": config.warmup,
-        "NUM_ENVS": config.environments,
-        "NUM_STEPS": config.rollout,
-        "UPDATE_EPOCHS": config.epochs,
-        "NUM_MINIBATCHES": config.minibatches,
-        "TOTAL_TIMESTEPS": _PEER_UPDATES * config.steps_per_update,
-        "REW_SHAPING_HORIZON": config.shaping_horizon,
-        "FC_DIM_SIZE": config.widths.head,
-        "GRU_HIDDEN_DIM": config.widths.gru,
-        "CLIP_EPS": config.clip,
-        "ENT_COEF": config.entropy,
-        "GAMMA": config.discount,
-        "GAE_LAMBDA": config.gae_lambda,
-        "SCALE_CLIP_EPS": False,
-        "VF_COEF": config.value,
-        "MAX_GRAD_NORM": config.max_grad_norm,
-        "ACTIVATION": "relu",
-    }
-    train = jax.jit(module.make_train(options)).lower(jax.random.PRNGKey(0)).compile()
-    return lambda: jax.block_until_ready(train(jax.random.PRNGKey(0)))
-
-
 def our_training(layout: Layout, config: PPOConfig) -> Callable[[], None]:
     """A compiled call of our training: initialisation and `_PEER_UPDATES` updates."""
     population = Population(Environment(layout), FCP(1), config)
@@ -271,14 +218,16 @@ def our_training(layout: Layout, config: PPOConfig) -> Callable[[], None]:
         state = population.init(key)
         return jax.lax.scan(lambda state, _: population.update(state), state, length=_PEER_UPDATES)
 
-    train = jax.jit(train_through).lower(jax.random.key(0)).compile()
-    return lambda: jax.block_until_ready(train(jax.random.key(0)))
+    return compiled_call(train_through, jax.random.key(0))
 
 
 def compare_peer(peer: Path, layout: Layout, config: PPOConfig, rounds: int) -> None:
     """Print steps/s of self-play learning with the paper's network, ours with encoder `words`, and the ratio."""
+    from benchmarks.peers import jaxmarl_environment, jaxmarl_training  # only the peer needs JaxMARL
+
     words = replace(config, widths=replace(config.widths, encoder="words"))
-    ours, theirs = our_training(layout, words), peer_training(load_peer(peer), layout, config)
+    ours = our_training(layout, words)
+    theirs = jaxmarl_training(peer, jaxmarl_environment(layout), config, _PEER_UPDATES)
     pairs = rates_in_turn(ours, theirs, _PEER_UPDATES * config.steps_per_update, rounds)
     sizes = {name: getattr(config, name) for name in ("environments", "rollout", "minibatches")}
     print_line(

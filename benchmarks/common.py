@@ -25,6 +25,14 @@ def elapsed(work: Callable[[], Any]) -> float:
     return time.perf_counter() - started
 
 
+def compiled_call(function: Callable[[Any], Any], key: Any) -> Callable[[], Any]:
+    """A compiled call of a JAX function with a key, which waits for the result."""
+    import jax  # readers are measured without it
+
+    compiled = jax.jit(function).lower(key).compile()
+    return lambda: jax.block_until_ready(compiled(key))
+
+
 def rates_in_turn(
     ours: Callable[[], Any], peer: Callable[[], Any], steps: int, rounds: int
 ) -> list[tuple[float, float]]:

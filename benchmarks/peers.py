@@ -1,14 +1,30 @@
-"""Peers of benchmarks and differential tests: environments of other packages on our layouts."""
+"""Peers of benchmarks and differential tests: JaxMARL's environment on our layouts, and its recurrent IPPO.
+
+The learner is JaxMARL's `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which its package does not contain: it is run from
+the path of a copy. Modules that it imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by
+stubs; it also needs distrax, from the extra `peers`.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stdout
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
+import click
+import jax
+
+from benchmarks.common import compiled_call
+from generation.learners.config import PPOConfig
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 
 with redirect_stdout(sys.stderr):  # it prints on import
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
     from jaxmarl.environments.overcooked_v2.layouts import Layout as PeerLayout
     from jaxmarl.environments.overcooked_v2.overcooked import OvercookedV2
 
@@ -24,3 +40,61 @@ def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> Overc
         sample_recipe_on_delivery=True,
         indicate_successful_delivery=layout.indicates_delivery,
     )
+
+
+def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, updates: int) -> Callable[[], Any]:
+    """Returns a compiled call of JaxMARL's IPPO on an environment, which initialises and waits for its updates.
+
+    The call returns what the script's function `train` returns.
+
+    Args:
+        script: a copy of JaxMARL's file.
+        env: the environment that the script gets in place of the one that it asks for.
+        config: hyper-parameters.
+        updates: number of updates.
+
+    Raises:
+        click.UsageError: if `script` is not a Python file.
+    """
+    module = _load_script(script)
+    module.jaxmarl.make = lambda name, **options: env
+    options = {
+        "ENV_NAME": "overcooked_v2",
+        "ENV_KWARGS": {},
+        "LR": config.learning_rate,
+        "ANNEAL_LR": True,
+        "LR_WARMUP": config.warmup,
+        "NUM_ENVS": config.environments,
+        "NUM_STEPS": config.rollout,
+        "UPDATE_EPOCHS": config.epochs,
+        "NUM_MINIBATCHES": config.minibatches,
+        "TOTAL_TIMESTEPS": updates * config.steps_per_update,
+        "REW_SHAPING_HORIZON": config.shaping_horizon,
+        "FC_DIM_SIZE": config.widths.head,
+        "GRU_HIDDEN_DIM": config.widths.gru,
+        "CLIP_EPS": config.clip,
+        "ENT_COEF": config.entropy,
+        "GAMMA": config.discount,
+        "GAE_LAMBDA": config.gae_lambda,
+        "SCALE_CLIP_EPS": False,
+        "VF_COEF": config.value,
+        "MAX_GRAD_NORM": config.max_grad_norm,
+        "ACTIVATION": "relu",
+    }
+    return compiled_call(module.make_train(options), jax.random.PRNGKey(0))
+
+
+def _load_script(path: Path) -> ModuleType:
+    """Import the learner's file as a module."""
+    silent: Any = ModuleType("silent")
+    silent.main = lambda **_: lambda function: function
+    silent.log = lambda metric: None
+    silent.OmegaConf = None
+    for name in ("hydra", "omegaconf", "wandb"):
+        sys.modules.setdefault(name, silent)
+    spec = importlib.util.spec_from_file_location("jaxmarl_ippo", path)
+    if spec is None or spec.loader is None:
+        raise click.UsageError(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -20,7 +20,7 @@ from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
-from icrl4aht_data.plotting import Picture, plot_layout_curves
+from icrl4aht_data.plotting import Picture, curve_svg, plot_layout_curves
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
@@ -33,8 +33,9 @@ from icrl4aht_data.sampling.base import Sampler, SamplerOptions, warn_of_mixed_s
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
 from icrl4aht_data.utils.forks import cached_property
-from icrl4aht_data.utils.html import curve_svg, facts_html
-from icrl4aht_data.utils.signatures import show_types
+from icrl4aht_data.utils.html import facts_html
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+from icrl4aht_data.utils.signatures import show_method_types, show_types
 from icrl4aht_data.utils.threads import usable_cores
 from icrl4aht_data.utils.validation import check_int
 
@@ -68,9 +69,9 @@ def load_icrl4aht(
     """Open a release and return a selection of its histories.
 
     Args:
-        root: a release folder, or an address: hf://datasets/<org>/<repo>[@<revision>], s3://..., https://..., or any
-            other that fsspec opens; the bundled mini release by default. Opening a remote release downloads its index,
-            everything else is downloaded when it is read.
+        root: a release folder, or an address: `hf://datasets/<org>/<repo>[@<revision>]`, `s3://...`, `https://...`, or
+            any other that fsspec opens; the bundled mini release by default. Opening a remote release downloads its
+            index, everything else is downloaded when it is read.
         split: "train", "validation", "test" or "heldout". This and each of the following filters is one value, a
             sequence of values, or None for any: train models on "train" only, as samplers warn of a mixture.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
@@ -147,11 +148,17 @@ class Dataset(Selection):
             reverse: from the largest value to the smallest. Histories without a value are last in either order.
 
         Raises:
-            OptionError: if no field is given.
+            OptionError: if no field is given, or anything but names.
             UnknownNameError: for a field that does not exist; names the nearest one.
         """
         if not names:
             raise OptionError('sort: expected the name of an index field, such as ds.sort("return_end")')
+        for name in names:
+            if not isinstance(name, str):
+                raise OptionError(
+                    f"sort: expected names of index fields, one after the other, such as "
+                    f'ds.sort("layout", "return_end"), found {name!r}; for another order give its ids to ds.select'
+                )
         keys = []
         for name in names:
             values = self.column(name)
@@ -184,8 +191,12 @@ class Dataset(Selection):
         """
         if by not in SPLIT_BY:
             raise unknown("split by", by, SPLIT_BY)
-        if isinstance(validation, bool) or not isinstance(validation, (int, float, np.floating)):
-            raise OptionError(f"validation = {validation!r}: expected the share that is held out, such as 0.1")
+        is_number = isinstance(validation, (int, float, np.integer, np.floating)) and not isinstance(validation, bool)
+        if not is_number or not 0 < validation < 1:
+            raise OptionError(
+                f"validation = {validation!r}: expected the share that is held out, a number between 0 and 1, such as "
+                f"0.1"
+            )
         seed = check_int("seed", seed, 0)
         if by == "history":
             held = choose_histories(self, validation, seed)
@@ -233,21 +244,22 @@ class Dataset(Selection):
         Raises:
             OptionError: if matplotlib is not installed.
         """
-        return Picture(f"Returns of {len(self)} histories by layout and source", plot_layout_curves(self))
+        return Picture(f"Returns of {counted_histories(len(self))} by layout and source", plot_layout_curves(self))
 
     def _repr_html_(self) -> str:
         """The selection's counts and learning curve, for notebooks."""
         named = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
         counts = {name: ", ".join(f"{value} ({n})" for value, n in self.counts(name).items()) for name in named}
         tasks = len(self.counts("task_id"))
-        lengths = f"{int(self.column('T').sum()):,} steps, {int(self.column('episodes').sum()):,} episodes"
+        steps, episodes = (int(self.column(name).sum()) for name in ("T", "episodes"))
+        lengths = f"{counted_noun(steps, 'step')}, {counted_noun(episodes, 'episode')}"
         facts = {
             "transitions": lengths,
             **{name.replace("_", " "): text or "none" for name, text in counts.items()},
             "observations": f"{self.obs}, {self.channels} channels",
             "release": f"{self.info.kind} {self.info.data_version} at {self.origin}",
         }
-        return facts_html(f"{len(self)} histories of {tasks} tasks", facts, self._curves_svg())
+        return facts_html(f"{counted_histories(len(self))} of {counted_noun(tasks, 'task')}", facts, self._curves_svg())
 
     def _curves_svg(self) -> str:
         """Mean returns of a few histories of each source that are on this machine, as SVG; or nothing."""
@@ -392,6 +404,7 @@ class Dataset(Selection):
         length: int,
         every: int = 1,
         labels: Labels | None = None,
+        families: bool = False,
         **options: Unpack[SamplerOptions],
     ) -> ADSampler:
         """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options.
@@ -401,7 +414,9 @@ class Dataset(Selection):
             WeakLabelsWarning: see `ADSampler`.
         """
         warn_of_mixed_splits(self)
-        return ADSampler(self, batch_size=batch_size, length=length, every=every, labels=labels, **options)
+        return ADSampler(
+            self, batch_size=batch_size, length=length, every=every, labels=labels, families=families, **options
+        )
 
     def dpt(
         self,
@@ -410,6 +425,7 @@ class Dataset(Selection):
         context: int,
         order: ContextOrder = "contiguous",
         labels: Labels = "expert",
+        queries: int = 1,
         **options: Unpack[SamplerOptions],
     ) -> DPTSampler:
         """Return a sampler of queries with contexts of `context` transitions for Decision-Pretrained Transformers.
@@ -421,12 +437,15 @@ class Dataset(Selection):
             WeakLabelsWarning: see `DPTSampler`.
         """
         warn_of_mixed_splits(self)
-        return DPTSampler(self, batch_size=batch_size, context=context, order=order, labels=labels, **options)
+        return DPTSampler(
+            self, batch_size=batch_size, context=context, order=order, labels=labels, queries=queries, **options
+        )
 
 
 for _function in (Dataset.ad, Dataset.dpt):
     show_types(_function, Sampler.__init__, SamplerOptions.__annotations__)
 show_types(load_icrl4aht)
+show_method_types(Dataset)
 
 
 def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:

@@ -25,6 +25,14 @@ class OptionError(Icrl4ahtError, ValueError):
     """An option has an impossible value (a window of no steps, layouts whose observations differ in shape)."""
 
 
+class PositionError(Icrl4ahtError, IndexError):
+    """A sequence of histories or episodes has no item at the position."""
+
+
+class PositionTypeError(Icrl4ahtError, TypeError):
+    """The position in a sequence of histories or episodes is neither an integer nor a slice."""
+
+
 class LabelsMissingError(Icrl4ahtError):
     """Expert or teammate actions were requested from histories that have none."""
 
@@ -116,6 +124,10 @@ class DiskFullError(Icrl4ahtError, OSError):
 
 class UploadError(Icrl4ahtError):
     """Uploading a release failed, or the repository's content differs from it; names the repository."""
+
+
+class PluginError(Icrl4ahtError):
+    """An object that another installed package registers cannot be used; names the package and the entry point."""
 
 
 class TaskFormatError(Icrl4ahtError, ValueError):

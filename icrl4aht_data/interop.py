@@ -6,28 +6,40 @@ A sampler is a sequence of batches, each a pure function of its number, so most 
     Grain          grain.MapDataset.source(sampler); no shuffling is needed, batches are random already
     PyTorch        torch_loader(sampler, workers=4); needs the extra `torch`
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
+
+Rows of episodes have state records, also those that `datasets.load_dataset(release, "episodes", streaming=True)` gives
+for a published release; `render_observations(rows)` makes observations of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, overload
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from icrl4aht_data.errors import NotStoredError, OptionError
-from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
+from icrl4aht_data.errors import NotStoredError, OptionError, unknown
+from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
+from icrl4aht_data.overcooked.fast_observe import fast_observe
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.reading.arrow_tables import episode_schema, episode_table, index_schema, record_width
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.sampling.base import Sampler
 from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
 from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.memory import new_array
 from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import datasets
     import torch
     from torch.utils.data import DataLoader
+
+Rendered = Literal["float32", "uint8"]
+RENDERED: tuple[Rendered, ...] = ("float32", "uint8")
+"""Dtypes of observations that `render_observations` makes of state records."""
 
 IGNORED = -100
 """The target of padding in `torch_loader` and `hf_windows`: the number that PyTorch's cross entropy ignores."""
@@ -132,15 +144,18 @@ def hf_index(dataset: Selection) -> datasets.Dataset:
     Raises:
         OptionError: if `datasets` is not installed.
     """
-    return _datasets().Dataset.from_list([entry.to_json() for entry in dataset.entries])
+    library = _datasets()
+    features = library.Features.from_arrow_schema(index_schema())
+    return library.Dataset.from_list([entry.to_json() for entry in dataset.entries], features=features)
 
 
 def hf_episodes(dataset: Selection) -> datasets.Dataset:
     """The selection's episodes as a `datasets.Dataset`, one row for each episode, in order.
 
-    Columns: history_id, task_id, layout, episode (number in its history, from 0), return, and lists with one element
-    for each step: actions, teammate_actions, rewards, expert_actions and oracle_actions (null if the history has none)
-    and state (bytes of the state record; see `overcooked.state`).
+    The rows are those of the configuration `episodes` of a published release, with records as wide as the longest one
+    of the selection's layouts. For the columns and their types see `arrow_tables.EPISODE_COLUMNS`: ids, names and
+    return; lists with one element for each step, rewards, actions, teammate_actions, expert_actions and oracle_actions
+    (null if the history has none) and state (bytes of the state record); and episode_end_state.
 
     Raises:
         NotStoredError: for a release of observations.
@@ -149,46 +164,81 @@ def hf_episodes(dataset: Selection) -> datasets.Dataset:
     if not dataset.has_states:
         raise NotStoredError(f"{dataset.root}: has observations only, no state records; take hf_windows")
     library = _datasets()
-    step = {name: library.List(library.Value("int8")) for name in ACTION_FIELDS}
-    features = library.Features(
-        {
-            "history_id": library.Value("int64"),
-            "task_id": library.Value("string"),
-            "layout": library.Value("string"),
-            "episode": library.Value("int32"),
-            "return": library.Value("float32"),
-            "rewards": library.List(library.Value("float32")),
-            **step,
-            "state": library.List(library.Value("binary")),
-        }
-    )
+    features = library.Features.from_arrow_schema(episode_schema(dataset))
     return library.Dataset.from_generator(_episodes, features=features, gen_kwargs={"dataset": dataset})
 
 
 def _episodes(dataset: Selection) -> Iterator[dict[str, Any]]:
+    schema = episode_schema(dataset)
     for history in dataset:
-        entry = history.entry
-        present = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
-        arrays = {name: history.read(name) for name in (*present, "rewards", "dones", "state")}
-        ends = np.flatnonzero(arrays.pop("dones")) + 1
-        for episode, (start, stop) in enumerate(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)):
-            part = {name: array[start:stop] for name, array in arrays.items()}
-            yield {
-                "history_id": entry.history_id,
-                "task_id": entry.task_id,
-                "layout": entry.layout,
-                "episode": episode,
-                "return": float(part["rewards"].sum()),
-                **dict.fromkeys(ACTION_FIELDS),
-                **part,
-                "state": [record.tobytes() for record in part["state"]],
-            }
+        yield from episode_table(history, schema).to_pylist()
+
+
+def render_observations(
+    rows: Mapping[str, Any] | Sequence[Mapping[str, Any]],
+    *,
+    channels: Channels = "own",
+    obs: Rendered = "float32",
+) -> np.ndarray:
+    """Return the ego's observations in episodes of the configuration `episodes`, or of `hf_episodes`.
+
+    With `datasets`, render while reading: `rows.map(lambda batch: {"obs": render_observations(batch)}, batched=True)`.
+
+    Args:
+        rows: one row; several rows; or a batch as `datasets` gives it, a mapping of columns. Of their columns only
+            `layout` and `state` are read, lists or arrays.
+        channels: channels of the observations; see `channels.CHANNELS`. With the layouts' own channels all rows must be
+            of layouts with equally many, such as one layout.
+        obs: the dtype.
+
+    Returns:
+        (T, 5, 5, C) for one row, T the steps of an episode; (B, T, 5, 5, C) for B rows.
+
+    Raises:
+        UnknownNameError: for channels, a dtype or a layout that does not exist.
+        OptionError: for no rows, rows of layouts with unequal channels, or records that are too short for the layout.
+        NotStoredError: for rows without state records, as those of a release of observations are.
+    """
+    if channels not in CHANNELS:
+        raise unknown("channels", channels, CHANNELS)
+    if obs not in RENDERED:
+        raise unknown("obs", obs, RENDERED)
+    if isinstance(rows, Mapping) and isinstance(rows.get("layout"), str):
+        return render_observations([rows], channels=channels, obs=obs)[0]
+    layouts, canonical = [get_layout(name) for name in _column(rows, "layout")], channels == "canonical"
+    shapes = {observation_shape(layout, canonical): layout for layout in layouts}
+    if len(shapes) != 1:
+        found = ", ".join(f"{layout.name} {shape}" for shape, layout in shapes.items())
+        raise OptionError(
+            f"observations of {len(layouts)} rows: expected one shape, found {found or 'none'}: give at least one row, "
+            f'and take channels="canonical" for rows of several layouts'
+        )
+    records = np.asarray(_column(rows, "state"), np.uint8)
+    longest = record_width(layouts)
+    if records.ndim != 3 or records.shape[-1] < longest:
+        raise OptionError(f"state: expected (B, T, S) with S at least {longest}, found {records.shape}")
+    out = new_array((*records.shape[:2], *next(iter(shapes))), obs, f"observations of {len(layouts)} episodes")
+    for layout, record, seen in zip(layouts, records, out, strict=True):
+        fast_observe(layout, record[:, : record_size(layout)], seen, canonical=canonical)
+    return out
+
+
+def _column(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]], name: str) -> Any:
+    try:
+        return rows[name] if isinstance(rows, Mapping) else [row[name] for row in rows]
+    except KeyError as error:
+        raise NotStoredError(
+            f"rows without a column {name!r}: expected rows of the configuration `episodes`, or of hf_episodes, of a "
+            f"full or lite release; for a release of observations, which has no state records, take hf_windows"
+        ) from error
 
 
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
     """The rows of batches start..stop as a `datasets.IterableDataset`, with the columns of the batch.
 
-    Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`.
+    Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`. Rows hold NumPy arrays of the
+    batch's dtypes. The result declares no `features`: with them, `datasets` makes lists of one-dimensional arrays, and
+    its format "numpy" makes int64 of uint8.
 
     The `state_dict` of the result resumes after the last row taken.
 

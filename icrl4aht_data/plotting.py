@@ -1,4 +1,6 @@
-"""Figures of datasets, histories, layouts and reference returns, and animated episodes. Needs the extra `plot`.
+"""Figures of datasets, histories, layouts and reference returns, and animated episodes.
+
+All but `curve_svg` need the extra `plot`.
 
 Every function that draws a figure returns it, and writes it to a file if a path is given.
 """
@@ -7,12 +9,13 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from html import escape
 from importlib.util import find_spec
 from io import BytesIO
 from itertools import product
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -24,6 +27,7 @@ from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame, encode_episode
+from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
@@ -37,9 +41,12 @@ PICTURES = (".png", ".svg", ".pdf")
 
 _CURVE_PARTS = 25  # of a history, as points of a curve
 
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _MARGIN = 420, 130, 44, 18, 8  # pixels of an SVG
+_MOST_POINTS = 60  # in its curves; each is the mean of several episodes, which scatter too much to show a trend
+_COLOURS = ("#1f77b4", "#d9730d", "#2ca02c", "#9467bd")  # readable on white and on black
 
 MOST_PANELS = 12
-"""Tasks of which each has a panel of its own; more are drawn together, by layout."""
+"""Most panels of a picture with a panel for each task or cell."""
 
 
 class RecordedCurve(Protocol):
@@ -91,9 +98,7 @@ class Picture:
         """The picture as an HTML element that contains it."""
         content, kind = self._content, "gif"
         if not isinstance(content, bytes):
-            stream, kind = BytesIO(), "png"
-            content.savefig(stream, dpi=110, format=kind)
-            content = stream.getvalue()
+            content, kind = _small_png(content), "png"
         data = b64encode(content).decode()
         return f'<img alt="{escape(self.title)}" style="max-width:100%" src="data:image/{kind};base64,{data}">'
 
@@ -113,6 +118,73 @@ class Picture:
             partial.write_bytes(self._content)
 
 
+def _small_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG of 256 colours, a third of the size: notebooks store every picture as text."""
+    from PIL import Image
+
+    drawn, small = BytesIO(), BytesIO()
+    figure.savefig(drawn, dpi=110, format="png")
+    Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
+    return small.getvalue()
+
+
+def running_mean(values: np.ndarray, window: int) -> np.ndarray:
+    """Return the mean over up to `window` values around each one, fewer at the ends; float64 (E,) of real (E,)."""
+    width = max(1, window)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    numbers = np.arange(len(values))
+    start, stop = np.maximum(numbers - width // 2, 0), np.minimum(numbers + (width + 1) // 2, len(values))
+    return (sums[stop] - sums[start]) / (stop - start)
+
+
+def return_limits(values: Iterable[float]) -> tuple[float, float]:
+    """Return the ends of an axis of returns: 0 and all values are on it, and at least one delivery's reward.
+
+    A constant return is therefore a line at its height above 0, not a magnified one.
+    """
+    found = [0.0, *values]
+    low, high = min(found), max(found)
+    high = max(high, low + DELIVERY_REWARD)
+    margin = 0.04 * (high - low)
+    return low - margin, high + margin
+
+
+def curve_svg(curves: Mapping[str, np.ndarray], axis: str = "episode") -> str:
+    """Return curves of returns in one pair of axes as an SVG element that uses the page's text colour.
+
+    The axis of returns is that of `return_limits`, with its ends as labels. Needs no optional library.
+
+    Args:
+        curves: label -> values at equal distances, (N,) of at least one.
+        axis: label of the horizontal axis.
+    """
+    points = {
+        label: [float(part.mean()) for part in np.array_split(values, min(len(values), _MOST_POINTS))]
+        for label, values in curves.items()
+    }
+    drawn = [value for of_curve in points.values() for value in of_curve]
+    (low, high), floor, right = return_limits(drawn), _HEIGHT - _BOTTOM, _WIDTH - _MARGIN
+    lines, legend = [], []
+    for number, (label, values) in enumerate(curves.items()):
+        last, parts = max(len(values) - 1, 1), np.array_split(np.arange(len(values)), len(points[label]))
+        xs = [_LEFT + (right - _LEFT) * part.mean() / last for part in parts]
+        ys = [floor - (floor - _MARGIN) * (value - low) / (high - low) for value in points[label]]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(xs, ys, strict=True))
+        colour = _COLOURS[number % len(_COLOURS)]
+        lines.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
+        legend.append(f'<tspan fill="{colour}"> {escape(label)}</tspan>')
+    words = f"return from {min(drawn):.4g} to {max(drawn):.4g} by {axis}, of {', '.join(curves)}"
+    return (
+        f'<svg role="img" aria-label="{escape(words)}" viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" '
+        f'height="{_HEIGHT}" style="display:block;max-width:100%;font:11px sans-serif">'
+        f'<path d="M{_LEFT},{_MARGIN}V{floor}H{right}" fill="none" stroke="currentColor" stroke-opacity="0.4"/>'
+        f'<g fill="currentColor"><text x="{_LEFT - 5}" y="{_MARGIN + 8}" text-anchor="end">{high:.1f}</text>'
+        f'<text x="{_LEFT - 5}" y="{floor}" text-anchor="end">{low:.1f}</text>'
+        f'<text x="{_LEFT}" y="{_HEIGHT - 4}">return by {escape(axis)}</text>'
+        f'<text x="{right}" y="{_HEIGHT - 4}" text-anchor="end">{"".join(legend)}</text></g>{"".join(lines)}</svg>'
+    )
+
+
 def plot_history(returns: np.ndarray, title: str, expert_return: float | None = None) -> Figure:
     """Plot a history's learning curve: the return of each episode, and its mean over a twentieth of the episodes.
 
@@ -127,10 +199,10 @@ def plot_history(returns: np.ndarray, title: str, expert_return: float | None = 
     figure, (axes,) = _panels(None, 1, (5.6, 3.3))
     episodes, window = np.arange(1, len(returns) + 1), max(1, len(returns) // 20)
     axes.plot(episodes, returns, color="C0", alpha=0.3, linewidth=0.8, label="each episode")
-    means = np.convolve(returns, np.full(window, 1 / window), mode="valid")
-    axes.plot(episodes[window - 1 :], means, color="C0", label=f"mean of the last {window}")
+    axes.plot(episodes, running_mean(returns, window), color="C0", label=f"running mean over {window}")
     if expert_return is not None:
         axes.axhline(expert_return, color="C1", linestyle="--", linewidth=1, label="expert, acting greedily")
+    axes.set_ylim(*return_limits([*map(float, returns), expert_return or 0.0]))
     axes.set_title(title, fontsize=9)
     axes.set_xlabel("episode")
     axes.set_ylabel("return of the kept steps")
@@ -159,7 +231,7 @@ def animate_episode(
 
 
 def plot_learning_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
-    """Plot the return per episode of every task in a selection: mean over streams, band from 10th to 90th percentile.
+    """Plot the return per episode of every task in a selection, a panel each, see `plot_curves`.
 
     More than 12 tasks are drawn as `plot_layout_curves` does, by layout and source.
 
@@ -168,7 +240,21 @@ def plot_learning_curves(dataset: RecordedCurves, path: Path | None = None) -> F
     """
     if len(dataset.counts("task_id")) > MOST_PANELS:
         return plot_layout_curves(dataset, path)
-    return _plot_histories(dataset, path, lambda e: (e.task_id, f"{e.layout} with {e.teammate_kind}"), lambda e: "mean")
+    streams: dict[str, list[RecordedCurve]] = {}
+    for history in dataset:
+        streams.setdefault(history.entry.task_id, []).append(history)
+    titles = {task: f"{of[0].entry.layout} with {of[0].entry.teammate_kind}" for task, of in streams.items()}
+    equal, seen = Counter(titles.values()), Counter[str]()
+    panels = []
+    for task, of_task in streams.items():
+        title = titles[task]
+        seen[title] += 1
+        number = f", {seen[title]}" if equal[title] > 1 else ""
+        returns = [history.returns() for history in of_task]
+        length = min(map(len, returns))  # streams of one task may differ in length
+        count = f"{len(returns)} streams" if len(returns) > 1 else "1 stream"
+        panels.append((f"{title}{number} ({count})", {"mean": np.stack([own[:length] for own in returns])}))
+    return plot_curves(path, panels)
 
 
 def plot_layout_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
@@ -207,7 +293,9 @@ def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
     labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
-    figure, grid = _panels(path, len(curves), (2.6, 1.9), columns=min(4, len(curves)))
+    size = (2.6, 1.9) if len(curves) > 2 else (4.2, 2.8)
+    figure, grid = _panels(path, len(curves), size, columns=min(4, len(curves)))
+    ends: list[float] = []
     for axes, (layout, of_layout) in zip(grid, curves.items(), strict=True):
         for label in (label for label in labels if label in of_layout):
             parts = min(_CURVE_PARTS, *map(len, of_layout[label]))
@@ -216,41 +304,24 @@ def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure
             color = f"C{labels.index(label)}"
             axes.plot(share, means.mean(axis=0), label=label, color=color, linewidth=1.2)
             axes.fill_between(share, low, high, alpha=0.2, linewidth=0, color=color)
+            ends += [float(low.min()), float(high.max())]
         axes.set_title(layout, fontsize=8)
         axes.set_xlim(0, 1)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
+    for axes in grid:
+        axes.set_ylim(*return_limits(ends))
     what = "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
-    figure.suptitle(what, fontsize=8)
+    figure.suptitle(fill(what, int(16 * figure.get_figwidth())), fontsize=8)
     legend_below(figure)
     return _saved(figure, path, dpi=80)
 
 
-def _plot_histories(
-    dataset: RecordedCurves,
-    path: Path | None,
-    panel: Callable[[Entry], tuple[str, str]],
-    curve: Callable[[Entry], str],
-) -> Figure:
-    """Plot one panel per key and title that `panel` returns, in it one curve per label that `curve` returns."""
-    panels: dict[tuple[str, str], dict[str, list[np.ndarray]]] = {}
-    for history in dataset:
-        panels.setdefault(panel(history.entry), {}).setdefault(curve(history.entry), []).append(history.returns())
-    equal, seen = Counter(title for _, title in panels), Counter()
-    drawn = []
-    for (_, title), curves in panels.items():
-        seen[title] += 1
-        number = f", {seen[title]}" if equal[title] > 1 else ""
-        streams = {}
-        for label, members in curves.items():
-            length = min(map(len, members))  # streams of one curve may differ in length
-            streams[f"{label} of {len(members)} streams"] = np.stack([member[:length] for member in members])
-        drawn.append((title + number, streams))
-    return plot_curves(path, drawn)
-
-
 def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> Figure:
-    """Plot panels of learning curves, each as the mean over streams and a band from 10th to 90th percentile.
+    """Plot panels of learning curves on one axis of returns, with one legend.
+
+    A line is the running mean over a twentieth of the episodes of the mean over streams, the band from the 10th to the
+    90th percentile of the streams' returns without smoothing.
 
     Args:
         path: the file to write; None to write none.
@@ -259,18 +330,26 @@ def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndar
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    figure, grid = _panels(path, len(panels), (4.6, 3.3))
+    figure, grid = _panels(path, len(panels), (4.2, 2.7))
+    labels = list(dict.fromkeys(label for _, curves in panels for label in curves))
+    ends: list[float] = []
     for axes, (title, curves) in zip(grid, panels, strict=True):
         for label, returns in curves.items():
-            episodes = np.arange(1, returns.shape[1] + 1)
+            episodes, color = np.arange(1, returns.shape[1] + 1), f"C{labels.index(label)}"
             low, high = np.percentile(returns, (10, 90), axis=0)
-            (line,) = axes.plot(episodes, returns.mean(axis=0), label=label)
-            axes.fill_between(episodes, low, high, alpha=0.25, linewidth=0, color=line.get_color())
-        axes.set_title(f"{title} (band: 10th to 90th percentile)", fontsize=9)
-        axes.set_xlabel("episode")
-        axes.set_ylabel("return of the kept steps")
+            ends += [float(low.min()), float(high.max())]
+            mean = running_mean(returns.mean(axis=0), len(episodes) // 20)
+            axes.plot(episodes, mean, label=label, color=color, linewidth=1.4)
+            axes.fill_between(episodes, low, high, alpha=0.2, linewidth=0, color=color)
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("episode", fontsize=8)
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8, frameon=False)
+    for axes in grid:
+        axes.set_ylim(*return_limits(ends))
+    figure.supylabel("return of the kept steps", fontsize=9)
+    what = "Lines: running means of the mean; bands: 10th to 90th percentile of streams"
+    figure.suptitle(fill(what, int(14 * figure.get_figwidth())), fontsize=9)
+    legend_below(figure)
     return _saved(figure, path, dpi=120)
 
 

@@ -57,6 +57,11 @@ def _remove_unfinished_entries(folder: Path) -> None:
                 entry.unlink()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Start with the file that builds the releases of many others, so that no second worker waits for them."""
+    items.sort(key=lambda item: item.path.name != "test_collect.py")
+
+
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Report a worker's memory to the main process."""
     if hasattr(session.config, "workeroutput"):

@@ -1,6 +1,7 @@
 """The models that this package bundles, in `baselines/models`: NAME/TRACK is the run folder of a model of one track.
 
-A bundled run has its settings, its card and its last parameters, without the optimizer's state.
+A bundled run has its settings and its last parameters, without the optimizer's state. Next to the runs of a model are
+its card and `bundle.json`, which states the way in which it plays unless another one is chosen.
 """
 
 from __future__ import annotations
@@ -19,12 +20,16 @@ from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.files import parse_json, read_text
 
 MODELS = Path(__file__).parents[1] / "models"
 """Folder of the bundled models."""
 
 MODEL_CARD = "README.md"
 """File name of a bundled model's card, in the folder NAME."""
+
+BUNDLE = "bundle.json"
+"""File name of a bundled model's way of playing, in the folder NAME: {"sampled": whether it draws its actions}."""
 
 _LARGEST = 2 * 10**6  # bytes of a bundled model's parameters
 
@@ -35,10 +40,12 @@ class BundledModel(NamedTuple):
     Attributes:
         name: such as "ad-reference".
         runs: track -> run folder of its model.
+        sampled: whether it draws its actions unless another way of playing is chosen.
     """
 
     name: str
     runs: dict[str, Path]
+    sampled: bool = False
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
@@ -47,7 +54,7 @@ def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
     for path in sorted(folder.glob("*/")):
         runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
         if runs:
-            found[path.name] = BundledModel(path.name, runs)
+            found[path.name] = BundledModel(path.name, runs, parse_json(read_text(path / BUNDLE))["sampled"])
     return found
 
 
@@ -62,19 +69,36 @@ def describe_model(model: BundledModel) -> list[str]:
         lines.append(
             f"{model.name}, track {track}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
             f"{', '.join(trained.layouts)} (source {' and '.join(sources)})"
+            + (", draws its actions" if model.sampled else "")
         )
     return lines
 
 
-def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
+def check_bundle_name(name: str) -> None:
+    """Check the name of a bundled model.
+
+    Raises:
+        OptionError: if it is not of small letters, digits and hyphens.
+    """
+    if not re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)+", name):
+        raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
+
+
+def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False) -> Path:
     """Copy a finished run into the bundled models, with its parameters alone; one that is there is replaced.
+
+    Args:
+        run: folder of the run.
+        name: name of the bundled model.
+        track: the track whose tasks the run plays.
+        folder: folder of the bundled models.
+        sampled: whether the model draws its actions by default, on all tracks.
 
     Raises:
         OptionError: if the name is not of small letters, digits and hyphens, or if the run is not finished or its
             parameters are too large.
     """
-    if not re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)+", name):
-        raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
+    check_bundle_name(name)
     trained, steps = read_trained(run), read_config(run)["train"]["steps"]
     if trained.step < steps:
         raise OptionError(f"{run}: at step {trained.step} of {steps}: continue the training with the same command")
@@ -89,4 +113,5 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS) -> Path:
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
+    (folder / name / BUNDLE).write_text(json.dumps({"sampled": sampled}) + "\n", encoding="utf-8")
     return target

@@ -54,10 +54,10 @@ class PlayMode(NamedTuple):
         """Returns the mode that the details of results state."""
         return cls(details.get("acting", "cached"), not details.get("sampled"), bool(details.get("forget")))
 
-    @property
-    def suffix(self) -> str:
-        """End of the name of an agent that plays in another way than the default one, which reports tell apart."""
-        return " (sampled)" * (not self.greedy) + FORGETS * self.forget
+    def suffix(self, default: PlayMode) -> str:
+        """Returns the end of the name of an agent that plays in another way than its default one, for reports."""
+        drawn = "" if self.greedy == default.greedy else " (greedy)" if self.greedy else " (sampled)"
+        return drawn + FORGETS * self.forget
 
     @property
     def details(self) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def random(layout: Layout) -> Policy:
 
 
 AS_PUBLISHED = PlayMode()
-"""The default way of playing."""
+"""The default way of playing of runs and of most bundled models, see `default_mode`."""
 
 
 def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
@@ -169,34 +169,42 @@ def with_hidden_recipe(policy: Policy, layout: Layout, hidden: Sequence[str]) ->
     return policy._replace(act=act)
 
 
-def find_agent(name: str, mode: PlayMode = AS_PUBLISHED) -> NamedEgo:
+def default_mode(name: str) -> PlayMode:
+    """Returns the way in which an agent plays unless another one is chosen; some bundled models draw their actions."""
+    model = bundled_models().get(name)
+    return AS_PUBLISHED if model is None else AS_PUBLISHED._replace(greedy=not model.sampled)
+
+
+def find_agent(name: str, mode: PlayMode | None = None) -> NamedEgo:
     """Returns a reference ego, a bundled model, or the trained model in a run folder of `python -m baselines train`.
 
     Args:
         name: name of a reference ego or of a bundled model, or path of a run folder.
-        mode: way in which a trained model plays.
+        mode: way in which a trained model plays; by default its own, see `default_mode`.
 
     Raises:
         UnknownNameError: if the name is none of these.
         OptionError: if the run has another format or no checkpoint, or `mode` is no `PlayMode`; from `make`, if the
             model does not fit the layout.
     """
+    default = default_mode(name)
+    mode = default if mode is None else mode
     if not isinstance(mode, PlayMode):
         raise OptionError(f"mode = {mode!r}: expected a PlayMode, such as PlayMode(acting='exact')")
     if name in AGENTS:
         return NamedEgo(name, AGENTS[name])
     folder, bundled = Path(name), bundled_models()
     if name in bundled:
-        return _bundled_ego(bundled[name], mode)
+        return _bundled_ego(bundled[name], mode, mode.suffix(default))
     if not folder.is_dir():
         raise unknown("agent", name, [*AGENTS, *bundled])
     run = read_trained(folder)
     details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, **mode.details}
     details["trained_on"] = run.trained_on
-    return NamedEgo(run.label + mode.suffix, _maker(run, mode, folder), details, folder)
+    return NamedEgo(run.label + mode.suffix(default), _maker(run, mode, folder), details, folder)
 
 
-def _bundled_ego(model: BundledModel, mode: PlayMode) -> NamedEgo:
+def _bundled_ego(model: BundledModel, mode: PlayMode, suffix: str) -> NamedEgo:
     """Returns a bundled model as an ego, which plays each layout by the model of the layout's track."""
     runs = {track: read_trained(folder) for track, folder in model.runs.items()}
 
@@ -211,7 +219,7 @@ def _bundled_ego(model: BundledModel, mode: PlayMode) -> NamedEgo:
 
     details = {"model": model.name, "run": {track: run.hash for track, run in runs.items()}, **mode.details}
     trained_on = {track: run.trained_on for track, run in runs.items()}
-    return NamedEgo(model.name + mode.suffix, make, {**details, "trained_on": trained_on})
+    return NamedEgo(model.name + suffix, make, {**details, "trained_on": trained_on})
 
 
 def _maker(run: TrainedModel, mode: PlayMode, folder: Path) -> Callable[[Layout], Policy]:

@@ -1,28 +1,26 @@
-"""Commands of `python -m baselines`: they parse, call, and print."""
+"""The command line `python -m baselines`, and its commands that train, evaluate and report."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
+from baselines.commands.experiment_commands import EXPERIMENT_COMMANDS
 from baselines.commands.model_commands import MODEL_COMMANDS
 from baselines.commands.options import (
     EGO_NAME,
     METHOD_NAME,
-    PROTOCOL_NAME,
     TRAINING_LAYOUT,
     acting_option,
-    default_batch_size,
     episodes_option,
     evaluation_split_option,
-    experiment_options,
     find_ego,
     forget_option,
     gifs_option,
+    greedy_option,
     hide_recipe_option,
     history_filters,
     join_processes,
@@ -34,7 +32,6 @@ from baselines.commands.options import (
     process_options,
     protocol_option,
     root_option,
-    sampled_option,
     save_minutes_option,
     seeds_option,
     size_option,
@@ -42,22 +39,19 @@ from baselines.commands.options import (
     tasks_option,
     tensorboard_option,
     training_options,
-    variant_names,
 )
 from baselines.training.options import HistoryOptions
 from baselines.training.stopping import TrainingStopped
-from generation.teammates.instances import INSTANCES, published_task
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
+from generation.teammates.instances import published_task
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
-    COUNT,
     LAYOUT,
     SEED,
     SETTINGS,
     TRACK,
     Folder,
-    Names,
     NewFile,
     Sections,
     bars,
@@ -72,7 +66,6 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
-from icrl4aht_data.utils.templates import card_file
 
 _console = Console(soft_wrap=True)
 
@@ -121,7 +114,7 @@ def cli() -> None:
     help="stay, random, oracle, a bundled model such as ad-reference, or a folder that `train` made.",
 )
 @acting_option
-@sampled_option
+@greedy_option
 @forget_option
 @protocol_option
 @click.option(
@@ -143,7 +136,7 @@ def cli() -> None:
 def evaluate_command(
     agent: str,
     acting: Any,
-    sampled: bool,
+    greedy: bool | None,
     forget: bool,
     protocol: str,
     track: tuple[str, ...],
@@ -158,19 +151,21 @@ def evaluate_command(
 ) -> None:
     """Evaluate an agent on test tasks, or on validation tasks.
 
-    Plays 100 episodes of each task and writes one JSON file per task into OUT/tasks. Finished tasks are kept. Choose
-    models by the validation tasks: their layouts are in training, their teammates are in neither training nor test.
-    Split diverse has validation tasks with more kinds of teammates than the published training ranges.
+    Plays 100 episodes of each task, writes one JSON file per task into OUT/tasks, and prints a summary of OUT. Finished
+    tasks are kept. Choose models by the validation tasks: their layouts are in training, their teammates are in neither
+    training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
+    ranges.
     """
     from baselines.evaluate.evaluator import evaluate
     from baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
-    from baselines.report.results import note_results
+    from baselines.report.results import note_results, read_run
+    from baselines.report.summary import summary_lines
 
     if manifest and split:
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
     split = split or "test"
     given = read_tasks(manifest) if manifest else [task for name in track for task in bundled_tasks(name, split)]
-    ego = find_ego("--agent", agent, acting=acting, greedy=not sampled, forget=forget)
+    ego = find_ego("--agent", agent, acting=acting, greedy=greedy, forget=forget)
     names = {get_layout(name).name for name in layout}
     chosen = limit_tasks([task for task in given if not names or task.layout.name in names], tasks)
     if not chosen:
@@ -194,6 +189,8 @@ def evaluate_command(
             played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
         )
     note_results(out, ego.run, chosen if manifest or split != "test" else ())
+    for line in summary_lines([read_run(out)]):
+        click.echo(line)
     noun = "result" if len(chosen) == 1 else "results"
     _console.print(f"{len(chosen)} {noun} in {out}; `python -m baselines report {out}` shows them")
 
@@ -204,7 +201,10 @@ def evaluate_command(
     "--out", type=Folder(), metavar="FOLDER", help="Write the report here.", show_default="report in the first RESULTS"
 )
 @click.option(
-    "--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Also write one HTML page."
+    "--html",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also write one HTML page: the summary, curves, episodes, tables.",
 )
 @overwrite_option
 @gifs_option
@@ -214,18 +214,21 @@ def report_command(
 ) -> None:
     """Compare results with the paper's.
 
-    RESULTS are folders that `evaluate` made. Prints a table for each agent and track, with the paper's numbers next to
-    results of protocol published, and marks scores with teammates or on layouts that were in training. Writes them as
-    Markdown, CSV and curves, with a card for each trained model. Results of one agent on different layouts are merged.
+    RESULTS are folders that `evaluate` made. Prints a summary of each agent, and a table for each agent and track with
+    the paper's numbers next to results of protocol published; marks scores with teammates or on layouts that were in
+    training. Writes them as Markdown, CSV and curves, with a card for each trained model. Results of one agent on
+    different layouts are merged.
     """
     from baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
     from baselines.report.page import write_page_with_episodes
+    from baselines.report.rendering import check_can_render
     from baselines.report.results import merge, read_run
-    from baselines.report.summary import REPORT_BEGINS, markdown, write_report
+    from baselines.report.summary import markdown, report_begins, write_report
 
     loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
-    check_new_files(folder, overwrite, REPORT_BEGINS | {card_name(run): CARD_BEGINS for run in loaded})
+    check_new_files(folder, overwrite, report_begins(loaded) | {card_name(run): CARD_BEGINS for run in loaded})
     if html:
+        check_can_render()
         check_new_file(html, overwrite)
     paths = write_report(loaded, folder)
     if html:
@@ -261,70 +264,6 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     task = published_task(layout, teammate)
     earned = episode_gif(out, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
     _console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
-
-
-@cli.command("headroom")
-@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/headroom", help="Write the results here.")
-@click.option(
-    "--protocol",
-    type=PROTOCOL_NAME,
-    multiple=True,
-    default=lambda: tuple(PROTOCOL_NAME.valid()),
-    show_default="all",
-    help="published or seeded; repeat for several.",
-)
-@click.option("--bundle", is_flag=True, help="Also replace headroom.json and headroom.md of the package's cards.")
-def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
-    """Measure the reference egos on every test task.
-
-    Writes their results into OUT, and OUT/headroom.json and OUT/headroom.md from them.
-    """
-    from baselines.report.headroom import HEADROOM_BEGINS, measure_headroom, write_headroom_cards
-
-    folders = [out, card_file("headroom.json").parent] if bundle else [out]
-    for folder in folders:
-        check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
-    with bars(edges=True, unit="tasks") as show:
-        runs = measure_headroom(out, protocol, show)
-    for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
-        _console.print(f"wrote {path}")
-
-
-@cli.command("drift")
-@click.argument("run", type=Folder())
-@click.option("--layout", type=LAYOUT, help="Layout to play.", show_default="the first that the model was trained on")
-@click.option(
-    "--family", type=Names("family", HEURISTIC_KINDS.values), default="H4", help="Teammates: H1, H2, H3 or H4."
-)
-@protocol_option
-@click.option("--episodes", type=COUNT, help="Episodes to play.", show_default="as many as fill the window three times")
-def drift_command(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
-    """Measure the difference between cached and exact acting.
-
-    RUN is a folder that `train` made. Prints one line per episode: the share of equal actions, and the total variation
-    between both policies. Writes nothing.
-    """
-    from baselines.agents.egos import check_fits
-    from baselines.evaluate.drift import measure_drift
-    from baselines.evaluate.protocols import get_protocol
-    from baselines.training.histories import read_trained
-
-    trained = read_trained(run)
-    fill_window = -(-trained.context // get_protocol(protocol).steps)
-    played = get_protocol(protocol, episodes or 3 * fill_window)
-    name = get_layout(layout or trained.layouts[0]).name
-    check_fits(trained, get_layout(name), run)
-    tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
-    with bars(edges=True, unit="episodes") as show:
-        found = []
-        model = trained.method, trained.params, trained.context
-        for episode in measure_drift(*model, tasks, played, trained.channels):
-            found.append(episode)
-            show(f"{trained.label}, {family} on {name}", len(found), played.episodes)
-    click.echo(f"{trained.label} on {name} with {len(tasks)} teammates of {family}, K = {trained.context}")
-    click.echo("episode  same action  total variation: mean     largest")
-    for number, (distance, same) in enumerate(found):
-        click.echo(f"{number:>7}  {same.mean():>11.1%}  {distance.mean():>21.6f}  {distance.max():>10.6f}")
 
 
 @cli.command(
@@ -388,7 +327,7 @@ def train_command(
     """
     join_processes(coordinator, processes, process)
     from baselines.methods.registry import PLAYING
-    from baselines.training.histories import read_trained, start_from
+    from baselines.training.histories import start_from
     from baselines.training.run_folder import RUN_CURVES
     from baselines.training.trainer import format_loss
     from baselines.training.trainer import train as run_training
@@ -411,7 +350,7 @@ def train_command(
         watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
         watched |= {"trainer": job.trainer} if plays else {}
         if init is not None:
-            watched["params"] = start_from(read_trained(init), job.about)
+            watched["params"] = start_from(init, job.method, job.about)
         run_training(job.method, job.data, options, folder, job.about, **watched)
     noun = "step" if options.steps == 1 else "steps"
     _console.print(
@@ -419,108 +358,6 @@ def train_command(
     )
     if not can_draw():
         click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")
-
-
-@cli.command(
-    "sweep",
-    epilog=examples(
-        "python -m baselines sweep size --layout demo_wide",
-        "python -m baselines sweep context --only K250 --steps 20 --layout demo_wide --tasks 1 --episodes 5",
-    ),
-)
-@click.argument("what", type=variant_names("sweep"))
-@experiment_options("runs/sweep-WHAT")
-def sweep_command(what: str, **options: Any) -> None:
-    """Train and evaluate over sizes, or context lengths.
-
-    WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
-    """
-    _run_experiment(f"sweep {what}", **options)
-
-
-@cli.command("ablate", epilog=examples("python -m baselines ablate ta --layout demo_wide"))
-@click.argument("what", type=variant_names("ablate"))
-@experiment_options("runs/ablate-WHAT")
-def ablate_command(what: str, **options: Any) -> None:
-    """Train and evaluate with and without parts.
-
-    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both; or windows (of AD) or contexts (of DPT):
-    length, episodes, labels and inputs, one difference each. Writes runs, results and OUT/report.
-    """
-    _run_experiment(f"ablate {what}", **options)
-
-
-@cli.command("tracks")
-@experiment_options("runs/tracks")
-def tracks_command(**options: Any) -> None:
-    """Train and evaluate on both tracks.
-
-    The paper's Tables 1 and 2; with other methods 4 and 5. Its numbers are shown with --protocol published. Writes
-    runs, results and OUT/report.
-    """
-    _run_experiment("tracks", **options)
-
-
-@cli.command("heldout-rl")
-@click.option(
-    "--suite",
-    type=Folder(),
-    metavar="FOLDER",
-    default="build/suite",
-    help="Folder of learned teammates.",
-)
-@experiment_options("runs/heldout-rl")
-def heldout_rl_command(suite: Path, **options: Any) -> None:
-    """Train, and evaluate with held-out teammates.
-
-    These are a suite's learned teammates that are not in training. Writes runs, results and OUT/report.
-    """
-    _run_experiment("heldout-rl", suite=suite, **options)
-
-
-def _run_experiment(
-    name: str,
-    out: Path | None,
-    root: Any,
-    train: dict[str, Any],
-    histories: dict[str, Any],
-    suite: Path | None = None,
-    size: str | None = None,
-    **options: Any,
-) -> None:
-    from baselines.experiments import ExperimentPlan, run_experiment
-
-    size = size or "small"
-    sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
-    plan = ExperimentPlan(root=root and str(root), suite=suite, **sizes, **histories, **options)
-    with bars(edges=True) as show:
-        found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
-    for note in found.notes:
-        click.echo(note)
-    for path in found.report:
-        click.echo(f"wrote {path}")
-
-
-@cli.command("control")
-@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/control", help="Write the runs here.")
-def control_command(out: Path) -> None:
-    """Check that the models adapt in context.
-
-    Trains them on bandits and Dark Room (about 10 minutes), and prints the checks: they adapt there, and do not with
-    their context cut off. Exits with 1 if a check fails.
-    """
-    from baselines.control.control import format_checks, run_control
-    from baselines.training.trainer import format_loss
-
-    with bars(edges=True, unit="steps") as show:
-
-        def done(name: str, total: int, step: int, loss: float | None) -> None:
-            show(name, step, total, format_loss(loss))
-
-        checks = run_control(out, done=done)
-    click.echo(format_checks(checks))
-    if not all(check.passed for check in checks):
-        sys.exit(1)
 
 
 @cli.command("demo")
@@ -536,7 +373,7 @@ def demo_command(out: Path) -> None:
     run_demo(out, _console)
 
 
-for _command in MODEL_COMMANDS:
+for _command in (*MODEL_COMMANDS, *EXPERIMENT_COMMANDS):
     cli.add_command(_command)
 
 

@@ -14,10 +14,10 @@ from baselines.commands.options import (
     EGO_NAME,
     REFERENCE_NAME,
     find_ego,
+    greedy_option,
     history_filters,
     manifests_option,
     root_option,
-    sampled_option,
 )
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
@@ -33,6 +33,7 @@ from icrl4aht_data.commands.options import (
     overwrite_option,
 )
 from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_files
 
@@ -52,7 +53,7 @@ _console = Console(soft_wrap=True)
     required=True,
     help="A folder that `train` made, a bundled model such as ad-reference, or a reference ego.",
 )
-@sampled_option
+@greedy_option
 @root_option
 @click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
 @history_filters
@@ -67,7 +68,9 @@ _console = Console(soft_wrap=True)
     help="Chance of a random action in a history's first and in its last episode.",
 )
 @click.option(
-    "--labeller", type=EGO_NAME, help="Another agent, such as rl2-reference, whose choices become the expert actions."
+    "--labeller",
+    type=EGO_NAME,
+    help="Another agent, such as rl2-reference, whose most probable actions become the expert actions.",
 )
 @manifests_option
 @click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
@@ -75,7 +78,7 @@ _console = Console(soft_wrap=True)
 @overwrite_option
 def collect_command(
     agent: str,
-    sampled: bool,
+    greedy: bool | None,
     root: Any,
     layouts: tuple[str, ...],
     filters: dict[str, Any],
@@ -99,8 +102,8 @@ def collect_command(
 
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
-    ego = find_ego("--agent", agent, greedy=not sampled)
-    other = find_ego("--labeller", labeller) if labeller else None
+    ego = find_ego("--agent", agent, greedy=greedy)
+    other = find_ego("--labeller", labeller, greedy=True) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks(manifest)]
@@ -137,11 +140,16 @@ def reference_command(
     training teammates; ad and dpt learn from histories: -noise of the scripted oracle whose noise falls, -ppo and -both
     of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
     """
-    from baselines.agents.bundled import bundle_run
-    from baselines.reference import make_reference, write_bundled_card
+    from baselines.agents.bundled import bundle_run, check_bundle_name
+    from baselines.reference import RECIPES, describe_times, make_reference, write_bundled_card
 
     if bundle and (len(names) > 1 or set(track) != set(TRACKS) or not evaluates):
         raise click.UsageError("--bundle-as: expected one --name of all tracks, evaluated: its card states its results")
+    try:
+        if bundle is not None:
+            check_bundle_name(bundle)
+    except OptionError as error:
+        raise click.UsageError(f"--bundle-as: {error}") from error
     outcomes = []
     with bars(edges=True) as show:
         for name, of_track in product(names, track):
@@ -152,8 +160,12 @@ def reference_command(
             _console.print(f"  {kind}: {folder}", highlight=False)
     if bundle:
         for found in outcomes:
-            _console.print(f"bundled: {bundle_run(found.run, bundle, found.track)}", highlight=False)
+            sampled = not RECIPES[found.name].mode.greedy
+            target = bundle_run(found.run, bundle, found.track, sampled=sampled)
+            _console.print(f"bundled: {target}", highlight=False)
         _console.print(f"card: {write_bundled_card(bundle, outcomes)}", highlight=False)
+    if times := describe_times(out):
+        _console.print(times, highlight=False)
 
 
 @click.command(
@@ -184,15 +196,8 @@ def results_command(
     Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
     `evaluate` made, are added.
     """
-    from baselines.report.comparison import (
-        RESULTS_BEGINS,
-        add_ablation,
-        add_results,
-        read_stored,
-        results_file,
-        write_comparison,
-        write_stored,
-    )
+    from baselines.report.comparison import RESULTS_BEGINS, write_comparison
+    from baselines.report.stored_results import add_ablation, add_results, read_stored, results_file, write_stored
 
     check_new_files(out, overwrite, RESULTS_BEGINS)
     stored = read_stored(results_file())
@@ -211,7 +216,7 @@ def models_command() -> None:
     """List the bundled models.
 
     Their names are agents of `evaluate`, `watch` and `collect`. One line per model and track: method, parameters,
-    context, training layouts and sources.
+    context, training layouts and sources, and whether it draws its actions unless --greedy is given.
     """
     from baselines.agents.bundled import bundled_models, describe_model
 

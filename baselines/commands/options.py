@@ -10,15 +10,14 @@ from typing import Any
 
 import click
 
-from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
+from baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
 from baselines.training.ablations import ABLATIONS
 from baselines.training.options import ALL_LAYOUTS, FILTERS, SAVE_MINUTES, HistoryOptions, PlayOptions, TrainOptions
-from icrl4aht_data.benchmark.facts import KIND_FAMILIES
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
 from icrl4aht_data.errors import unknown
-from icrl4aht_data.overcooked.layouts import LAYOUTS
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -39,13 +38,13 @@ def find_ego(option: str, value: str, **mode: Any) -> Any:
     Args:
         option: name of the option, for messages.
         value: the ego's name or folder.
-        mode: values of `baselines.agents.egos.PlayMode`.
+        mode: values of `baselines.agents.egos.PlayMode`; for None and those left out the agent's own default.
 
     Raises:
         click.UsageError: if the value is neither a reference ego, nor a bundled model, nor a run folder.
     """
     from baselines.agents.bundled import bundled_models
-    from baselines.agents.egos import AGENTS, PlayMode, find_agent
+    from baselines.agents.egos import AGENTS, default_mode, find_agent
     from baselines.training.run_folder import CONFIG
 
     names = [*AGENTS, *bundled_models()]
@@ -54,7 +53,8 @@ def find_ego(option: str, value: str, **mode: Any) -> Any:
         raise click.UsageError(f"{option}: {unknown('agent', value, names)} {hint}")
     if value not in names and not (Path(value) / CONFIG).is_file():
         raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `python -m baselines train` makes one")
-    return find_agent(value, PlayMode(**mode))
+    given = {name: chosen for name, chosen in mode.items() if chosen is not None}
+    return find_agent(value, default_mode(value)._replace(**given))
 
 
 class HostPort(click.ParamType):
@@ -77,9 +77,9 @@ def _ego_names() -> list[str]:
 
 
 EGO_NAME = EgoName("agent", _ego_names)
-TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], offered=1 + len(LAYOUTS))
+TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()])
 _EVALUATION_SPLIT = Names("split", lazy_attribute("baselines.evaluate.protocols", "EVALUATION_SPLITS"))
-METHOD_NAME = Names("method", lazy_attribute("baselines.methods.registry", "METHODS"))
+METHOD_NAME = Names("method", lambda: import_module("baselines.methods.registry").all_methods())
 _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
 _playing = lazy_attribute("baselines.methods.registry", "PLAYING")
 ABLATION_NAME = Names("ablation", lambda: [name.removeprefix("ablate ") for name in ABLATIONS])
@@ -98,8 +98,11 @@ acting_option = click.option("--acting", type=_ACTING, default="cached", help=_A
 forget_option = click.option(
     "--forget", is_flag=True, help="Clear the memory of a trained model at the start of each episode."
 )
-sampled_option = click.option(
-    "--sampled", is_flag=True, help="Draw the actions of a trained model, instead of taking the most probable ones."
+greedy_option = click.option(
+    "--greedy/--sampled",
+    default=None,
+    help="Take the most probable actions of a trained model, or draw its actions.",
+    show_default="greedy; a bundled model's own, see `models`",
 )
 experiment_acting_option = click.option(
     "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
@@ -125,7 +128,9 @@ save_minutes_option = click.option(
     default=SAVE_MINUTES,
     help="Most minutes between checkpoints, which are also written every --save-every steps.",
 )
-gifs_option = click.option("--gifs/--no-gifs", default=True, help="A GIF per teammate family on the page.")
+gifs_option = click.option(
+    "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
+)
 root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
 )
@@ -142,7 +147,7 @@ def history_filters(command: Any) -> Any:
         ),
         click.option(
             "--algorithm",
-            type=Names("algorithm", lambda: KIND_FAMILIES),
+            type=Names("algorithm", lambda: [*KIND_FAMILIES, *TEAMMATE_PLUGINS.names]),
             multiple=True,
             help="Train only with teammates of this algorithm, such as fcp, or kind of heuristic; repeat for several.",
         ),
@@ -150,7 +155,7 @@ def history_filters(command: Any) -> Any:
             "--source",
             metavar="NAME",
             multiple=True,
-            help="Train only on histories of this source, ppo or noise; repeat for several.",
+            help="Train only on histories of this source: ppo, noise or student; repeat for several.",
         ),
     ]
 
@@ -278,9 +283,6 @@ def prepare_method(
     return job, options, f"{description}\n{training_summary(job.about['histories'])}"
 
 
-_RL2_MODEL = {"width", "recurrent_layers", "encoder", "teammate_actions", "reward_scale"}
-
-
 def prepare_rl2(
     size: str | None,
     model: Mapping[str, Any],
@@ -304,8 +306,7 @@ def prepare_rl2(
     """
     from baselines.online.prepare import prepare_play
 
-    unused = {"context", "accumulate", "weight_decay", "validate_every", "validation_batches"} & train.keys()
-    unused |= model.keys() - _RL2_MODEL
+    unused = UNUSED_OPTIONS["rl2"] & (train.keys() | model.keys())
     if size or unused:
         raise click.UsageError(f"{_flags(unused or ['size'])}: not with rl2, which learns by playing")
     sized = ModelOptions(**RL2_SETTINGS["model"] | dict(model))
@@ -362,7 +363,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "held_out", "obs", "labels", "every", "weights", "curriculum", "mirror")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "obs", "labels", "every", "weights", "curriculum", "mirror")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:

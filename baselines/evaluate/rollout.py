@@ -20,7 +20,7 @@ from baselines.agents.host import HostPolicy, Percept
 from baselines.evaluate.protocols import FOUR_RECIPES, Protocol
 from generation.env import Environment, EnvState
 from generation.policy import Policy, stacked
-from icrl4aht_data.benchmark.facts import track_of
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
@@ -76,7 +76,7 @@ class EvaluationRollout:
     @cached_property
     def env(self) -> Environment:
         """The environment of the layout under the protocol."""
-        four = self.protocol.four_recipes and track_of(self.layout.name) == "layout"
+        four = self.protocol.four_recipes and any(self.layout.name in names for names in TRACKS["layout"].values())
         recipes = np.array([self.layout.recipe_item(r) for r in FOUR_RECIPES], np.uint8) if four else None
         return Environment(self.layout, self.protocol.steps, recipes)
 

@@ -28,6 +28,7 @@ from baselines.methods.method import (
 from baselines.methods.options import ModelOptions
 from baselines.methods.tokens import RingBuffer, StepInput, StepTokens, batch_steps
 from generation.learners.encoder import encoding_log
+from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -38,11 +39,13 @@ class StepOutput(NamedTuple):
         head: the head's output, float (B, L, ..).
         next_obs: float (B, L, N), predicted observation after taking the action; None without +next_obs.
         teammate: float (B, L, A), logits of the teammate's action at the same step; None if they are not predicted.
+        family: float (B, L, F), logits of the teammate's family; None if it is not predicted.
     """
 
     head: Any
     next_obs: Float[Array, "B L N"] | None
     teammate: Float[Array, "B L A"] | None = None
+    family: Float[Array, "B L F"] | None = None
 
 
 class WindowMemory(NamedTuple):
@@ -72,6 +75,7 @@ class StepModel(nn.Module):
     head: nn.Module
     next_obs: nn.Module | None = None
     teammate: nn.Module | None = None
+    family: nn.Module | None = None
 
     def __call__(
         self,
@@ -79,13 +83,14 @@ class StepModel(nn.Module):
         actions: Int[Array, "B L"] | None = None,
         deterministic: bool = True,
     ) -> StepOutput:
-        """Returns the output for windows of steps; predicts observations if actions are given."""
+        """Returns the output for windows of steps, with the auxiliary predictions if actions are given."""
         trunk: Any = self.trunk
         tokens_BxLxD = self.tokens(steps, deterministic)
         features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
         predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
         mate = None if self.teammate is None or actions is None else self.teammate(features_BxLxD)
-        return StepOutput(self.head(features_BxLxD), predicted, mate)
+        family = None if self.family is None or actions is None else self.family(features_BxLxD)
+        return StepOutput(self.head(features_BxLxD), predicted, mate, family)
 
     def start(self, context: int, cached: bool) -> Any:
         """Returns the memory of an ego before its first step."""
@@ -137,7 +142,9 @@ def dropped_steps(context: int) -> int:
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
     """Returns a model of steps with the given trunk and head."""
     teammate = nn.Dense(world.actions) if options.teammate_loss else None
-    return StepModel(make_tokens(StepTokens, options, world), trunk, head, make_next_obs_head(options, world), teammate)
+    family = nn.Dense(len(all_families())) if options.family_loss else None
+    next_obs = make_next_obs_head(options, world)
+    return StepModel(make_tokens(StepTokens, options, world), trunk, head, next_obs, teammate, family)
 
 
 def example_step(world: World) -> StepInput:
@@ -179,6 +186,10 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
         if output.teammate is not None:
             log["teammate_loss"] = teammate_loss(output.teammate, batch)
             total += log["teammate_loss"]
+        if output.family is not None:
+            families = jnp.broadcast_to(jnp.asarray(batch.families)[:, None], mask.shape)
+            log["family_loss"] = mean_of_rows(cross_entropy(output.family, families, 0.0), mask)
+            total += log["family_loss"]
         return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
     return loss

@@ -2,9 +2,11 @@
 
 The query follows its context, [c_1 .. c_K, q], so that the answer, read at the last position, has seen all of it, and
 so that an ego's context need not be recomputed for every query. The loss with prior poses the query after every part of
-the context, c_1 .. c_j for j = 0..K: K + 1 copies of the query, each of which sees its part and itself.
+the context, c_1 .. c_j for j = 0..K: K + 1 copies of the query, each of which sees its part and itself. With Q queries
+a context, they are posed in turn: query j mod Q after the first j transitions.
 
-Shapes: `B` batch size, `K` transitions of a context, `D` width, `A` actions, `N` entries of an observation.
+Shapes: `B` batch size, `Q` queries of a context, `K` transitions of a context, `D` width, `A` actions, `N` entries of
+an observation.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from baselines.methods.conditional import change_if
 from baselines.methods.method import (
@@ -88,12 +90,11 @@ class DPT(nn.Module):
     finished_episodes_only: bool = True
 
     def __call__(self, context: Transition, query: Any, deterministic: bool = True) -> DPTOutput:
-        """Returns the answers to a query (B, ..) after every part of a context (B, K)."""
+        """Returns the answers to one query (B, ..) or several (B, Q, ..) after every part of a context (B, K)."""
         tokens_BxKxD, obs_features = self.tokens.context(context, deterministic)
-        query_BxD = self.tokens.query(query, deterministic)
         batch, length, width = tokens_BxKxD.shape
-        queries = jnp.broadcast_to(query_BxD[:, None], (batch, length + 1, width))
-        sequence = jnp.concatenate([tokens_BxKxD, queries], axis=1)
+        queries_BxQxD = self.tokens.query(query, deterministic).reshape(batch, -1, width)
+        sequence = jnp.concatenate([tokens_BxKxD, _in_turn(queries_BxQxD, length)], axis=1)
         features = self.trunk(sequence, context=length, deterministic=deterministic)
         features, answers = features[:, :length], features[:, length:]
         predicted = None
@@ -165,6 +166,11 @@ class DPT(nn.Module):
         return self.trunk.step(query, caches, jnp.int32(last), valid, visible)
 
 
+def _in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
+    """Returns one value for every part of a context of K = `length` transitions: value j mod Q after the first j."""
+    return values[:, jnp.arange(length + 1) % values.shape[1]]
+
+
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
     """Returns the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
     check_no_teammate_loss("dpt", options)
@@ -175,7 +181,8 @@ def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True
     def loss(params: Any, slow: Any, batch: DPTBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         context, query = batch_transitions(batch, world.view)
         output: DPTOutput = run_model(model, options, params, key, context, query)
-        target = jnp.broadcast_to(jnp.asarray(batch.query_target)[:, None], output.logits.shape[:2])
+        batch_size, answers = output.logits.shape[:2]
+        target = _in_turn(jnp.asarray(batch.query_target).reshape(batch_size, -1), answers - 1)
         total = cross_entropy(output.logits, target, options.label_smoothing).mean()
         hits = output.logits.argmax(axis=-1) == target
         log = {"action_loss": total, "accuracy": hits[:, -1].mean(), "prior_accuracy": hits[:, 0].mean()}

@@ -137,13 +137,14 @@ def make_next_obs_head(options: ModelOptions, world: World) -> NextObsHead | Non
 
 
 def check_no_teammate_loss(name: str, options: ModelOptions) -> None:
-    """Check that a method that does not predict the teammate's action is not asked to.
+    """Check that a method that predicts nothing of the teammate is not asked to.
 
     Raises:
         OptionError: if it is.
     """
-    if options.teammate_loss:
-        raise OptionError(f"teammate_loss = True: {name} does not predict the teammate's action; leave it out")
+    for option, what in (("teammate_loss", "action"), ("family_loss", "family")):
+        if getattr(options, option):
+            raise OptionError(f"{option} = True: {name} does not predict the teammate's {what}; leave it out")
 
 
 def squared_error(predicted: Float[Array, "*B N"], obs: Num[Array, "*B ..."]) -> Float[Array, "*B"]:

@@ -19,6 +19,7 @@ from generation.learners.encoder import CompactView, WindowEncoder
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
 
 METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "ad": ad,
@@ -27,8 +28,10 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "amago_offline": amago_offline,
     "rl2": rl2,
 }
-"""Methods: name -> function from (ModelOptions, World) to the method."""
+"""Methods: name -> function from (ModelOptions, World) to the method. Scripts may add theirs."""
 
+METHOD_PLUGINS = Plugins(METHOD_GROUP, METHODS)
+"""Methods of other installed packages, which are trained on histories."""
 
 PLAYING = ("rl2",)
 """Methods that are trained by playing."""
@@ -39,10 +42,31 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
 
     Raises:
         UnknownNameError: if there is no such method; lists the valid names and the nearest.
+        PluginError: if a registered method cannot be used; also raised by the returned function.
     """
-    if name not in METHODS:
-        raise unknown("method", name, METHODS)
-    return METHODS[name]
+    if name in METHODS:
+        return METHODS[name]
+    if name not in METHOD_PLUGINS.names:
+        raise unknown("method", name, all_methods())
+    make = METHOD_PLUGINS.load(name, Callable)
+
+    def make_checked(options: ModelOptions, world: World) -> Method:
+        method = make(options, world)
+        if not isinstance(method, Method):
+            raise METHOD_PLUGINS.error(name, f"expected a function that returns a Method, it returned {method!r:.100}")
+        if method.name != name or method.data not in ("ad", "dpt"):
+            raise METHOD_PLUGINS.error(
+                name,
+                f"expected name {name!r} and data 'ad' or 'dpt', found name {method.name!r} and data {method.data!r}",
+            )
+        return method
+
+    return make_checked
+
+
+def all_methods() -> list[str]:
+    """Returns the names of all methods, those of other packages last."""
+    return [*METHODS, *METHOD_PLUGINS.names]
 
 
 def overcooked_world(

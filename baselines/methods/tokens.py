@@ -73,7 +73,7 @@ def percept_step(percept: Any) -> StepInput:
 
 
 def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:
-    """Returns the context's transitions (B, K) and the query's observations (B, ..) of a DPT batch."""
+    """Returns the context's transitions (B, K) and the queries' observations, (B, ..) or (B, Q, ..), of a DPT batch."""
     both = jnp.stack([jnp.asarray(batch.context_obs), jnp.asarray(batch.context_next_obs)], axis=2)
     obs, query = group_equal(view(both, batch.layouts)), view(batch.query_obs, batch.layouts)
     mate: Any = batch.context_teammate_actions

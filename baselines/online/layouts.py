@@ -26,7 +26,7 @@ def with_four_recipes(layout: Layout) -> Layout:
 
 
 def rearranged_layouts(layout: Layout, count: int, seed: int = 0) -> list[Layout]:
-    """Returns layouts with the same rooms, in which counters, piles, pots and other fixtures stand elsewhere.
+    """Returns layouts with the same rooms, and with counters, piles, pots and other fixtures in other places.
 
     A fixture moves only to cells that the same agents reach, so that the same work is possible. None of the layouts is
     one of the benchmark, mirrored ones included. Every second one has the four recipes of `with_four_recipes`.

@@ -159,7 +159,7 @@ def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
 
 def _check_unused(name: str, histories: HistoryOptions) -> None:
     default = HistoryOptions(histories.layouts)
-    for field in ("order", "labels", "every", "weights", "curriculum", "held_out", "obs"):
+    for field in ("order", "queries", "labels", "every", "weights", "curriculum", "held_out", "obs"):
         found = getattr(histories, field)
         if found != getattr(default, field):
             raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave it out")
@@ -170,23 +170,17 @@ def _check_unused(name: str, histories: HistoryOptions) -> None:
 def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
     """Returns the teammates of all tasks of a selection of histories, and of some more."""
     found: _Teammates = {}
-    for task_id, history_id in _history_of_task(dataset).items():
-        assert dataset is not None
-        entry = dataset.index.entry(history_id)
-        key = get_layout(entry.layout), entry.teammate_kind
-        mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
-        found.setdefault(key, {})[task_id] = mate
+    if dataset is not None:
+        history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
+        for task_id, history_id in history_of.items():
+            entry = dataset.index.entry(history_id)
+            key = get_layout(entry.layout), entry.teammate_kind
+            mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
+            found.setdefault(key, {})[task_id] = mate
     for task in tasks:
         mate = _Teammate(task.teammate, build_teammate(task.layout, task.teammate))
         found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
     return found
-
-
-def _history_of_task(dataset: Dataset | None) -> dict[str, int]:
-    """Returns a history of each task of a selection."""
-    if dataset is None:
-        return {}
-    return {str(task): int(number) for task, number in zip(dataset.column("task_id"), dataset.ids, strict=True)}
 
 
 def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:

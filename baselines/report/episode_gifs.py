@@ -13,6 +13,7 @@ import numpy as np
 from baselines.agents.egos import AGENTS, PlayMode, find_agent, get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import Protocol
+from baselines.evaluate.rollout import EpisodeBatch
 from baselines.report.overlap import describe_overlap
 from baselines.report.results import EvaluationRun, ResultSource, cell_of, cell_order, group_of, groups_of
 from generation.policy import Policy
@@ -26,18 +27,34 @@ from icrl4aht_data.utils.threads import usable_cores
 _PROGRESS = "episodes of the report"
 
 
-class EpisodeGif(NamedTuple):
-    """An episode of a reported agent with a teammate of one family.
+class ShownEpisode(NamedTuple):
+    """A picture of an episode.
+
+    Attributes:
+        number: number of the episode in its task, from 1.
+        earned: return of the team.
+        path: the GIF.
+    """
+
+    number: int
+    earned: float
+    path: Path
+
+
+class EpisodePair(NamedTuple):
+    """The first and the last episode of a task that a reported agent played with a teammate of one family.
 
     Attributes:
         family: of the teammate.
-        caption: who plays which task, and the return; or why there is no picture.
-        path: the GIF, or None.
+        title: who plays on which layout.
+        caption: the task and the training data; or why there is no picture.
+        episodes: the first and the last episode, one if the task has only one, none if the agent cannot be restored.
     """
 
     family: str
+    title: str
     caption: str
-    path: Path | None
+    episodes: tuple[ShownEpisode, ...] = ()
 
 
 def episode_gif(
@@ -52,8 +69,38 @@ def episode_gif(
 ) -> float:
     """Write the first episode of a task as a GIF with `cell` pixels per map cell. Returns the team's return."""
     (played,) = play_tasks(make_ego, [task], dataclasses.replace(protocol, episodes=1), [seed], suite)
+    return _save_played(path, task.layout, played, cell)
+
+
+def first_and_last(
+    prefix: Path,
+    task: Task,
+    make_ego: Callable[[Layout], Policy],
+    protocol: Protocol,
+    *,
+    seed: int = 0,
+    cell: int = 24,
+    suite: Path | None = None,
+) -> tuple[ShownEpisode, ...]:
+    """Play a task, and write its first and last episode as GIFs. Returns them; they earn what `evaluate` stores.
+
+    Args:
+        prefix: path of the GIFs without "-1.gif" and the like.
+        task, make_ego, protocol, seed, suite: see `evaluator.play_tasks`.
+        cell: pixels per map cell.
+    """
+    shown = []
+    for number, played in enumerate(play_tasks(make_ego, [task], protocol, [seed], suite), start=1):
+        if number in (1, protocol.episodes):
+            path = prefix.with_name(f"{prefix.name}-{number}.gif")
+            shown.append(ShownEpisode(number, _save_played(path, task.layout, played, cell), path))
+    return tuple(shown)
+
+
+def _save_played(path: Path, layout: Layout, played: EpisodeBatch, cell: int) -> float:
+    """Write the only episode of a batch as a GIF with `cell` pixels per map cell. Returns the team's return."""
     record, reward = np.asarray(played.record[0]), np.asarray(played.reward[0])
-    save_episode(path, task.layout, record, reward, cell=cell)
+    save_episode(path, layout, record, reward, cell=cell)
     return float(reward.sum())
 
 
@@ -62,8 +109,8 @@ def family_gifs(
     folder: Path,
     suite: Path | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
-) -> list[EpisodeGif]:
-    """Write the first episode of an evaluated task for each agent and family of teammates.
+) -> list[EpisodePair]:
+    """Write the first and the last episode of an evaluated task for each agent and family of teammates.
 
     The task is on a layout where that family leaves headroom, if there is one among the results.
 
@@ -71,7 +118,7 @@ def family_gifs(
         runs: what is reported.
         folder: for the GIFs.
         suite: folder of learned teammates' checkpoints.
-        progress: called with (description, episodes drawn, episodes), from the calling thread.
+        progress: called with (description, tasks drawn, tasks), from the calling thread.
 
     Returns:
         Run after run, families in order. If an agent cannot be restored, the caption says why.
@@ -87,9 +134,9 @@ def family_gifs(
             chosen.append((run, source, source.tasks[cell][0]))
     egos = {source.folder: _restore(source) for _, source, _ in chosen}
 
-    def draw(number: int) -> EpisodeGif:
+    def draw(number: int) -> EpisodePair:
         run, source, task = chosen[number]
-        return _draw_result(run, source, task, egos[source.folder], folder / f"{number}.gif", suite)
+        return _draw_result(run, source, task, egos[source.folder], folder / str(number), suite)
 
     progress(_PROGRESS, 0, len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
@@ -105,23 +152,22 @@ def _draw_result(
     source: ResultSource,
     task: Task,
     ego: Callable[[Layout], Policy] | Icrl4ahtError,
-    path: Path,
+    prefix: Path,
     suite: Path | None,
-) -> EpisodeGif:
+) -> EpisodePair:
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
     family = task.teammate_family
     group = group_of(cell_of(task))
     kind = "" if group == "test" else f" ({group})"  # a number without it names a published teammate
-    players = f"{run.label} with {family}/t{task.teammate['theta_id']}{kind} on {task.layout.name}"
+    title = f"{run.label} with {family}/t{task.teammate['theta_id']}{kind} on {task.layout.name}"
     trained = describe_overlap([task], source.seen)
     origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {trained}"
     try:
         if isinstance(ego, Icrl4ahtError):
             raise ego
-        earned = episode_gif(path, task, ego, protocol, seed=seed, cell=24, suite=suite)
+        return EpisodePair(family, title, origin, first_and_last(prefix, task, ego, protocol, seed=seed, suite=suite))
     except Icrl4ahtError as error:
-        return EpisodeGif(family, f"{players}: no picture, {error}. {origin}", None)
-    return EpisodeGif(family, f"{players}: team return {earned:g} in episode 1 of {protocol.episodes}. {origin}", path)
+        return EpisodePair(family, title, f"No picture: {error}. {origin}")
 
 
 def _restore(source: ResultSource) -> Callable[[Layout], Policy] | Icrl4ahtError:

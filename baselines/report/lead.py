@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from baselines.evaluate.results import Result
-from baselines.report.summary import bootstrap_interval
-from icrl4aht_data.benchmark.facts import FAMILIES
+from baselines.report.intervals import bootstrap_interval
+from icrl4aht_data.benchmark.facts import family_order
 from icrl4aht_data.benchmark.tasks import Task
 
 FLOOR = ("stay", "random")
@@ -60,7 +60,7 @@ def family_returns(tasks: Sequence[Task], results: Mapping[str, Sequence[Result]
     """
     present = {task.teammate_family for task in tasks}
     found = []
-    for family in (name for name in FAMILIES if name in present):
+    for family in sorted(present, key=family_order):
         chosen = [number for number, task in enumerate(tasks) if task.teammate_family == family]
         returns = {
             agent: np.concatenate([np.asarray(of_agent[number].returns) for number in chosen])

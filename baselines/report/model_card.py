@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from baselines.methods.options import UNUSED_OPTIONS
 from baselines.report.overlap import describe_training, overlap_legend
 from baselines.report.results import EvaluationRun, ResultSource, instances_range
 from baselines.report.summary import track_tables
+from baselines.training.options import FILTERS, HistoryOptions
 from baselines.training.seen import TASKS_SOURCE, TRAINED_ON
 from icrl4aht_data.utils.templates import fill_template
 
@@ -19,13 +22,19 @@ CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 
 
-def model_card(run: EvaluationRun) -> str:
+_NOT_LISTED = ("layouts", "root", "split", "labels", "held_out", "obs", "channels", "hide_recipe", *FILTERS)
+
+
+def model_card(run: EvaluationRun, title: str = "", command: str = "", validation: Sequence[EvaluationRun] = ()) -> str:
     """Returns README.md of a model, to publish with its run folder.
 
     Args:
         run: results of a model that was trained here. A run that was merged from models of several layouts has one
             card, with a row of the table of models for each, and settings for each that differ. Several results of
             one model are one row.
+        title: name of the model; by default the agent's.
+        command: command that makes the model.
+        validation: further results of the model, on validation tasks under the same protocol, which get tables, too.
     """
     sources_of: dict[str, list[ResultSource]] = {}
     for source in run.sources:
@@ -41,18 +50,26 @@ def model_card(run: EvaluationRun) -> str:
         f"{'It is one run' if single else 'Each model is one run'}, of seed {', '.join(seeds)}: the variation between "
         f"seeds is not known.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
-        *overlap_legend(run.overlaps(run.cells)),
+        *overlap_legend(dict.fromkeys(name for one in (run, *validation) for name in one.overlaps(one.cells))),
     ]
+    method, dataset = config["method"] if title else run.agent, on_hub[1] if on_hub else "icrl4aht"
+    properties = {
+        "method": method,
+        "data": f"{dataset}, data version {histories['data_version']}",
+        "created with": f"icrl4aht-data {config['package_version']}",
+        "made by": command and f"`{command}`",
+    }
+    tables = [table for one in (run, *validation) for table in track_tables(one)]
     return fill_template(
         "baseline.md",
-        method=run.agent,
-        dataset=on_hub[1] if on_hub else "icrl4aht",
-        data_version=histories["data_version"],
-        code_version=config["package_version"],
+        title=title or run.agent,
+        method=method,
+        dataset=dataset,
+        properties="\n".join(f"| {name} | {value} |" for name, value in properties.items() if value),
         models="\n".join(_model_row(run, sources) for sources in models),
         settings=_settings(models),
         protocol=run.protocol,
-        results="\n\n".join(f"### {title[0].upper()}{title[1:]}\n\n{table}" for title, table in track_tables(run)),
+        results="\n\n".join(f"### {heading[0].upper()}{heading[1:]}\n\n{table}" for heading, table in tables),
         limits="\n".join(f"* {limit}" for limit in limits),
     )
 
@@ -122,18 +139,29 @@ def _settings(models: Iterable[Sequence[ResultSource]]) -> str:
         made_by = sorted({cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell})
         data = {"sources of histories": ", ".join(made_by), "labels": config["histories"].get("labels")}
         histories = config["histories"]
-        changes = {name: histories.get(name) for name in ("every", "mirror", "weights", "curriculum")}
-        changes = {name: value for name, value in changes.items() if value not in (None, 1, False, "uniform")}
+        changes = _changed(histories)
         changes["hidden recipe indicators"] = ", ".join(histories.get("hide_recipe", ()))
         changes["started from run"] = (
             config.get("init", {}).get("run") if isinstance(config.get("init"), dict) else None
         )
-        settings = {**config["model"], **config["train"], **config.get("play", {}), "channels": channels}
+        unused = UNUSED_OPTIONS.get(config.get("method", ""), ())
+        settings = {name: value for name, value in (config["model"] | config["train"]).items() if name not in unused}
+        settings |= {**config.get("play", {}), "channels": channels}
         settings |= {name: value for name, value in (data | changes).items() if value}
         tested_on.setdefault(_bullets(settings), []).extend(sources)
     if len(tested_on) == 1:
         return next(iter(tested_on))
     return "\n\n".join(f"Tested on {_layouts(sources)}:\n\n{listed}" for listed, sources in tested_on.items())
+
+
+def _changed(histories: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the options of a choice of histories that are not the defaults, without those that the card has."""
+    default = asdict(HistoryOptions(()))
+    return {
+        name: histories[name]
+        for name, value in default.items()
+        if name not in _NOT_LISTED and histories.get(name, value) != value
+    }
 
 
 def _bullets(settings: Mapping[str, Any]) -> str:

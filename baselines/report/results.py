@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from baselines.evaluate.results import Result, read_result
 from baselines.report.overlap import OVERLAPS, find_overlaps
 from baselines.training.run_folder import read_config
 from baselines.training.seen import TRAINED_ON, SeenInTraining, read_trained_on
-from icrl4aht_data.benchmark.facts import FAMILIES, KEPT_STEPS, LAYOUT_NAMES, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order, layout_order, track_of
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -57,6 +57,10 @@ GROUP_TEXTS = {
 }
 """Group of tasks that are not published test tasks -> explanation."""
 
+Returns = TypeVar("Returns", float, np.ndarray)
+"""A return or several."""
+
+_KINDS = ("test", *GROUP_TEXTS)
 _ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
 
 
@@ -85,19 +89,27 @@ class ResultSource(NamedTuple):
         return self.settings.get("details", {}).get("acting", "")
 
     @property
+    def playing(self) -> tuple[bool, bool]:
+        """Whether a trained model drew its actions, and whether its memory was cleared before each episode."""
+        details = self.settings.get("details", {})
+        return bool(details.get("sampled")), bool(details.get("forget"))
+
+    @property
     def encoder(self) -> str:
         """Kind of a trained model's encoder, see `methods.options.ModelOptions`; empty for other agents."""
         return self.settings.get("details", {}).get("encoder", "")
 
     @property
     def conditions(self) -> str:
-        """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of acting."""
+        """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of playing."""
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
-        listed = ", ".join(map(str, seeds))
+        listed, (sampled, forgets) = ", ".join(map(str, seeds)), self.playing
         return (
             f"protocol {protocol['name']}, {count_text(len(seeds), 'seed')} ({listed}), "
             f"{count_text(protocol['episodes'], 'episode')} of {count_text(protocol['steps'], 'step')}"
             + (f", {self.acting} acting" if self.acting else "")
+            + (", sampled actions" if sampled else "")
+            + (", memory cleared before each episode" if forgets else "")
         )
 
 
@@ -151,14 +163,20 @@ class EvaluationRun:
         """Returns the mean return of each instance of a cell, float64 (instances,)."""
         return self.cells[cell].mean(axis=1)
 
-    def gain(self, cell: Cell) -> float:
-        """Returns the mean return of the last 20 episodes minus that of the first 20 (paper, App. F).
+    def ends(self, cell: Cell) -> np.ndarray:
+        """Returns the mean returns of the first and the last 20 episodes, or of the halves if there are fewer than 40.
 
-        With fewer than 40 episodes it compares the halves.
+        Returns:
+            float64 (2, instances).
         """
         returns = self.cells[cell]
-        ends = max(1, min(_ENDS, returns.shape[1] // 2))
-        return float(returns[:, -ends:].mean() - returns[:, :ends].mean())
+        count = end_episodes(returns.shape[1])
+        return np.stack([returns[:, :count].mean(axis=1), returns[:, -count:].mean(axis=1)])
+
+    def gain(self, cell: Cell) -> float:
+        """Returns the mean return of the last episodes minus that of the first (paper, App. F), see `ends`."""
+        first, last = self.ends(cell)
+        return float(last.mean() - first.mean())
 
     @cached_property
     def label(self) -> str:
@@ -170,6 +188,11 @@ class EvaluationRun:
     def name(self) -> str:
         """The label with the protocol in parentheses."""
         return f"{self.label} ({self.protocol})"
+
+
+def end_episodes(episodes: int) -> int:
+    """Returns the number of episodes at each end of a task that the adaptation gain compares."""
+    return max(1, min(_ENDS, episodes // 2))
 
 
 def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
@@ -240,7 +263,7 @@ def as_run(
         raise OptionError(f"{where}: results of different settings in one run")
     known = published_test_tasks() | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
-        known = shipped_validation_tasks() | _diverse_tasks() | known
+        known = shipped_validation_tasks() | _bundled_by_id("diverse") | known
     cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
     played: dict[Cell, list[Task]] = defaultdict(list)
     for result in results:
@@ -288,22 +311,20 @@ def _find_seen(
     return {"": SeenInTraining() if is_reference else None}
 
 
-@cache
 def published_test_tasks() -> dict[str, Task]:
     """Returns the 160 published test tasks by id."""
-    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, "test")}
+    return _bundled_by_id("test")
 
 
-@cache
 def shipped_validation_tasks() -> dict[str, Task]:
     """Returns the package's validation tasks with teammates of the published training ranges, by id."""
-    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, "validation")}
+    return _bundled_by_id("validation")
 
 
 @cache
-def _diverse_tasks() -> dict[str, Task]:
-    """Returns the package's validation tasks with diverse teammates, by id."""
-    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, "diverse")}
+def _bundled_by_id(split: str) -> dict[str, Task]:
+    """Returns the package's tasks of one of `EVALUATION_SPLITS`, by id."""
+    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
 
 
 @cache
@@ -320,7 +341,7 @@ def cell_of(task: Task) -> Cell:
     """Returns the cell of a task, see the module's docstring."""
     if task.task_id in published_test_tasks():
         return task.layout.name, task.teammate_family
-    group = "diverse" if task.task_id in _diverse_tasks() else _GROUPS[task.split]
+    group = "diverse" if task.task_id in _bundled_by_id("diverse") else _GROUPS[task.split]
     return task.layout.name, f"{task.teammate_family} ({group})"
 
 
@@ -364,14 +385,20 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
 
 
 def _rules(run: EvaluationRun) -> tuple[Any, ...]:
-    """Returns what merged results must agree in: protocol with episodes and steps, seeds, acting, and encoder."""
+    """Returns what merged results must agree in: protocol, seeds, way of playing, and encoder."""
     source = run.sources[0]
-    return source.settings["protocol"], source.settings["seeds"], source.acting, source.encoder
+    return source.settings["protocol"], source.settings["seeds"], source.acting, source.playing, source.encoder
 
 
-def cell_order(cell: Cell) -> tuple[int, int, str]:
+def cell_order(cell: Cell) -> tuple[tuple[int, str], tuple[int, str], str]:
     """Returns the sort key of a cell in the paper's order."""
-    return LAYOUT_NAMES.index(cell[0]), FAMILIES.index(family_of(cell)), cell[1]
+    return layout_order(cell[0]), family_order(family_of(cell)), cell[1]
+
+
+def group_title(group: str) -> str:
+    """Returns a group of teammates as people read it: learned teammates, family "rl", are called "learned"."""
+    family, space, kind = group.partition(" ")
+    return f"{'learned' if family == 'rl' else family}{space}{kind}"
 
 
 def family_of(cell: Cell) -> str:
@@ -382,6 +409,25 @@ def family_of(cell: Cell) -> str:
 def group_of(cell: Cell) -> str:
     """Returns the kind of a cell's tasks: "test" for published test tasks, otherwise one of `GROUP_TEXTS`."""
     return cell[1].partition(" (")[2].removesuffix(")") or "test"
+
+
+def split_cells(cells: Iterable[Cell], most: int) -> list[list[Cell]]:
+    """Returns cells in lists of at most `most`, such as for pictures, in the paper's order.
+
+    A list has one kind of tasks, and all cells of a layout unless these are more than `most`.
+    """
+    by_layout: dict[tuple[str, str], list[Cell]] = {}
+    for cell in sorted(cells, key=cell_order):
+        by_layout.setdefault((group_of(cell), cell[0]), []).append(cell)
+    split: list[list[Cell]] = []
+    for (kind, _), of_layout in sorted(by_layout.items(), key=lambda found: _KINDS.index(found[0][0])):
+        for start in range(0, len(of_layout), most):
+            part = of_layout[start : start + most]
+            if split and group_of(split[-1][0]) == kind and len(split[-1]) + len(part) <= most:
+                split[-1] += part
+            else:
+                split.append(part)
+    return split
 
 
 def groups_of(cells: Iterable[Cell]) -> list[str]:
@@ -400,8 +446,18 @@ def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
     return read_published()["methods"].get(agent, {})
 
 
+def normalise(returns: Returns, references: Mapping[str, float]) -> Returns:
+    """Returns (return - stay) / (oracle - stay).
+
+    Args:
+        returns: a return, or float64 (U,), in a cell with headroom.
+        references: reference ego -> its mean return in the cell.
+    """
+    return (returns - references["stay"]) / (references["oracle"] - references["stay"])
+
+
 def normalized_return(mean: float, references: Mapping[str, float] | None) -> float | None:
-    """Returns (return - stay) / (oracle - stay), or None if the cell has no headroom or was not measured.
+    """Returns the normalised mean return of a cell, or None if the cell has no headroom or was not measured.
 
     Args:
         mean: mean return of a cell.
@@ -409,7 +465,7 @@ def normalized_return(mean: float, references: Mapping[str, float] | None) -> fl
     """
     if references is None or not has_headroom(references):
         return None
-    return (mean - references["stay"]) / (references["oracle"] - references["stay"])
+    return normalise(mean, references)
 
 
 def normalised_score(run: EvaluationRun, cell: Cell, headroom: Mapping[Cell, Mapping[str, float]]) -> float | None:

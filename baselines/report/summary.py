@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from baselines.plotting import plot_return_curves
+from baselines.report.headline import find_headlines, headline_text
+from baselines.report.intervals import bootstrap_interval
 from baselines.report.overlap import overlap_legend, overlap_marks
 from baselines.report.results import (
     GROUP_TEXTS,
@@ -25,32 +27,39 @@ from baselines.report.results import (
     normalised_score,
     published_cells,
     published_instances,
+    split_cells,
 )
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS, track_layouts
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, headroom_table, read_headroom
-from icrl4aht_data.plotting import check_can_draw
+from icrl4aht_data.plotting import MOST_PANELS, check_can_draw
 from icrl4aht_data.utils.templates import markdown_table
 
-REPORT_BEGINS = {
-    "report.md": b"# Returns per layout and teammate family\n",
-    "report.csv": b"agent,protocol,layout,family,instances,episodes,mean,std,",
-    "curves.png": None,
-}
-"""Files of a report -> their first bytes, by which they are recognised before they are replaced; None: those of a
-picture that this package drew."""
+_FIRST_CURVES = "curves.png"
 
-_RESAMPLES = 10_000
 _PAPER_AGENTS = ("random", "AD", "DPT")
 
 HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 """Layout -> family -> reference ego -> mean return."""
 
 
-def bootstrap_interval(means: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
-    """Returns the bootstrap 95 % interval of the mean over instances (n,)."""
-    resampled = rng.choice(means, (_RESAMPLES, len(means))).mean(axis=1)
-    low, high = np.percentile(resampled, (2.5, 97.5))
-    return float(low), float(high)
+def report_begins(runs: Sequence[EvaluationRun] = ()) -> dict[str, bytes | None]:
+    """Returns the files of a report with their first bytes, by which they are recognised before they are replaced.
+
+    The bytes are None for a picture, which carries this package's mark. Without runs the only picture is curves.png.
+    """
+    pictures = [name for name, _ in _curve_pictures(runs)] or [_FIRST_CURVES]
+    return {
+        "report.md": b"# Returns per layout and teammate family\n",
+        "report.csv": b"agent,protocol,layout,family,instances,episodes,mean,std,",
+    } | dict.fromkeys(pictures)
+
+
+def _curve_pictures(runs: Sequence[EvaluationRun]) -> list[tuple[str, list[Cell]]]:
+    """Returns the names of the pictures of curves and the cells in each: curves.png, curves-2.png and so on."""
+    parts = split_cells({cell for run in runs for cell in run.cells}, MOST_PANELS)
+    return [
+        (_FIRST_CURVES if number == 1 else f"curves-{number}.png", cells) for number, cells in enumerate(parts, start=1)
+    ]
 
 
 def rows(run: EvaluationRun) -> list[dict[str, Any]]:
@@ -103,24 +112,29 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
 
 
 def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
-    """Write report.md, report.csv and curves.png of some runs into the folder `out`. Returns their paths.
+    """Write report.md, report.csv and the curves of some runs into the folder `out`. Returns their paths.
+
+    More cells than fit a picture are drawn in several: curves.png, curves-2.png and so on.
 
     Raises:
         OptionError: if matplotlib is not installed; nothing is written then.
     """
     check_can_draw()
     out.mkdir(parents=True, exist_ok=True)
-    paths = [out / "report.md", out / "report.csv", out / "curves.png"]
+    paths = [out / name for name in report_begins(runs)]
     paths[0].write_text(markdown(runs), encoding="utf-8")
     paths[1].write_text(csv_text(runs), encoding="utf-8")
-    plot_return_curves([(run.name, run.cells) for run in runs], paths[2])
+    for name, cells in _curve_pictures(runs):
+        plot_return_curves([(run.name, run.cells) for run in runs], cells, out / name)
     return paths
 
 
 def markdown(runs: list[EvaluationRun]) -> str:
-    """Returns a Markdown report with one table per run, track and kind of tasks: returns by layout and family."""
+    """Returns a Markdown report: a summary, and a table of returns per run, track and kind of tasks."""
     lines = [
         "# Returns per layout and teammate family",
+        "",
+        *(f"* {text}" for text in summary_lines(runs)),
         "",
         "Mean ± std over the instances' means. The published number of the same agent is below it if the protocol is",
         "`published`: the paper's 5 instances, 100 episodes of 100 steps.",
@@ -131,6 +145,13 @@ def markdown(runs: list[EvaluationRun]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
+    """Returns the summary of some runs for the console and Markdown, see `headline.headline_text`, and its legend."""
+    headlines = [headline for run in runs for headline in find_headlines(run)]
+    legend = overlap_legend({name for one in headlines for name in one.run.overlaps(one.cells)})
+    return [*map(headline_text, headlines), *legend]
+
+
 def track_tables(run: EvaluationRun) -> Iterator[tuple[str, str]]:
     """Yields each track and kind of tasks that was played, and a Markdown table with caption and meaning of its marks.
 
@@ -138,8 +159,8 @@ def track_tables(run: EvaluationRun) -> Iterator[tuple[str, str]]:
     A table has a column per layout and a row per family of teammates.
     """
     cells = dict(zip(run.cells, rows(run), strict=True))
-    for (track, splits), kind in product(TRACKS.items(), ("test", *GROUP_TEXTS)):
-        of_track = dict.fromkeys((*splits["test"], *splits["train"]))
+    for track, kind in product(TRACKS, ("test", *GROUP_TEXTS)):
+        of_track = dict.fromkeys((*track_layouts(track, "test"), *track_layouts(track, "train")))
         shown = [cell for cell in run.cells if cell[0] in of_track and group_of(cell) == kind]
         layouts = [layout for layout in of_track if any(cell[0] == layout for cell in shown)]
         if shown:
@@ -171,11 +192,11 @@ def _cell_text(cell: Cell, row: dict[str, Any] | None) -> str:
         text += f"<br>{instances_text(cell, row['instances'])}"
     if row["published_mean"] is not None:
         text += f"<br>published {row['published_mean']:.1f} ± {row['published_std']:.1f}"
-    text += f"<br>gain {row['gain']:+.1f}"
+    text += f"<br>gain {row['gain']:+z.1f}"
     if row["headroom"] is False:
         text += "<br>no headroom"
     if row["normalised"] is not None:
-        text += f"<br>normalised {row['normalised']:.2f}"
+        text += f"<br>normalised {row['normalised']:z.2f}"
     return text
 
 

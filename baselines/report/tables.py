@@ -11,12 +11,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.plotting import SweepPoint
 from baselines.report.overlap import describe_overlap
 from baselines.report.results import (
     PUBLISHED_PROTOCOL,
     EvaluationRun,
+    family_of,
     group_of,
+    groups_of,
     instances_range,
     instances_text,
     normalised_score,
@@ -31,6 +32,22 @@ AVERAGE = "Average"
 """Label of the row of means over families, as in cards/published.json."""
 
 _TEAMMATE, _LAYOUT = TRACKS["teammate"]["test"], TRACKS["layout"]["test"]
+
+
+class SweepPoint(NamedTuple):
+    """One run of a sweep on one layout.
+
+    Attributes:
+        value: of what is varied.
+        mean: return, over the cells played.
+        std: of the cells' means; None for a single cell.
+        published: the paper's mean, if it states one for these conditions.
+    """
+
+    value: Any
+    mean: float
+    std: float | None
+    published: float | None
 
 
 class PaperTable(NamedTuple):
@@ -77,6 +94,7 @@ class TableScore(NamedTuple):
         shortfall: instances played, if they are not the published ones, such as "1 of 5 instances"; usually empty.
         overlaps: the ways in which training data and tasks overlap, see `baselines.report.overlap.OVERLAPS`.
         details: what the score is of, with the conditions of the evaluation and the training of the agent; sentences.
+        gain: mean gain over the cells played, see `EvaluationRun.gain`; None if nothing was played.
     """
 
     mean: float | None
@@ -88,6 +106,7 @@ class TableScore(NamedTuple):
     shortfall: str = ""
     overlaps: tuple[str, ...] = ()
     details: str = ""
+    gain: float | None = None
 
 
 class TableRow(NamedTuple):
@@ -133,6 +152,49 @@ def fill_table(table: PaperTable, runs: Sequence[EvaluationRun], protocol: str) 
             ]
             filled.append(TableRow(label, agent, scores))
     return filled
+
+
+def returns_table(
+    runs: Sequence[EvaluationRun], cells: Sequence[Cell], protocol: str
+) -> tuple[list[str], list[TableRow]]:
+    """Returns a table of all that was played in some cells, without empty rows and columns.
+
+    Test cells also have averages over the families of a layout, over the layouts, and over all.
+
+    Args:
+        runs: runs under one protocol, none of a sweep.
+        cells: cells of one kind of tasks.
+        protocol: name of the protocol.
+
+    Returns:
+        The names of the columns with scores, and the rows.
+    """
+    headroom = read_headroom(protocol)
+    layouts, groups = list(dict.fromkeys(layout for layout, _ in cells)), groups_of(cells)
+    is_test = group_of(cells[0]) == "test"
+    columns = {layout: [layout] for layout in layouts} | ({AVERAGE: layouts} if is_test and len(layouts) > 1 else {})
+    labels = {family_of(("", group)): [group] for group in groups} | (
+        {AVERAGE: groups} if is_test and len(groups) > 1 else {}
+    )
+    filled = []
+    for label, of_label in labels.items():
+        for run in runs:
+            wanted = [[(n, g) for n in names for g in of_label if (n, g) in cells] for names in columns.values()]
+            scores = [_score_with_paper(of_column, run, headroom) for of_column in wanted]
+            if any(score.mean is not None for score in scores):
+                filled.append(TableRow(label, run.label, scores))
+    return list(columns), filled
+
+
+def _score_with_paper(
+    cells: Sequence[Cell], run: EvaluationRun, headroom: Mapping[Cell, dict[str, float]]
+) -> TableScore:
+    """Returns a run's score on cells, with the paper's number of the same agent on a single cell."""
+    published = None
+    if len(cells) == 1 and cells[0] in run.cells and run.variant is None:
+        layout, family = cells[0]
+        published = published_cells(run.agent).get(layout, {}).get(family)
+    return score_cells(cells, run, headroom, published)
 
 
 def table_cells(table: PaperTable) -> set[Cell]:
@@ -187,6 +249,7 @@ def score_cells(
         shortfall=_shortfall(run, list(means)),
         overlaps=run.overlaps(means),
         details=" ".join(["Mean over cells:"] * (len(cells) > 1) + [_describe_cell(run, cell) for cell in means]),
+        gain=float(np.mean([run.gain(cell) for cell in means])),
     )
 
 

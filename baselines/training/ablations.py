@@ -54,6 +54,13 @@ def _ablated(
     )
 
 
+def _asked(
+    name: str, about: str, histories: Mapping[str, Any] = MappingProxyType({}), **options: Any
+) -> ExperimentEntry:
+    """Returns an entry of an ablation whose contexts have a query after every part of 200 transitions."""
+    return _ablated(name, about, histories={"queries": 201, **histories}, **options)
+
+
 WINDOW_ENTRIES = (
     _ablated("plain", "size tiny, K = 200, 16 windows a batch, +TA, labels of RL^2, scaled rewards, rope"),
     _ablated("sampled", "draws its actions", run_of="plain", sampled=True),
@@ -69,6 +76,7 @@ WINDOW_ENTRIES = (
     _ablated("no-ta", "without the teammate's actions", {"teammate_actions": False}),
     _ablated("next_obs", "predicts the next observation, too", {"next_obs": True}),
     _ablated("teammate", "predicts the teammate's action, too", {"teammate_loss": True}),
+    _ablated("family", "predicts the teammate's family, too", {"family_loss": True}),
     _ablated("no-positions", "without rope", {"positions": "none"}),
     _ablated("smoothing", "label smoothing of 0.1", {"label_smoothing": 0.1}),
     _ablated("rewards", "rewards as they are, 20 a delivery", {"reward_scale": 1.0}),
@@ -76,11 +84,12 @@ WINDOW_ENTRIES = (
 """Models of AD that differ in one thing each, trained on histories of RL^2 with its labels, as `collect` makes them."""
 
 CONTEXT_ENTRIES = (
-    _ablated("plain", "size tiny, contiguous contexts of K = 200, 16 a batch, +TA, labels of RL^2"),
-    _ablated("sampled", "draws its actions", run_of="plain", sampled=True),
-    _ablated("mixed", "contexts of mixed skill: transitions of all of a history", histories={"order": "random"}),
-    _ablated("K500", "K = 500, 6 contexts a batch", train={"context": 500, "batch_size": 6}),
-    _ablated("oracle", "labels of the oracle, which sees the full state", histories={"labels": "oracle"}),
+    _asked("plain", "size tiny, contiguous contexts of K = 200, 16 a batch, 201 queries each, +TA, labels of RL^2"),
+    _asked("sampled", "draws its actions", run_of="plain", sampled=True),
+    _asked("one-query", "one query with each context, as published", histories={"queries": 1}),
+    _asked("mixed", "contexts of mixed skill: transitions of all of a history", histories={"order": "random"}),
+    _asked("K500", "K = 500, 6 contexts a batch", train={"context": 500, "batch_size": 6}),
+    _asked("oracle", "labels of the oracle, which sees the full state", histories={"labels": "oracle"}),
 )
 """Models of DPT that differ in one thing each, trained on the same histories."""
 

@@ -9,24 +9,26 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from baselines.methods.method import Method
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import PLAYING, get_method, overcooked_world
 from baselines.methods.tokens import BatchView, plain_view
-from baselines.methods.view_change import changed_view, mirrored_action
+from baselines.methods.view_change import changed_view
+from baselines.training.layout_numbers import number_layouts
 from baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from baselines.training.run_folder import CHECKPOINTS, read_config
 from baselines.training.seen import TRAINED_ON
 from baselines.training.trainer import TrainingData
 from generation.learners.config import EncoderKind
-from generation.learners.resume import Checkpoints
+from generation.learners.resume import Checkpoints, differing_settings
 from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
 from icrl4aht_data.sampling.draws import Curriculum
@@ -87,10 +89,8 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     draws = _draws(split.train, options, histories)
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
-        part: _number_layouts(
-            _sampler(
-                method, selection, options, model.teammate_actions, histories, labels, draws if part == "train" else {}
-            ),
+        part: number_layouts(
+            _sampler(method, selection, options, model, histories, labels, draws if part == "train" else {}),
             dataset.layouts,
             histories.mirror,
         )
@@ -244,7 +244,7 @@ def _sampler(
     method: Method,
     dataset: Dataset,
     options: TrainOptions,
-    teammate_actions: bool,
+    model: ModelOptions,
     histories: HistoryOptions,
     labels: Labels | None,
     draws: Mapping[str, Any],
@@ -259,18 +259,24 @@ def _sampler(
     shared: Any = {
         "batch_size": options.batch_size,
         "seed": options.seed,
-        "teammate_actions": teammate_actions,
+        "teammate_actions": model.teammate_actions,
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
         **draws,
     }
     if method.data == "ad":
         _check_thinned(dataset, options.context, every)
-        return dataset.ad(length=options.context, every=every, labels=labels, **shared)
+        if histories.queries > 1:
+            raise OptionError(
+                f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
+            )
+        return dataset.ad(length=options.context, every=every, labels=labels, families=model.family_loss, **shared)
     if every > 1:
         raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
     assert labels is not None
-    return dataset.dpt(context=options.context, order=histories.order, labels=labels, **shared)
+    return dataset.dpt(
+        context=options.context, order=histories.order, labels=labels, queries=histories.queries, **shared
+    )
 
 
 def _draws(dataset: Dataset, options: TrainOptions, histories: HistoryOptions) -> dict[str, Any]:
@@ -310,68 +316,6 @@ def _longer_source(dataset: Dataset, context: int) -> str:
     lengths, sources = dataset.column("T"), dataset.column("source")
     longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
     return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""
-
-
-class LayoutNumbers:
-    """A sampler's batches of state records, with other numbers of the layouts.
-
-    Args:
-        sampler: of histories on some of the layouts.
-        numbers: int32, new number of each layout of `sampler.layouts`.
-    """
-
-    def __init__(self, sampler: Any, numbers: np.ndarray) -> None:
-        self._sampler, self._numbers = sampler, numbers
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sampler, name)
-
-    def __getitem__(self, i: int) -> Any:
-        return self.batch(i)
-
-    def batch(self, i: int, out: Any = None) -> Any:
-        """Returns batch i, written into `out` if it is given."""
-        batch = self._sampler.batch(i, out)
-        rows = np.zeros(len(batch.obs if hasattr(batch, "obs") else batch.query_obs), np.int32)
-        return batch._replace(layouts=self._numbers[rows if batch.layouts is None else batch.layouts])
-
-
-class MirroredBatches(LayoutNumbers):
-    """A sampler's batches of state records, of which each row is mirrored at random; see `view_change.changed_view`.
-
-    Args:
-        sampler: of histories on some of the layouts.
-        numbers: int32, new number of each layout of `sampler.layouts`.
-        layouts: number of all layouts.
-    """
-
-    def __init__(self, sampler: Any, numbers: np.ndarray, layouts: int) -> None:
-        super().__init__(sampler, numbers)
-        self._layouts = layouts
-
-    def batch(self, i: int, out: Any = None) -> Any:
-        """Returns batch i, written into `out` if it is given."""
-        batch = super().batch(i, out)
-        drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
-        mirroring = drawn.integers(4, size=len(batch.layouts), dtype=np.int32)
-        actions = {
-            name: mirrored_action(values, mirroring)
-            for name, values in batch._asdict().items()
-            if values is not None and (name.endswith("actions") or name == "query_target")
-        }
-        if hasattr(batch, "is_first"):  # no step precedes: the fillers stay 0, as they are when a model acts
-            filler = batch.is_first | ~batch.attention_mask
-            actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
-        return batch._replace(**actions, layouts=batch.layouts + self._layouts * mirroring)
-
-
-def _number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
-    """Returns the sampler with layouts numbered as in `layouts`, of which its histories may be on a part only."""
-    numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
-    if mirror:
-        return MirroredBatches(sampler, numbers, len(layouts))
-    agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
-    return sampler if agree else LayoutNumbers(sampler, numbers)
 
 
 class HistorySplit(NamedTuple):
@@ -446,13 +390,26 @@ class TrainedModel(NamedTuple):
     hide_recipe: tuple[str, ...] = ()
 
 
-def start_from(before: TrainedModel, about: dict[str, Any]) -> Any:
-    """Returns the parameters of a model, to start another training from, and notes it in that training's settings.
+def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
+    """Returns the parameters of a run, to start another training from, and notes it in that training's settings.
 
     Args:
-        before: the model.
+        run: run folder of the model.
+        method: what is to be trained.
         about: settings of the other training; its record of training data gets that of the model, too.
+
+    Raises:
+        OptionError: if the parameters are of another model; names the options that differ.
     """
+    before, config = read_trained(run), read_config(run)
+    shapes = jax.eval_shape(method.init, jax.random.key(0))
+    if jax.tree.map(jnp.shape, before.params) != jax.tree.map(jnp.shape, shapes):
+        found, expected = (
+            {"method": name, "obs_shape": list(one["histories"]["obs_shape"]), **asdict(ModelOptions()), **one["model"]}
+            for name, one in ((config["method"], config), (method.name, about))
+        )
+        listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differing_settings(found, expected).items())
+        raise OptionError(f"{run}: its parameters are of another model ({listed}): give its options, or another run")
     about["init"] = {"run": before.hash, "step": before.step}
     about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]
     return before.params
@@ -485,7 +442,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += "+teammate" * model.teammate_loss
+    label += "+teammate" * model.teammate_loss + "+family" * model.family_loss
     label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
     names = tuple(layout.name for layout in layouts)
     digest = json_hash(config)

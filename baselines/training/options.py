@@ -99,6 +99,7 @@ class HistoryOptions:
     algorithm: tuple[str, ...] = ()
     source: tuple[str, ...] = ()
     order: ContextOrder = option_field("contiguous", "Order of the transitions in DPT's contexts.")
+    queries: int = option_field(1, "Queries that DPT answers with each context, posed in turn.", at_least=1)
     labels: Labels | None = option_field(
         None,
         "Actions to learn: expert (greedy ones of a policy) or oracle (of a script that knows the full state).",

@@ -5,12 +5,16 @@ Checkpoints, logs and resuming are those of `generation.learners.resume`; this m
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from baselines.methods.options import ModelOptions
+from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from generation.learners.resume import differing_settings
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
@@ -49,8 +53,14 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def open_run(folder: Path, config: dict[str, Any]) -> None:
-    """Start a run in a folder, or check that the run in it has the same settings.
+_DEFAULTS = {"model": ModelOptions(), "play": PlayOptions(), "histories": HistoryOptions(()), "train": TrainOptions()}
+"""Part of a run's settings -> the defaults of its options."""
+
+
+def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
+    """Start a run in a folder, or check that the run in it has the same settings. Returns the settings in the folder.
+
+    An option that the folder does not state is one that came after the run: the run has its default.
 
     Args:
         folder: created if it is missing.
@@ -64,8 +74,23 @@ def open_run(folder: Path, config: dict[str, Any]) -> None:
         if jax.process_index() == 0:
             with atomic_write(folder / CONFIG) as partial:
                 write_json(partial, config)
-        return
-    different = differing_settings(read_config(folder), config)
+        return config
+    found = read_config(folder)
+    different = differing_settings(_with_defaults(found, config), config)
     if different:
         listed = "; ".join(f"{name}: the run has {one!r}, expected {two!r}" for name, (one, two) in different.items())
         raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
+    return found
+
+
+def _with_defaults(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a run with the defaults of those options of a new one that it does not state."""
+    parts = {
+        part: asdict(options)
+        for part, options in _DEFAULTS.items()
+        if isinstance(found.get(part), dict) and part in config
+    }
+    return {**found} | {
+        part: {name: value for name, value in options.items() if name in config[part]} | found[part]
+        for part, options in parts.items()
+    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from icrl4aht_data.benchmark.facts import FAMILIES, KIND_FAMILIES
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS, all_families
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
@@ -14,8 +14,6 @@ TRAINED_ON = "trained_on"
 
 TASKS_SOURCE = "tasks"
 """In that record, the `source` of teammates that a model has played with and that have no histories."""
-
-_KINDS = {family: tuple(kind for kind, of in KIND_FAMILIES.items() if of == family) for family in FAMILIES}
 
 
 class SeenInTraining(NamedTuple):
@@ -56,17 +54,22 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
     return SeenInTraining(tuple(dict.fromkeys(layouts)), seen)
 
 
+def _kinds_of(family: str) -> tuple[str, ...]:
+    kinds = tuple(kind for kind, of in KIND_FAMILIES.items() if of == family)
+    return kinds or tuple(name for name in TEAMMATE_PLUGINS.names if name == family)
+
+
 def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str] | None]:
     """Returns an entry's layout, teammate kinds and teammate ids."""
     fields = entry if isinstance(entry, dict) else {}
     layout, family, algorithm = (fields.get(name) for name in ("layout", "family", "algorithm"))
     ids = fields.get("teammates")
-    kinds = _KINDS.get(family, ()) if isinstance(family, str) else ()
+    kinds = _kinds_of(family) if isinstance(family, str) else ()
     valid_ids = ids is None or (isinstance(ids, list | tuple) and all(isinstance(name, str) for name in ids))
     if not isinstance(layout, str) or not kinds or algorithm not in (None, *kinds) or not valid_ids:
         raise OptionError(
-            f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(FAMILIES)}), perhaps an algorithm of this "
-            f"family and a list of teammates' ids; found {str(entry)[:200]!r}"
+            f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(all_families())}), perhaps an algorithm "
+            f"of this family and a list of teammates' ids; found {str(entry)[:200]!r}"
         )
     try:
         name = get_layout(layout).name

@@ -239,7 +239,7 @@ def train(
         writes = jax.process_index() == 0
         if writes:
             stack.enter_context(run_lock(folder))
-        open_run(folder, config)
+        config = open_run(folder, config)
         checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
         if checkpoints.latest is None:
             state = trainer.init()

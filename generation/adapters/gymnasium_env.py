@@ -8,11 +8,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex, get_args
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
 from jaxtyping import Array, Float, Int, UInt8
 
 from generation.adapters.arguments import check_action, check_integers, check_record
@@ -22,14 +20,22 @@ from generation.policy import Noise, Policy
 from generation.teammates.instances import published_task
 from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.tasks import Task, parse_task
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.render import draw_frame
+from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.validation import check_int
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError as error:
+    reason = f"an environment for Gymnasium needs {error.name or error}: {install_command('gym')}"
+    raise ImportError(reason, name=error.name) from error
 
 RESET_OPTIONS = ("state", "key", "episode", "teammate_actions", "recipes")
 """Names of the options of `TaskEnv.reset`."""
@@ -76,6 +82,11 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         ):
             if value not in valid:
                 raise unknown(what, value, map(str, valid))
+        if not isinstance(task, Mapping):
+            raise TaskFormatError(
+                f"task = {task!r:.200}: expected the fields of a task by name, such as dataclasses.asdict(task), found "
+                f"{type(task).__name__}"
+            )
         self.task: Task = parse_task(dict(task))
         self.layout: Layout = self.task.layout
         policy = build_teammate(
@@ -88,6 +99,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         self.render_mode = render_mode
         self._moment: _Moment | None = None
         self._script, self._recipes = np.empty(0, np.int32), np.empty(0, np.uint8)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.layout.name}, task {self.task.task_id})"
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

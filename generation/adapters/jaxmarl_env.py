@@ -8,8 +8,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxmarl.environments import spaces
-from jaxmarl.environments.multi_agent_env import MultiAgentEnv
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
 
 from generation.env import Environment, EnvState
@@ -20,7 +18,18 @@ from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe_both
+from icrl4aht_data.overcooked.state import unpack
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.validation import check_int
+
+try:
+    from jaxmarl.environments import spaces
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
+    from jaxmarl.environments.overcooked_v2.common import DynamicObject
+except ImportError as error:
+    reason = f"an environment for JaxMARL needs {error.name or error}: {install_command('jaxmarl')}"
+    raise ImportError(reason, name=error.name) from error
 
 
 @struct.dataclass
@@ -32,12 +41,14 @@ class JaxMARLState:
         step: int32 (), steps taken in the episode.
         done: bool (), whether the episode has ended.
         record: uint8 (S,), the state record; see `icrl4aht_data.overcooked.state`.
+        recipe: int32 (), the current recipe as JaxMARL's OvercookedV2 encodes it, for its wrapper of logs.
     """
 
     key: UInt32[Array, " 2"]
     step: Int[Array, ""]
     done: Bool[Array, ""]
     record: UInt8[Array, " S"]
+    recipe: Int[Array, ""]
 
 
 class JaxMARLEnv(MultiAgentEnv):
@@ -55,6 +66,9 @@ class JaxMARLEnv(MultiAgentEnv):
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
         channels: the layout's own channels, or the canonical ones, which all layouts share.
 
+    Attributes:
+        possible_recipes: int32 (R, 3), the ingredient ids of each recipe, which JaxMARL's wrapper of logs reads.
+
     Raises:
         UnknownNameError: for a layout or channels that do not exist.
         OptionError: for a number of steps below 1.
@@ -68,17 +82,23 @@ class JaxMARLEnv(MultiAgentEnv):
         self.max_steps = check_int("max_steps", max_steps, 1)
         self._canonical = channels == "canonical"
         self._environment = Environment(self.layout)
+        self.possible_recipes = jnp.array(self.layout.recipes, jnp.int32)
+        self._recipe_items = jnp.array(self.layout.recipe_items)
+        self._recipe_codes = jax.vmap(DynamicObject.get_recipe_encoding)(self.possible_recipes)
         self._observed = spaces.Box(0, 255, observation_shape(self.layout, self._canonical), jnp.uint8)
         self._played = spaces.Discrete(len(ACTIONS))
         self.observation_spaces = dict.fromkeys(self.agents, self._observed)
         self.action_spaces = dict.fromkeys(self.agents, self._played)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.layout.name}, episodes of {counted_noun(self.max_steps, 'step')})"
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: Key[Array, ""] | UInt32[Array, " 2"]) -> tuple[dict[str, UInt8[Array, "5 5 C"]], JaxMARLState]:
         """Returns the first observations and the state of an episode, a function of the key."""
         data = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
         record = self._environment.init(data[None]).record[0]
-        state = JaxMARLState(data, jnp.int32(0), jnp.bool_(False), record)
+        state = JaxMARLState(data, jnp.int32(0), jnp.bool_(False), record, self._recipe_code(record))
         return self.get_obs(state), state
 
     def step_env(  # type: ignore[override]
@@ -104,11 +124,16 @@ class JaxMARLEnv(MultiAgentEnv):
         recipe = self._environment.next_recipe(running)
         outcome = rules.step(self.layout, running.record, both[None], recipe)
         ended = state.step + 1 >= self.max_steps
-        after = state.replace(step=state.step + 1, done=ended, record=outcome.state[0])  # type: ignore[attr-defined]
+        record = outcome.state[0]
+        after = JaxMARLState(state.key, state.step + 1, ended, record, self._recipe_code(record))
         shaped = dict(zip(self.agents, outcome.shaped[0], strict=True))
         dones = dict.fromkeys((*self.agents, "__all__"), ended)
         rewards: dict[str, Any] = dict.fromkeys(self.agents, outcome.reward[0])
         return self.get_obs(after), after, rewards, dones, {"shaped_reward": shaped}
+
+    def _recipe_code(self, record: UInt8[Array, " S"]) -> Int[Array, ""]:
+        """Returns JaxMARL's encoding of a record's recipe."""
+        return self._recipe_codes[jnp.argmax(self._recipe_items == unpack(self.layout, record).recipe)]
 
     def get_obs(  # type: ignore[override]
         self, state: JaxMARLState

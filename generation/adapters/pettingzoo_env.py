@@ -9,9 +9,6 @@ from typing import Any, NamedTuple, SupportsIndex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
-from gymnasium.utils import seeding
-from pettingzoo import ParallelEnv
 
 from generation.adapters.arguments import check_action, check_record
 from generation.env import Environment, EnvState
@@ -23,7 +20,17 @@ from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_sh
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.render import draw_frame
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.validation import check_int
+
+try:
+    from gymnasium import spaces
+    from gymnasium.utils import seeding
+    from pettingzoo import ParallelEnv
+except ImportError as error:
+    reason = f"an environment for PettingZoo needs {error.name or error}: {install_command('pettingzoo')}"
+    raise ImportError(reason, name=error.name) from error
 
 AGENT_NAMES = ("ego", "teammate")
 """Names of the two agents, by slot."""
@@ -76,6 +83,9 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         self._functions = _compiled(self.layout, channels == "canonical")
         self._random, _ = seeding.np_random()
         self._running: EnvState | None = None
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.layout.name}, episodes of {counted_noun(self.max_steps, 'step')})"
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the space of an agent's observations."""

@@ -14,14 +14,22 @@ from generation.learners.resume import BusyError
 from generation.plotting import plot_matrix
 from generation.populations.cross_play import EPISODES_PER_PAIR
 from generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
-from generation.populations.select import TeammateSelection, layout_number, select_teammates, write_manifests
+from generation.populations.select import TeammateSelection, select_teammates, write_manifests
 from generation.populations.train import PopulationRun, is_trained, play_matrix, suite_checkpoints, train_population
 from generation.profiles import Profile
 from generation.progress import progress_bars
 from generation.teammates.instances import published_thetas
 from generation.teammates.learned import build_learned
 from generation.teammates.registry import build_teammate
-from icrl4aht_data.benchmark.facts import ALGORITHMS, EPISODE_STEPS, HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import (
+    ALGORITHMS,
+    EPISODE_STEPS,
+    HEURISTIC_KINDS,
+    TRACKS,
+    layout_number,
+    track_layouts,
+    track_of,
+)
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.plotting import check_can_draw
@@ -92,7 +100,7 @@ def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], s
 
 def training_layouts() -> list[str]:
     """The layouts of all training tasks."""
-    return list(dict.fromkeys(name for splits in TRACKS.values() for name in splits["train"]))
+    return list(dict.fromkeys(name for track in TRACKS for name in track_layouts(track, "train")))
 
 
 def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bool:

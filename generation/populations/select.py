@@ -12,7 +12,7 @@ import numpy as np
 
 from generation.learners.checkpoint import POLICY_WEIGHTS
 from generation.populations.train import SuiteCheckpoint, suite_checkpoints
-from icrl4aht_data.benchmark.facts import ALGORITHMS, LAYOUT_NAMES, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write
@@ -104,11 +104,6 @@ def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str)
             seed = first + number + (split != "train") * len(selection.train)
             tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed))
     return tasks
-
-
-def layout_number(layout: str) -> int:
-    """Position of a layout among all, for seeds."""
-    return LAYOUT_NAMES.index(layout)
 
 
 def _entry(suite: Path, algorithm: str, number: int, point: SuiteCheckpoint) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from generation.teammates.heuristics.heuristic import Heuristic
 from generation.teammates.heuristics.recipe_aware_button import RECIPE_AWARE_BUTTON
 from generation.teammates.heuristics.territory import TERRITORY
 from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
+from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import TEAMMATES
@@ -25,6 +26,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 HEURISTIC_FAMILIES = {
     heuristic.kind: heuristic for heuristic in (RECIPE_AWARE_BUTTON, TERRITORY, ASSEMBLY_LINE, UTILITY_GREEDY)
 }
+"""The heuristics of the benchmark by kind; other installed packages register further ones."""
 
 _JITTER = 0.2
 """Largest distance of a sampled parameter from its preset, as a share of its full range."""
@@ -163,6 +165,11 @@ def check_theta(teammate: dict[str, Any]) -> None:
 
 
 def _family(name: str) -> Heuristic:
-    if name not in HEURISTIC_FAMILIES:
-        raise unknown("teammate family", name, HEURISTIC_FAMILIES)
-    return HEURISTIC_FAMILIES[name]
+    if name in HEURISTIC_FAMILIES:
+        return HEURISTIC_FAMILIES[name]
+    if name not in TEAMMATE_PLUGINS.names:
+        raise unknown("teammate family", name, (*HEURISTIC_FAMILIES, *TEAMMATE_PLUGINS.names))
+    heuristic = TEAMMATE_PLUGINS.load(name, Heuristic)
+    if heuristic.kind != name:
+        raise TEAMMATE_PLUGINS.error(name, f"expected kind {name!r}, found {heuristic.kind!r}")
+    return heuristic

@@ -1,8 +1,16 @@
-"""Facts of the benchmark: tracks, splits, teammate families, lengths, and which layouts belong to which split."""
+"""Facts of the benchmark: tracks, splits, teammate families, lengths, and which layouts belong to which split.
+
+The constants are those of the published benchmark. The functions also know the layouts and heuristic teammates that
+other installed packages register, see docs/extending.md.
+"""
 
 from __future__ import annotations
 
+import hashlib
+
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
+from icrl4aht_data.utils.plugins import Plugins
 
 _TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
 _LAYOUT_LAYOUTS = ("asymm_both", "cramped_up")
@@ -31,7 +39,9 @@ TESTED_ON = {
 """Training layout -> the layout that its models are tested on (paper, Sec. 5.1 and 5.2)."""
 
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
-"""Every layout of the benchmark, in the paper's order; the position in this tuple enters seeds."""
+"""Every layout of the benchmark, in the paper's order."""
+
+_OTHER_NUMBERS = 10_000  # different numbers of layouts that are not among these
 
 SPLITS = ("train", "validation", "test", "heldout")
 """Splits of the tasks. `validation` combines training layouts with heuristic teammates that are neither in `train`
@@ -53,6 +63,9 @@ ALGORITHMS = ("fcp", "brdiv", "lbrdiv", "comedi")
 
 KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 """teammate kind -> family, for algorithms and heuristics."""
+
+TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
+"""Heuristic teammates of other installed packages. Each is a family of its own, of the same name."""
 
 SOURCES = ("ppo", "noise", "student")
 """How histories are made: by an ego that learns with PPO; by a script whose actions are replaced by random ones, ever
@@ -87,6 +100,26 @@ SAME_BEHAVIOUR = 0.02
 """Hamming distance below which two teammates count as one behaviour."""
 
 
+def all_families() -> tuple[str, ...]:
+    """Families of teammates: those of the benchmark, then registered ones."""
+    return (*FAMILIES, *TEAMMATE_PLUGINS.names)
+
+
+def family_order(family: str) -> tuple[int, str]:
+    """Sort key of a family: those of the benchmark come first, in its order, then others by name."""
+    return (FAMILIES.index(family), "") if family in FAMILIES else (len(FAMILIES), family)
+
+
+def kind_family(kind: str) -> str | None:
+    """Family of a teammate kind; None for a kind that is neither of the benchmark nor registered."""
+    return KIND_FAMILIES.get(kind) or (kind if kind in TEAMMATE_PLUGINS.names else None)
+
+
+def track_layouts(track: str, split: str) -> tuple[str, ...]:
+    """Short names of the layouts of a track and split; registered layouts belong to every split of track `layout`."""
+    return (*TRACKS[track][split], *(LAYOUT_PLUGINS.names if track == "layout" else ()))
+
+
 def track_of(layout: str) -> str:
     """The track whose train or test layouts include `layout` (short name).
 
@@ -96,7 +129,36 @@ def track_of(layout: str) -> str:
     for track, splits in TRACKS.items():
         if any(layout in layouts for layouts in splits.values()):
             return track
-    raise unknown("layout", layout, LAYOUT_NAMES)
+    if layout in LAYOUT_PLUGINS.names:
+        return "layout"
+    raise unknown("layout", layout, (*LAYOUT_NAMES, *LAYOUT_PLUGINS.names))
+
+
+def layout_order(layout: str) -> tuple[int, str]:
+    """Sort key of a layout (short name): those of the benchmark come first, in its order, then others by name."""
+    return (LAYOUT_NAMES.index(layout), "") if layout in LAYOUT_NAMES else (len(LAYOUT_NAMES), layout)
+
+
+def layout_number(layout: str) -> int:
+    """Number of a layout (short name), for seeds: its position in `LAYOUT_NAMES`.
+
+    The number of a layout that is not there follows from its name alone, so that it does not depend on which other
+    packages are installed.
+    """
+    if layout in LAYOUT_NAMES:
+        return LAYOUT_NAMES.index(layout)
+    digest = hashlib.sha256(layout.encode()).digest()
+    return len(LAYOUT_NAMES) + int.from_bytes(digest[:4], "big") % _OTHER_NUMBERS
+
+
+def check_family(family: object) -> None:
+    """Check that a family of teammates exists.
+
+    Raises:
+        UnknownNameError: lists the valid names and the nearest.
+    """
+    if family not in FAMILIES and family not in (families := all_families()):
+        raise unknown("teammate_family", family, families)
 
 
 def check_membership(track: object, split: object, layout: object) -> None:
@@ -109,5 +171,5 @@ def check_membership(track: object, split: object, layout: object) -> None:
         raise unknown("track", track, TRACKS)
     if not isinstance(split, str) or split not in SPLITS:
         raise unknown("split", split, SPLITS)
-    if layout not in TRACKS[track][split]:
-        raise unknown(f"layout of the {split} split of track {track}", layout, TRACKS[track][split])
+    if layout not in TRACKS[track][split] and layout not in (names := track_layouts(track, split)):
+        raise unknown(f"layout of the {split} split of track {track}", layout, names)

@@ -18,7 +18,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, FAMILIES, HEURISTIC_KINDS, SPLITS, TRACKS, check_membership
+from icrl4aht_data.benchmark.facts import (
+    ALGORITHMS,
+    HEURISTIC_KINDS,
+    SPLITS,
+    TEAMMATE_PLUGINS,
+    TRACKS,
+    check_family,
+    check_membership,
+    kind_family,
+)
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -67,8 +76,8 @@ class Task:
 
     @property
     def teammate_family(self) -> str:
-        """The index's `teammate_family`: H1..H4, or rl."""
-        return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS[self.teammate_kind]
+        """The index's `teammate_family`: rl, H1..H4, or the name of a registered heuristic."""
+        return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS.get(self.teammate_kind, self.teammate_kind)
 
 
 @dataclass(frozen=True)
@@ -96,8 +105,7 @@ def named_task(line: Mapping[str, Any]) -> NamedTask:
     """
     layout = get_layout(line["layout"])
     check_membership(line["track"], line["split"], layout.name)
-    if line["teammate_family"] not in FAMILIES:
-        raise unknown("teammate_family", line["teammate_family"], FAMILIES)
+    check_family(line["teammate_family"])
     teammate = {name: line[name] for name in ("teammate_kind", "teammate_family")}
     return NamedTask(line["task_id"], line["track"], line["split"], layout.alias, -1, teammate)
 
@@ -205,8 +213,9 @@ def parse_task(fields: Any) -> Task:
 def _check_teammate(teammate: dict[str, Any]) -> None:
     if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
         raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
-    kinds = tuple(HEURISTIC_KINDS) if teammate["kind"] == "heuristic" else ALGORITHMS
-    if teammate["family"] not in kinds:
+    family, is_heuristic = kind_family(teammate["family"]), teammate["kind"] == "heuristic"
+    if family is None or (family == "rl") == is_heuristic:
+        kinds = (*HEURISTIC_KINDS, *TEAMMATE_PLUGINS.names) if is_heuristic else ALGORITHMS
         raise unknown(f"{teammate['kind']} family", teammate["family"], kinds)
     if teammate.get("slot", TEAMMATE) != TEAMMATE:
         raise TaskFormatError(f"teammate.slot: a task's teammate plays slot {TEAMMATE}, found {teammate['slot']!r}")

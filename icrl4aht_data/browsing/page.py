@@ -6,10 +6,11 @@ import base64
 import json
 import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
 from icrl4aht_data.overcooked.layouts import WINDOW, get_layout
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.nouns import counted_histories
 
 PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
 """First bytes of a page, by which it is recognised before it is replaced."""
@@ -34,7 +36,8 @@ PAGE_MEGABYTES = 5
 _FILES = Path(__file__).parent
 
 
-class BrowserPage(NamedTuple):
+@dataclass(frozen=True)
+class BrowserPage:
     """A page with histories.
 
     Attributes:
@@ -44,7 +47,7 @@ class BrowserPage(NamedTuple):
         shown_episodes: number of episodes that can be watched.
     """
 
-    html: bytes
+    html: bytes = field(repr=False)
     histories: int
     episodes: int
     shown_episodes: int
@@ -98,8 +101,9 @@ def make_browser_page(
         longest = max(len(one.facts["shown"]) for one in embedded)
         if longest <= 2:
             raise OptionError(
-                f"the page has {len(html) / 1e6:.2f} MB with the first and last episodes of {len(dataset)} histories, "
-                f"expected less than {megabytes:g} MB: take fewer histories, or allow a larger page"
+                f"the page has {len(html) / 1e6:.2f} MB with the first and last episodes of "
+                f"{counted_histories(len(dataset))}, expected less than {megabytes:g} MB: take fewer histories, or "
+                f"allow a larger page"
             )
         most = max(2, min(longest - 1, int(longest * 0.95 * megabytes * 1e6 / len(html))))
 

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from itertools import islice
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import KIND_FAMILIES
+from icrl4aht_data.benchmark.facts import kind_family
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
@@ -64,7 +64,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
             report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id}, of one task: unlike {unlike}")
         if not has_tasks and entry.seed != -1:
             report.add(HISTORIES, f"history {entry.history_id}: seed: expected -1 without tasks, found {entry.seed}")
-        if KIND_FAMILIES.get(entry.teammate_kind, entry.teammate_family) != entry.teammate_family:
+        if kind_family(entry.teammate_kind) not in (None, entry.teammate_family):
             report.add(
                 HISTORIES,
                 f"history {entry.history_id}: teammate_kind {entry.teammate_kind!r} is of another family than "

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import Any, Literal
 
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+
 Level = Literal["quick", "full", "deep"]
 """Depth of a verification, see `verify_release`."""
 
@@ -65,8 +67,9 @@ class Report:
 
     def __repr__(self) -> str:
         number = len(self.findings)
-        state = "ok" if self.ok else f"{number:,} problem{'s' * (number != 1)}"
-        lines = [f"Report({self.root}, level {self.level}: {state}; {self.files:,} files, {self.histories:,} histories"]
+        state = "ok" if self.ok else counted_noun(number, "problem")
+        checked = f"{counted_noun(self.files, 'file')}, {counted_histories(self.histories)}"
+        lines = [f"Report({self.root}, level {self.level}: {state}; {checked}"]
         lines += [f"    {finding.file}: {finding.problem:.200}" for finding in islice(self.findings, _SHOWN)]
         lines += [f"    and {number - _SHOWN:,} more: see .findings"] * (number > _SHOWN)
         return "\n".join(lines) + ")"
@@ -97,3 +100,17 @@ def _printable(text: str) -> str:
     """Return a text of limited length, with control characters escaped: they could command a terminal."""
     text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
     return text if text.isprintable() else text.encode("unicode_escape").decode()
+
+
+def verdict_in_words(report: Report) -> str:
+    """Return whether a release is valid, and what was checked, in one line."""
+    number = len(report.findings)
+    verdict = "valid" if report.ok else counted_noun(number, "problem")
+    if report.level == "quick":
+        return f"{verdict}; checked names, sizes and the index of {counted_noun(report.files, 'file')}, no contents"
+    physics = " and their physics" if report.replayed else ""
+    fetched = f"; fetched {report.fetched_bytes:,} bytes in {report.requests} requests" * (report.requests > 0)
+    return (
+        f"{verdict}; checked {counted_noun(report.files, 'file')}, {counted_noun(report.chunks, 'chunk')}, "
+        f"{counted_histories(report.histories)}, {counted_noun(report.transitions, 'transition')}{physics}{fetched}"
+    )

@@ -39,6 +39,7 @@ from icrl4aht_data.remote.download import chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.signatures import show_types
 
 _WITHOUT_HASHES = (
     "format version {version} has no chunk hashes: reading checks chunks by CRC-32 only, which a forger can satisfy; "
@@ -102,6 +103,9 @@ def verify_release(
         traffic = origin.remote.store.traffic - before
         report.fetched_bytes, report.requests = traffic.bytes, traffic.requests
     return report
+
+
+show_types(verify_release)
 
 
 def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, FilterValues]) -> None:

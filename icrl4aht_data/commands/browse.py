@@ -32,6 +32,7 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
 
 _FILE = "browse.html"
 
@@ -114,8 +115,8 @@ def browse(
     elif not quiet:
         shown = "all" if page.shown_episodes == page.episodes else f"{page.shown_episodes:,} of"
         click.echo(
-            f"{out or 'page'}: {page.histories} of {len(matching)} histories, {shown} {page.episodes:,} episodes to "
-            f"watch, {len(page.html):,} bytes"
+            f"{out or 'page'}: {page.histories} of {counted_histories(len(matching))}, {shown} "
+            f"{counted_noun(page.episodes, 'episode')} to watch, {len(page.html):,} bytes"
         )
     if server:
         with server:

@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.checking.report import Report
+from icrl4aht_data.checking.report import verdict_in_words
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.browse import browse
 from icrl4aht_data.commands.doctor import diagnose, in_words
@@ -55,6 +55,7 @@ from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.download import repair as repair_files
 from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.minari import from_minari, is_minari_dataset, to_minari
@@ -114,10 +115,10 @@ def cli() -> None:
 def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
     """List the tasks of a release.
 
-    Prints one row per task: layout, split, teammate, source, histories, transitions, the mean return of an episode at
-    the start and at the end of learning, and the labels: expert, with what the policy earns that they come from, acting
-    greedily (if it was measured), and oracle. Where the output is not a terminal, prints all facts of a task on one
-    line, separated by tabs, below a line with their names.
+    Prints for each task layout, split, teammate, source, histories, steps, the mean return of an episode at the start
+    and at the end of learning, the labels: expert, with what the policy earns that they come from, acting greedily (if
+    it was measured), and oracle; the end of the task's id, and the ids of its histories, if they are short. Where the
+    output is not a terminal, prints all facts of a task on one line, separated by tabs, below a line with their names.
     """
     tasks = summarize_tasks(_load(root, filters).entries)
     if as_json:
@@ -132,7 +133,9 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
 @cli.command()
 @_root
 @filter_options
-@click.option("--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history.")
+@click.option(
+    "--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history; list prints the ids."
+)
 @click.option(
     "--plot",
     type=NewFile(*PICTURES),
@@ -232,8 +235,8 @@ def download(
             click.echo(f"{name}: had changed, was fetched again")
         verb = "to download" if dry_run else "downloaded"
         fetched = len(plan.absent) + len(plan.changed)
-        here = f"{len(plan.files) - fetched} files present already, with the right hashes"
-        click.echo(f"{plan.root}: {fetched} files, {plan.size:,} bytes {verb}; {here}")
+        here = f"{counted_noun(len(plan.files) - fetched, 'file')} present already, with the right hashes"
+        click.echo(f"{plan.root}: {counted_noun(fetched, 'file')}, {plan.size:,} bytes {verb}; {here}")
         click.echo(f"folder: {plan.root.folder}")
 
 
@@ -287,21 +290,8 @@ def verify(
         for finding in report.findings:
             click.echo(finding.problem if finding.file == "." else f"{finding.file}: {finding.problem}")
         if not quiet:
-            click.echo("\n".join([f"{report.root}: {_verdict(report)}", *report.notes]))
+            click.echo("\n".join([f"{report.root}: {verdict_in_words(report)}", *report.notes]))
     sys.exit(0 if report.ok else 1)
-
-
-def _verdict(report: Report) -> str:
-    number = len(report.findings)
-    verdict = "valid" if report.ok else f"{number} problem{'s' * (number > 1)}"
-    if report.level == "quick":
-        return f"{verdict}; checked names, sizes and the index of {report.files} files, no contents"
-    physics = " and their physics" if report.replayed else ""
-    fetched = f"; fetched {report.fetched_bytes:,} bytes in {report.requests} requests" if report.requests else ""
-    return (
-        f"{verdict}; checked {report.files} files, {report.chunks} chunks, {report.histories} histories, "
-        f"{report.transitions:,} transitions{physics}{fetched}"
-    )
 
 
 @cli.command(

@@ -20,12 +20,13 @@ import h5py
 from huggingface_hub import constants
 from packaging.specifiers import SpecifierSet
 
+from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.requirements import Dependency, dependencies, installed_version
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, PluginError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.safe_hdf5 import OLDEST_HDF5
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, get_layout
 from icrl4aht_data.remote.addresses import check_credentials, without_credentials
 from icrl4aht_data.remote.download import default_remote
 from icrl4aht_data.remote.remote_release import is_address
@@ -33,6 +34,8 @@ from icrl4aht_data.remote.store import offline_switches
 from icrl4aht_data.utils.cache import CACHE_VARIABLES, DATA_VARIABLES, cache_folder, cache_limit, data_folder
 from icrl4aht_data.utils.installation import PACKAGE, install_command, installation_source, restore_command
 from icrl4aht_data.utils.memory import free_memory
+from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
+from icrl4aht_data.utils.requirements import Dependency, dependencies, installed_version
 from icrl4aht_data.utils.threads import usable_cores
 
 _LEAST_FREE = 2**30
@@ -64,7 +67,14 @@ def diagnose() -> dict[str, Any]:
         A JSON object: "ok", then for each section a mapping of what was found (sizes in bytes), then "problems".
     """
     problems: list[Problem] = []
-    checks = {"packages": _packages, "devices": _devices, "folders": _folders, "network": _network, "bundled": _bundled}
+    checks = {
+        "packages": _packages,
+        "plugins": _plugins,
+        "devices": _devices,
+        "folders": _folders,
+        "network": _network,
+        "bundled": _bundled,
+    }
     sections = {name: check(problems) for name, check in checks.items()}
     return {"ok": not problems, **sections, "problems": [problem._asdict() for problem in problems]}
 
@@ -112,6 +122,19 @@ def _packages(problems: list[Problem]) -> dict[str, Any]:
         elif found is None or not versions.contains(found, prereleases=True):
             problem = f"{name} {found or 'is not installed'}: expected {versions}"
             problems.append(Problem(problem, steps.get(name, f"pip install -U '{name}{versions}'")))
+    return facts
+
+
+def _plugins(problems: list[Problem]) -> dict[str, Any]:
+    """Return what other packages register, by group of entry points; teammates and methods are not imported."""
+    facts: dict[str, Any] = {}
+    for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, Plugins(METHOD_GROUP, ())):
+        try:
+            facts[plugins.group] = [f"{name} ({package})" for name, package in plugins.packages.items()]
+            if plugins is LAYOUT_PLUGINS:
+                _ = [get_layout(name) for name in plugins.names]
+        except PluginError as error:
+            problems.append(Problem(str(error), "correct or uninstall the package"))
     return facts
 
 

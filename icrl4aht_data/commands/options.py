@@ -20,14 +20,14 @@ from click.shell_completion import CompletionItem
 from rich.console import Console
 from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 
-from icrl4aht_data.benchmark.facts import FAMILIES, SPLITS, TRACKS
-from icrl4aht_data.commands.requirements import extras_with
+from icrl4aht_data.benchmark.facts import SPLITS, TRACKS, all_families
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
-from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.disk import FULL, describe_disk
-from icrl4aht_data.utils.installation import PACKAGE, install_command
+from icrl4aht_data.utils.installation import PACKAGE
 from icrl4aht_data.utils.progress import LineProgress
+from icrl4aht_data.utils.requirements import missing_library
 
 SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
 
@@ -78,11 +78,13 @@ class Names(click.ParamType):
     Args:
         name: singular noun for the names, such as "layout".
         valid: returns the valid names.
-        offered: how many of them, the first ones, completion offers; all by default.
+        offered: returns those that completion offers; all by default.
     """
 
-    def __init__(self, name: str, valid: Callable[[], Iterable[str]], offered: int | None = None) -> None:
-        self.name, self.valid, self._offered = name, valid, offered
+    def __init__(
+        self, name: str, valid: Callable[[], Iterable[str]], offered: Callable[[], Iterable[str]] | None = None
+    ) -> None:
+        self.name, self.valid, self.offered = name, valid, offered or valid
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         names = list(self.valid())
@@ -91,14 +93,14 @@ class Names(click.ParamType):
         return value
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return [CompletionItem(name) for name in list(self.valid())[: self._offered] if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in self.offered() if name.startswith(incomplete)]
 
 
-LAYOUT = Names("layout", lambda: [*LAYOUTS, *(layout.alias for layout in LAYOUTS.values())], offered=len(LAYOUTS))
+LAYOUT = Names("layout", all_layout_names, offered=lambda: [*LAYOUTS, *LAYOUT_PLUGINS.names])
 TRACK, SPLIT, FAMILY = (
     Names("track", lambda: TRACKS),
     Names("split", lambda: SPLITS),
-    Names("family", lambda: FAMILIES),
+    Names("family", all_families),
 )
 
 
@@ -205,7 +207,9 @@ def filter_options(command: Any) -> Any:
         click.option(
             "--teammate-kind", multiple=True, metavar="KIND", help="Only this kind, such as utility_greedy or fcp."
         ),
-        click.option("--source", multiple=True, metavar="NAME", help="Only histories of this source: ppo or noise."),
+        click.option(
+            "--source", multiple=True, metavar="NAME", help="Only histories of this source: ppo, noise or student."
+        ),
     ]
     for option in reversed(options):
         command = option(command)
@@ -289,11 +293,9 @@ def run(command: click.Command, extra: str | None = None) -> None:
     except OSError as error:
         _stop(_in_words(error), 1)
     except ModuleNotFoundError as error:
-        extras = extras_with(error.name or "")
-        if not extras:
+        if (message := missing_library(error.name or "", extra)) is None:
             raise
-        chosen = extra if extra in extras else extras[0]
-        _stop(f"this needs {error.name}, which is not installed: {install_command(chosen)}", 1)
+        _stop(message, 1)
 
 
 def _open_outputs() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -14,6 +14,9 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.info import describe
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+
+_IDS_SHOWN = 11  # characters of a task's ids of histories, which the table has room for
 
 
 def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
@@ -37,41 +40,49 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
             "labels": [kind for kind in LABELS if all(entry.has(FIELDS[f"{kind}_actions"]) for entry in some)],
             "expert_return": some[0].expert_return,
             "expert_return_sampled": some[0].expert_return_sampled,
+            "history_ids": [entry.history_id for entry in some],
         }
         for task_id, some in by_task.items()
     ]
 
 
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
-    """Return a table of what `summarize_tasks` returned, one row a task and a last one with totals.
+    """Return a table of what `summarize_tasks` returned, two lines a task and a last one with totals.
 
-    Texts fold, so that it fits 80 columns. The column `task` has the end of the id, by which lines of `list | cat`,
-    which have the complete one, can be found.
+    Names of teammates fold, so that it fits 80 columns. The column `task` has the end of the id, by which lines of
+    `list | cat`, which have the complete one, can be found, and the ids of histories where they are short.
     """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_footer=True, row_styles=("", "dim"))
     steps, histories = (sum(task[name] for task in tasks) for name in ("transitions", "histories"))
-    table.add_column("layout", footer=counted_noun(len(tasks), "task"), overflow="fold")
+    table.add_column("layout\nsplit", footer=counted_noun(len(tasks), "task"), no_wrap=True)
     table.add_column("teammate", overflow="fold")
     table.add_column("source", no_wrap=True)
-    table.add_column("hist.", footer=f"{histories:,}", justify="right", no_wrap=True)
-    table.add_column("steps", footer=f"{steps:,}", justify="right", no_wrap=True)
+    table.add_column("hist.\nsteps", footer=f"{histories:,}\n{steps:,}", justify="right", no_wrap=True)
     table.add_column("return", no_wrap=True)
-    table.add_column("labels", overflow="fold")
-    table.add_column("task", no_wrap=True)
+    table.add_column("labels", no_wrap=True)
+    table.add_column("task\nhist. ids", no_wrap=True)
     for task in tasks:
         earned = "" if task["expert_return"] is None else f" {task['expert_return']:.1f}"
-        labels = " ".join(kind + earned * (kind == "expert") for kind in task["labels"]) or "none"
+        ids = id_ranges(task["history_ids"])
         table.add_row(
-            f"{task['layout']} {task['split']}",
-            task["teammate"].replace("/", " ").replace("_", " "),
+            f"{task['layout']}\n{task['split']}",
+            task["teammate"].replace("/", " "),
             task["source"],
-            f"{task['histories']:,}",
-            f"{task['transitions']:,}",
+            f"{task['histories']:,}\n{task['transitions']:,}",
             f"{task['return_start']:.1f}→{task['return_end']:.1f}",
-            labels,
-            task["task_id"][-8:],
+            "\n".join(kind + earned * (kind == "expert") for kind in task["labels"]) or "none",
+            f"{task['task_id'][-8:]}\n{ids if len(ids) <= _IDS_SHOWN else '…'}",
         )
     return table
+
+
+def id_ranges(ids: Sequence[int]) -> str:
+    """Return ids as ranges in ascending order, such as 3,158-163."""
+    numbers = set(ids)
+    firsts = sorted(number for number in numbers if number - 1 not in numbers)
+    lasts = sorted(number for number in numbers if number + 1 not in numbers)
+    pairs = zip(firsts, lasts, strict=True)
+    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in pairs)
 
 
 def layout_table(dataset: Dataset) -> Table:
@@ -96,23 +107,35 @@ def layout_table(dataset: Dataset) -> Table:
 
 
 def facts_table(facts: Mapping[str, Any]) -> Table:
-    """Return a table of names and values, one row each, whose values fold."""
+    """Return a table of names and values, whose values fold; a mapping that contains others has a row for each key."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in facts.items():
-        table.add_row(name.replace("_", " "), _in_words(value))
+        for row in _rows(name, value):
+            table.add_row(*row)
     return table
 
 
+def _rows(name: str, value: Any, indent: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the rows of a value of JSON; those of keys below it are indented."""
+    label = indent + name.replace("_", " ")
+    if isinstance(value, dict) and (indent or any(isinstance(one, dict | list) for one in value.values())):
+        yield label, ""
+        for key, one in value.items():
+            yield from _rows(key, one, indent + "  ")
+    else:
+        yield label, "\n".join(value) if name == "map" else _in_words(value)
+
+
 def _in_words(value: Any) -> str:
-    """A value of JSON as text: lists and mappings with commas, those that contain others as JSON."""
-    if isinstance(value, dict) and not any(isinstance(one, dict | list) for one in value.values()):
+    """A value of JSON as text: lists and mappings with commas, a line for each list in a list."""
+    if isinstance(value, dict):
         return ", ".join(f"{name} {_in_words(one)}" for name, one in value.items())
-    if isinstance(value, list) and not any(isinstance(one, dict | list) for one in value):
-        return ", ".join(map(_in_words, value))
+    if isinstance(value, list):
+        return ("\n" if any(isinstance(one, list) for one in value) else ", ").join(map(_in_words, value))
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:.4g}"
     return "unknown" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
@@ -122,17 +145,12 @@ def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
     return "\n".join("\t".join(row) for row in texts)
 
 
-def counted_noun(number: int, noun: str, plural: str | None = None) -> str:
-    """A number with a noun in the singular or plural; by default the plural has an s."""
-    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
-
-
 def describe_selection(dataset: Dataset) -> str:
     """Return a paragraph about a selection: what it has, how much of it, and how the returns rise."""
     info, (start, end) = dataset.info, (dataset.column(name).mean() for name in ("return_start", "return_end"))
     sizes = ", ".join(
         (
-            counted_noun(len(dataset), "history", "histories"),
+            counted_histories(len(dataset)),
             counted_noun(int(dataset.column("episodes").sum()), "episode"),
             counted_noun(int(dataset.column("T").sum()), "step"),
         )

@@ -11,11 +11,11 @@ from typing import Any, overload
 import msgspec
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import FAMILIES, check_membership
-from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError, unknown
+from icrl4aht_data.benchmark.facts import check_family, check_membership
+from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import LINE_BYTES, plain_size, wrap_read_errors
 from icrl4aht_data.utils.paths import LARGEST
@@ -113,7 +113,7 @@ class Columns(Sequence[Entry]):
         for name, hint in _OPTIONAL.items():
             if values[name] == -1 if hint == int | None else math.isnan(values[name]):
                 values[name] = None
-        return Entry(history_id=row, obs_shape=LAYOUTS[values["layout"]].obs_shape, **values)
+        return Entry(history_id=row, obs_shape=get_layout(values["layout"]).obs_shape, **values)
 
 
 def read_columns(path: Path) -> Columns:
@@ -267,9 +267,8 @@ def _check_related(
         IndexFormatError, UnknownNameError: without file and line, which the caller adds.
     """
     check_membership(track, split, layout)
-    if family not in FAMILIES:
-        raise unknown("teammate_family", family, FAMILIES)
-    expected = LAYOUTS[layout].obs_shape
+    check_family(family)
+    expected = get_layout(layout).obs_shape
     if obs_shape != expected:
         raise IndexFormatError(f"obs_shape {list(obs_shape)}, expected {list(expected)} for {layout}")
     folder = f"data/{track}/{layout}/{split}"

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import FAMILIES, SOURCES, SPLITS, TRACKS
+from icrl4aht_data.benchmark.facts import SOURCES, SPLITS, TRACKS, all_families
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError, unknown
 from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.nouns import counted_histories
 from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.validation import check_int
 
 ALIASES = {"algorithm": "teammate_kind"}
 """Other names of filters: the kind of a learned teammate is the algorithm that trained it."""
 
-_KNOWN_VALUES = {"split": SPLITS, "track": tuple(TRACKS), "teammate_family": FAMILIES, "source": SOURCES}
+_KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
+    "split": lambda: SPLITS,
+    "track": lambda: tuple(TRACKS),
+    "teammate_family": all_families,
+    "source": lambda: SOURCES,
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,17 +45,19 @@ class Index:
     entries: Columns
 
     def __repr__(self) -> str:
-        return f"Index({len(self.entries):,} histories at {self.root})"
+        return f"Index({counted_histories(len(self.entries))} at {self.root})"
 
     def entry(self, history_id: int) -> Entry:
         """The entry of one history.
 
         Raises:
             UnknownNameError: if there is none.
+            OptionError: if the id is not an integer.
         """
-        if not 0 <= history_id < len(self.entries):
-            raise UnknownNameError(f"{self.root}: no history with id {history_id}; ids: 0..{len(self.entries) - 1}")
-        return self.entries[history_id]
+        number = check_int("history_id", history_id, -(2**63))
+        if not 0 <= number < len(self.entries):
+            raise UnknownNameError(f"{self.root}: no history with id {number}; ids: 0..{len(self.entries) - 1}")
+        return self.entries[number]
 
     def values(self, name: str) -> list[str]:
         """The values of a string field in this release, in order of first appearance."""
@@ -96,9 +105,12 @@ class Index:
         """
         canonical = get_layout(str(value)).name if name == "layout" else value
         code = self.entries.code(name, canonical) if isinstance(canonical, str) else None
-        if code is None and name != "layout" and canonical not in _KNOWN_VALUES.get(name, ()):
-            raise unknown(given, value, (*_KNOWN_VALUES.get(name, ()), *self.values(name)))
-        return -1 if code is None else code
+        if code is not None:
+            return code
+        known = _KNOWN_VALUES[name]() if name in _KNOWN_VALUES else ()
+        if name != "layout" and canonical not in known:
+            raise unknown(given, value, (*known, *self.values(name)))
+        return -1
 
     def summary(self) -> str:
         """The combinations of split, layout and family that exist, in one line."""

@@ -27,6 +27,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.installation import upgrade_advice
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
 from icrl4aht_data.utils.paths import resolve_inside
 
 _NUMBER = r"(0|[1-9]\d*)"
@@ -172,8 +173,9 @@ class ReleaseInfo:
     def __repr__(self) -> str:
         return (
             f"ReleaseInfo({self.kind} release {self.data_version} of format {self.format_version}: "
-            f"{self.histories:,} histories and {self.transitions:,} transitions on {', '.join(self.layouts)}; "
-            f"{len(self.shards)} shards, {len(self.left_out)} tasks left out)"
+            f"{counted_histories(self.histories)} and {counted_noun(self.transitions, 'transition')} on "
+            f"{', '.join(self.layouts)}; {counted_noun(len(self.shards), 'shard')}, "
+            f"{counted_noun(len(self.left_out), 'task')} left out)"
         )
 
     @property

@@ -14,7 +14,16 @@ from pathlib import Path
 from types import MappingProxyType
 
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, OptionError, UnsafePathError
-from icrl4aht_data.format.schema import EXPERTS, HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
+from icrl4aht_data.format.schema import (
+    EXPERTS,
+    HISTORIES,
+    INFO,
+    MANIFEST,
+    PARQUET_EPISODES,
+    PROVENANCE,
+    TASKS,
+    TEAMMATES,
+)
 from icrl4aht_data.utils.files import atomic_write, final_name, plain_size, read_text, wrap_read_errors
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.paths import LARGEST, files_below, is_inside, resolve_inside
@@ -32,7 +41,7 @@ _KNOWN = re.compile(
             rf"meta/chunks/{_NAME}/{_NAME}/{_NAME}\.npy",
             rf"({TEAMMATES}|{EXPERTS})/[0-9a-f]{{64}}/(policy\.json|policy\.safetensors|README\.md)",
             rf"figures/{_NAME}\.(png|svg)",
-            rf"index/{_NAME}/{_NAME}\.parquet",
+            rf"(index|{PARQUET_EPISODES})/{_NAME}/{_NAME}\.parquet",
         )
     )
 )

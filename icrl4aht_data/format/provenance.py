@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.schema import check_name
 from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.nouns import counted_noun
 
 _Streams = Annotated[int, Meta(ge=0, lt=2**31)]
 _Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -282,6 +284,29 @@ class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
 
     slot: Literal[1]
     noise: str | None = None
+
+
+class ProvenanceByTask(Mapping[str, Provenance]):
+    """Read-only mapping from the id of each task of a release to how its histories were made.
+
+    Args:
+        records: task id -> record.
+    """
+
+    def __init__(self, records: Mapping[str, Provenance]) -> None:
+        self._records = records
+
+    def __getitem__(self, task_id: str) -> Provenance:
+        return self._records[task_id]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._records)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({counted_noun(len(self), 'task')})"
 
 
 def read_provenance(path: Path) -> dict[str, Provenance]:

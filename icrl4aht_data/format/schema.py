@@ -47,6 +47,10 @@ TEAMMATES = "teammates"
 EXPERTS = "experts"
 """The folder of the egos' checkpoints whose greedy actions are the labels; a release may be without it."""
 
+PARQUET_EPISODES = "episodes"
+"""The folder of the episodes as Parquet files, `episodes/<layout>/<split>-00000-of-00001.parquet`: a copy of the
+histories for other tools, in a release built for publication that has state records."""
+
 Kind = Literal["full", "lite", "observations"]
 KINDS: tuple[Kind, ...] = ("full", "lite")
 """The kinds of release with state records: those that are generated."""

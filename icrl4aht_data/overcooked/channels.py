@@ -49,14 +49,14 @@ def canonical_positions(layout: Layout) -> np.ndarray:
     """Return the place of each own channel of a layout among the canonical channels, int64 (C,), ascending.
 
     Raises:
-        OptionError: if the layout has a channel that is not canonical, of an ingredient that no registered layout has.
+        OptionError: if the layout has a channel that is not canonical, of an ingredient that no published layout has.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]
     if missing:
         raise OptionError(
             f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
-            f"take its own channels, or register the layout as docs/extending.md describes"
+            f"take its own channels, or give its piles ingredients that the published layouts have"
         )
     places = np.array([CANONICAL_CHANNELS.index(name) for name in names])
     places.flags.writeable = False  # callers share it

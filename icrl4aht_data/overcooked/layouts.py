@@ -1,4 +1,4 @@
-"""The ten layouts: maps, recipes, aliases, and the lookup tables computed from them.
+"""The ten layouts: maps, recipes, aliases, and the lookup tables computed from them; layouts of other packages.
 
 A cell is (x, y), x = column, y = row, origin top-left; its flat number is y * width + x.
 Map letters: W wall (= counter), A agent, X goal, B plate pile, P pot, R recipe indicator, L button,
@@ -16,6 +16,7 @@ import numpy as np
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.plugins import Plugins
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
 """Kinds of cells. A wall is a counter that holds one item; PLATES and PILE are endless supplies."""
@@ -299,14 +300,32 @@ LAYOUTS: dict[str, Layout] = {layout.name: layout for layout in _ALL}
 
 _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 
+LAYOUT_PLUGINS = Plugins("icrl4aht.layouts", (*LAYOUTS, *_BY_ALIAS))
+"""Layouts of other installed packages, which belong to no published task."""
+
 
 def get_layout(name: str) -> Layout:
     """Return the layout with a short name (coord_simple) or environment name (grounded_coord_simple).
 
+    A layout that another installed package registers has one name, see docs/extending.md.
+
     Raises:
         UnknownNameError: lists the valid names and the nearest.
+        PluginError: if a registered layout cannot be used.
     """
     layout = LAYOUTS.get(name) or _BY_ALIAS.get(name)
-    if layout is None:
-        raise unknown("layout", name, [*LAYOUTS, *_BY_ALIAS])
+    if layout is not None:
+        return layout
+    if name not in LAYOUT_PLUGINS.names:
+        raise unknown("layout", name, all_layout_names())
+    layout = LAYOUT_PLUGINS.load(name, Layout)
+    if {layout.name, layout.alias} != {name}:
+        raise LAYOUT_PLUGINS.error(
+            name, f"expected name and alias {name!r}, found name {layout.name!r} and alias {layout.alias!r}"
+        )
     return layout
+
+
+def all_layout_names() -> list[str]:
+    """Return the names that `get_layout` knows: short names, those of other packages, environment names."""
+    return [*LAYOUTS, *LAYOUT_PLUGINS.names, *_BY_ALIAS]

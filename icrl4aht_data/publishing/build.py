@@ -1,4 +1,4 @@
-"""Preparation of a release for publication: card, figures, Parquet index and Croissant added to its data."""
+"""Preparation of a release for publication: card, figures, Parquet files and Croissant added to its data."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import datetime
 import os
 import shutil
 from contextlib import suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, ReleaseError, unknown
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
-from icrl4aht_data.format.schema import INFO, MANIFEST, TEAMMATES
+from icrl4aht_data.format.schema import INFO, MANIFEST, PARQUET_EPISODES, TEAMMATES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
@@ -37,7 +38,7 @@ from icrl4aht_data.writing.dataset_card import (
     dataset_card,
     evaluated_on,
 )
-from icrl4aht_data.writing.parquet import to_parquet
+from icrl4aht_data.writing.parquet import to_parquet, write_episodes
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
@@ -64,7 +65,7 @@ def build_release(
             changes its copy too.
         overwrite: replace a release at `target`.
         published: the date for Croissant; today by default.
-        advance: progress of verifying and of copying.
+        advance: progress of verifying, of copying, and of writing the histories' episodes.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`, if `source` is of a
@@ -89,7 +90,9 @@ def build_release(
             _copy(source / name, root / name, link)
             advance("copying", number, len(kept))
         _keep_source_card(source, root)
-        _add_figures_and_parquet(load_icrl4aht(source), root)
+        dataset = load_icrl4aht(source)
+        _add_figures(dataset, root)
+        _add_parquet(dataset, root, advance)
         for folder in sorted((root / TEAMMATES).glob("*/")):
             (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
         for name in _COPIED_TEXTS:
@@ -158,7 +161,8 @@ def _is_made_here(name: str) -> bool:
     """Return whether building writes a file, so that the source's version is not copied."""
     top, _, rest = name.partition("/")
     is_teammate_card = top == TEAMMATES and rest.endswith(f"/{RELEASE_CARD}")
-    return name in (RELEASE_CARD, CROISSANT, *_COPIED_TEXTS) or top in ("figures", PARQUET_INDEX) or is_teammate_card
+    is_made = name in (RELEASE_CARD, CROISSANT, *_COPIED_TEXTS) or is_teammate_card
+    return is_made or top in ("figures", PARQUET_INDEX, PARQUET_EPISODES)
 
 
 def _copy(source: Path, target: Path, link: bool) -> None:
@@ -176,14 +180,20 @@ def _keep_source_card(source: Path, root: Path) -> None:
         (root / SOURCE_CARD).write_text(text, encoding="utf-8")
 
 
-def _add_figures_and_parquet(dataset: Dataset, root: Path) -> None:
+def _add_figures(dataset: Dataset, root: Path) -> None:
     (root / CURVES_FIGURE).parent.mkdir()
     plot_layout_curves(dataset, root / CURVES_FIGURE)
     plot_layouts(dataset.layouts, root / LAYOUTS_FIGURE)
     tested = evaluated_on(layout.name for layout in dataset.layouts)
     plot_headroom(read_headroom(HEADROOM_PROTOCOL), tested, root / HEADROOM_FIGURE)
+
+
+def _add_parquet(dataset: Dataset, root: Path, advance: NamedProgress) -> None:
+    """Add the index and, if the release has state records, the episodes as Parquet files."""
     for layout in dataset.layouts:
         histories = dataset.filter(layout=layout.name)
         (root / PARQUET_INDEX / layout.name).mkdir(parents=True)
         for split in {entry.split for entry in histories.entries}:
             to_parquet(histories.filter(split=split), root / PARQUET_INDEX / layout.name / f"{split}.parquet")
+    if dataset.has_states:
+        write_episodes(dataset, root / PARQUET_EPISODES, advance=partial(advance, "episodes"))

@@ -1,7 +1,8 @@
 """A release's description in Croissant 1.1, the vocabulary by which dataset search engines and loaders know data.
 
-Every file is a FileObject with its SHA-256, its address relative to the description; the Parquet copy of the index is a
-RecordSet with every field described. Croissant does not read HDF5: the shards' arrays are described in the text.
+Every file is a FileObject with its SHA-256, its address relative to the description; the Parquet copies of the index
+and of the episodes are RecordSets with every field described. Croissant does not read HDF5: the shards' arrays are
+described in the text.
 """
 
 from __future__ import annotations
@@ -10,15 +11,17 @@ import datetime
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
+from icrl4aht_data.format.info import ReleaseInfo, read_info
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.templates import card_file
-from icrl4aht_data.writing.card_texts import card_texts
-from icrl4aht_data.writing.dataset_card import PARQUET_INDEX
+from icrl4aht_data.writing.card_content import PARQUET_INDEX
+from icrl4aht_data.writing.card_texts import card_texts, episode_texts
 
 if TYPE_CHECKING:
     import mlcroissant
@@ -48,11 +51,40 @@ _TERMS_OF_1_1 = {
 """Terms of the standard's JSON-LD context that mlcroissant's default context, which is 1.0's, does not have."""
 
 
+class _Column(NamedTuple):
+    """A column of Parquet files: its name, what it is, Croissant's type, and the lengths of lists or None."""
+
+    name: str
+    description: str
+    type: str
+    shape: str | None
+
+
+class _Table(NamedTuple):
+    """Parquet files of equal columns, and the record set that they are.
+
+    Args:
+        folder: the files' folder.
+        files: description of the files.
+        name: name of the record set.
+        description: description of the record set.
+        key: names of the columns that identify a record.
+        columns: the columns.
+    """
+
+    folder: str
+    files: str
+    name: str
+    description: str
+    key: list[str]
+    columns: list[_Column]
+
+
 def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) -> dict[str, Any]:
     """Return the content of croissant.json.
 
     Args:
-        root: a release folder with the Parquet copy of its index.
+        root: a release folder with the Parquet copies of its index and, if it has state records, of its episodes.
         digests: path below `root` -> SHA-256, of the files to describe.
         published: the date of publication.
 
@@ -65,6 +97,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         raise OptionError(f"croissant.json needs mlcroissant: {install_command('hf')}") from error
     info, texts = read_info(root), card_texts("arrays")
     arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
+    tables = [_index_table()] + ([_episode_table(info)] if info.kind in KINDS else [])
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
     with warnings.catch_warnings():
@@ -85,8 +118,8 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
             creators=[mlc.Organization(ctx=context, name="The icrl4aht-data authors")],
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
-            distribution=[*_files(context, root, digests), _parquet_index(context)],
-            record_sets=[_records(context)],
+            distribution=[*_files(context, root, digests), *(_file_set(context, table) for table in tables)],
+            record_sets=[_record_set(context, table) for table in tables],
         ).to_json()
 
 
@@ -107,41 +140,73 @@ def _files(context: mlcroissant.Context, root: Path, digests: Mapping[str, str])
     ]
 
 
-def _parquet_index(context: mlcroissant.Context) -> mlcroissant.FileSet:
+def _index_table() -> _Table:
+    texts = card_texts("index")
+    return _Table(
+        folder=PARQUET_INDEX,
+        files="The index, one row per history, in one file for each layout and split.",
+        name="histories",
+        description="One record per learning history: what it is, and where its arrays are stored.",
+        key=["history_id"],
+        columns=[
+            _Column(name, texts[name], _TYPES[hint], "3" if hint == _SHAPE else None)
+            for name, hint in ENTRY_HINTS.items()
+        ],
+    )
+
+
+def _episode_table(info: ReleaseInfo) -> _Table:
+    lengths = {"steps": info.environment.kept_steps, "width": record_width(list(map(get_layout, info.layouts)))}
+    texts, types = episode_texts(), {"s": "TEXT", "i": "INTEGER", "u": "INTEGER", "f": "FLOAT"}
+    return _Table(
+        folder=PARQUET_EPISODES,
+        files="The episodes, one row each, in files for each layout and split.",
+        name="episodes",
+        description="One record per episode: its history's names, returns, actions, rewards, labels, state records.",
+        key=["history_id", "episode"],
+        columns=[
+            _Column(name, texts[name], types[dtype[0]], ",".join(str(lengths[axis]) for axis in shape) or None)
+            for name, (dtype, shape) in EPISODE_COLUMNS.items()
+        ],
+    )
+
+
+def _file_set(context: mlcroissant.Context, table: _Table) -> mlcroissant.FileSet:
     import mlcroissant as mlc
 
     return mlc.FileSet(
         ctx=context,
-        id=PARQUET_INDEX,
-        name=PARQUET_INDEX,
-        description="The index, one row per history, in one file for each layout and split.",
+        id=f"{table.folder}-files",
+        name=table.folder,
+        description=table.files,
         encoding_formats=[_FORMATS[".parquet"]],
-        includes=[f"{PARQUET_INDEX}/*/*.parquet"],
+        includes=[f"{table.folder}/*/*.parquet"],
     )
 
 
-def _records(context: mlcroissant.Context) -> mlcroissant.RecordSet:
-    """Return the record set of histories, with a field for each column of the Parquet index."""
+def _record_set(context: mlcroissant.Context, table: _Table) -> mlcroissant.RecordSet:
     import mlcroissant as mlc
 
-    columns = [
+    fields = [
         mlc.Field(
             ctx=context,
-            id=f"histories/{name}",
-            name=name,
-            description=card_texts("index")[name],
-            data_types=[getattr(mlc.DataType, _TYPES[hint])],
-            is_array=True if hint == _SHAPE else None,
-            array_shape="3" if hint == _SHAPE else None,
-            source=mlc.Source(ctx=context, file_set=PARQUET_INDEX, extract=mlc.Extract(ctx=context, column=name)),
+            id=f"{table.name}/{column.name}",
+            name=column.name,
+            description=column.description,
+            data_types=[getattr(mlc.DataType, column.type)],
+            is_array=True if column.shape else None,
+            array_shape=column.shape,
+            source=mlc.Source(
+                ctx=context, file_set=f"{table.folder}-files", extract=mlc.Extract(ctx=context, column=column.name)
+            ),
         )
-        for name, hint in ENTRY_HINTS.items()
+        for column in table.columns
     ]
     return mlc.RecordSet(
         ctx=context,
-        id="histories",
-        name="histories",
-        description="One record per learning history: what it is, and where its arrays are stored.",
-        key=["histories/history_id"],
-        fields=columns,
+        id=table.name,
+        name=table.name,
+        description=table.description,
+        key=[f"{table.name}/{name}" for name in table.key],
+        fields=fields,
     )

@@ -8,7 +8,11 @@ from typing import Self, overload
 import numpy as np
 
 from icrl4aht_data.format.schema import Entry, episode_returns
+from icrl4aht_data.plotting import curve_svg
 from icrl4aht_data.reading.lazy_array import LazyArray
+from icrl4aht_data.utils.html import facts_html
+from icrl4aht_data.utils.signatures import show_method_types
+from icrl4aht_data.utils.validation import check_position
 
 ReadField = Callable[[str], LazyArray]
 """Function from the name of a history's field to its lazy array."""
@@ -46,6 +50,19 @@ class Episode:
             f"Episode({self.number} of {e.episodes} of history {e.history_id}: {e.layout} with {e.teammate_kind}, "
             f"steps {self.start}..{self.stop - 1}, return {self.total_return:g})"
         )
+
+    def _repr_html_(self) -> str:
+        """The episode's facts and its return by step, for notebooks."""
+        e, rewards = self.entry, self.rewards
+        given = ", ".join(f"{reward:+g} at step {step}" for step, reward in enumerate(rewards) if reward)
+        facts = {
+            "history": f"{e.history_id}, {e.layout} with {e.teammate_family}, {e.teammate_kind}",
+            "steps": f"{self.start:,} to {self.stop - 1:,} of the history",
+            "rewards": given or "none",
+            "return": f"{self.total_return:g}",
+        }
+        title = f"Episode {self.number} of history {e.history_id}"
+        return facts_html(title, facts, curve_svg({"return": np.cumsum(rewards)}, "step"))
 
     def __getitem__(self, name: str) -> np.ndarray:
         array = self._field(name)
@@ -143,7 +160,7 @@ class Episodes(Sequence[Episode]):
     def __getitem__(self, position: int | slice) -> Episode | Self:
         if isinstance(position, slice):
             return type(self)(self._entry, self._field, self._ends, self.numbers[position])
-        number = self.numbers[position]
+        number = self.numbers[check_position(repr(self), position, len(self))]
         ends = self._ends()
         start = int(ends[number - 1]) if number else 0
         return Episode(self._entry, number, start, int(ends[number]), self._field)
@@ -155,3 +172,6 @@ class Episodes(Sequence[Episode]):
         """Return the sum of the rewards of each of these episodes, float64 (E,)."""
         returns = episode_returns(self._field("rewards")[:], self._field("dones")[:])
         return returns[np.array(self.numbers, np.int64)]
+
+
+show_method_types(Episode)

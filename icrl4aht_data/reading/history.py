@@ -13,13 +13,15 @@ from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_retu
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.plotting import Picture, animate_episode, plot_history
+from icrl4aht_data.plotting import Picture, animate_episode, curve_svg, plot_history
 from icrl4aht_data.reading.episodes import Episodes
 from icrl4aht_data.reading.lazy_array import LazyArray
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.forks import cached_property
-from icrl4aht_data.utils.html import curve_svg, facts_html
+from icrl4aht_data.utils.html import facts_html
 from icrl4aht_data.utils.memory import new_array
+from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.signatures import show_method_types
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
@@ -63,8 +65,8 @@ class History:
     def __repr__(self) -> str:
         e = self.entry
         return (
-            f"History({e.history_id}: {e.layout} with {e.teammate_kind}, T={e.T}, {e.episodes} episodes, "
-            f"return {e.return_start:.1f} -> {e.return_end:.1f}"
+            f"History({e.history_id}: {e.layout} with {e.teammate_kind}, T={e.T}, "
+            f"{counted_noun(e.episodes, 'episode')}, return {e.return_start:.1f} -> {e.return_end:.1f}"
             + ("" if e.expert_return is None else f", labels {e.expert_return:.1f}")
             + f", source {e.source}"
             + (f", learner {e.learner})" if e.learner else ")")
@@ -77,7 +79,7 @@ class History:
             "layout": f"{e.layout}, {e.split}",
             "teammate": f"{e.teammate_family}, {e.teammate_kind}",
             "source": e.source + (f", learner {e.learner}" if e.learner else ""),
-            "length": f"{e.T:,} steps, {e.episodes:,} episodes",
+            "length": f"{counted_noun(e.T, 'step')}, {counted_noun(e.episodes, 'episode')}",
             "return": f"{e.return_start:.1f} to {e.return_end:.1f}",
             "labels": ", ".join(name for name in LABELS if e.has(FIELDS[f"{name}_actions"])) or "none",
             "expert return": "unknown" if e.expert_return is None else f"{e.expert_return:.1f}",
@@ -261,8 +263,11 @@ class History:
         count = self.entry.episodes
         if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or not -count <= episode < count:
             raise OptionError(
-                f"episode = {episode!r}: history {self.entry.history_id} has {count} episodes; expected a number from "
-                f"{-count} to {count - 1}"
+                f"episode = {episode!r}: history {self.entry.history_id} has {counted_noun(count, 'episode')}; "
+                f"expected a number from {-count} to {count - 1}"
             )
         chosen = self.episodes[int(episode)]
         return animate_episode(self._shard.layout, chosen.state, chosen.rewards, repr(chosen), cell=cell, fps=fps)
+
+
+show_method_types(History)

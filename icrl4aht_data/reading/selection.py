@@ -12,10 +12,11 @@ import numpy as np
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.reading.filters import check_return, learner_numbers, passing
 from icrl4aht_data.reading.history import LABELS, OBS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import (
@@ -31,8 +32,9 @@ from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
 from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
 from icrl4aht_data.utils.threads import usable_cores
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.validation import check_int, check_position
 
 if TYPE_CHECKING:
     import pandas
@@ -164,9 +166,9 @@ class Selection:
         return self.index.info
 
     @cached_property
-    def provenance(self) -> dict[str, Provenance]:
+    def provenance(self) -> ProvenanceByTask:
         """How the histories of each task of the release were made, as in meta/provenance.json: task id -> record."""
-        return read_provenance(self.origin.file(PROVENANCE))
+        return ProvenanceByTask(read_provenance(self.origin.file(PROVENANCE)))
 
     @property
     def has_states(self) -> bool:
@@ -185,7 +187,7 @@ class Selection:
     def __getitem__(self, position: int | slice) -> History | Self:
         if isinstance(position, slice):
             return self.select(self.ids[position])
-        return self.history(int(self.ids[position]))
+        return self.history(int(self.ids[check_position("the selection's histories", position, len(self))]))
 
     def __iter__(self) -> Iterator[History]:
         return (self.history(int(i)) for i in self.ids)
@@ -196,9 +198,9 @@ class Selection:
         weak = "" if self.info.has_chunk_hashes else f" of format {self.info.format_version}, without chunk hashes,"
         canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
-            f"{type(self).__name__}({len(self)} histories of {tasks} tasks on {', '.join(layouts)}; "
-            f"{self.named_counts('split')}; {self.named_counts('source')}; "
-            f"{int(self.column('T').sum()):,} transitions, obs {self.obs}{canonical}; "
+            f"{type(self).__name__}({counted_histories(len(self))} of {counted_noun(tasks, 'task')} on "
+            f"{', '.join(layouts)}; {self.named_counts('split')}; {self.named_counts('source')}; "
+            f"{counted_noun(int(self.column('T').sum()), 'transition')}, obs {self.obs}{canonical}; "
             f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
         )
 
@@ -403,17 +405,12 @@ class Selection:
                 (or algorithm, which is the same), source or task_id, as in `load_icrl4aht`.
 
         Raises:
-            UnknownNameError: for a field or value that does not exist.
+            UnknownNameError: for a field or value that does not exist, also of the entries that `predicate` reads.
             EmptySelectionError: if no history is left.
-            OptionError: if `predicate` is not a function, `min_expert_return` not a number, or `learner` not an integer
-                or several.
+            OptionError: if `predicate` is not a function that returns a bool, `min_expert_return` not a number, or
+                `learner` not an integer or several.
             NotStoredError: for `min_expert_return`, if of some history that is left it is not known.
         """
-        if predicate is not None and not callable(predicate):
-            raise OptionError(
-                f"filter: expected a function of an index entry, such as lambda entry: entry.return_end > 30, found "
-                f"{predicate!r}; values have names: filter(layout={str(predicate)!r})"
-            )
         matching = self.index.query(**wanted)
         ids = self.ids[np.isin(self.ids, matching)]
         if not len(ids):
@@ -427,18 +424,15 @@ class Selection:
 
     def _passing(self, predicate: Callable[[Entry], bool]) -> Self:
         """The histories whose index entries pass; see `filter`."""
-        kept = np.array([bool(predicate(self.index.entry(i))) for i in self.ids.tolist()], bool)
+        kept = passing(predicate, map(self.index.entry, self.ids.tolist()))
         if not kept.any():
             raise EmptySelectionError(f"{self.root}: no history of this selection passes the function; it is {self!r}")
         return self.select(kept)
 
     def _of_learners(self, wanted: int | Sequence[int]) -> Self:
         """The histories of some learners; see `filter`."""
-        numbers = np.atleast_1d(np.asarray(wanted))
-        if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
-            raise OptionError(f"learner = {wanted!r}: expected the number of a task's learner, from 0, or several")
         learners = self.column("learner")
-        kept = np.isin(learners, numbers)
+        kept = np.isin(learners, learner_numbers(wanted))
         if not kept.any():
             known = ", ".join(map(str, np.unique(learners).tolist()))
             raise EmptySelectionError(
@@ -449,8 +443,7 @@ class Selection:
 
     def _earning(self, least: float) -> Self:
         """The histories whose labels come from a policy that earned at least so much; see `filter`."""
-        if isinstance(least, bool) or not isinstance(least, (int, float, np.integer, np.floating)) or np.isnan(least):
-            raise OptionError(f"min_expert_return = {least!r}: expected a number, the return of an episode")
+        check_return(least)
         returns = self.column("expert_return")
         absent = np.isnan(returns)
         if absent.any():
@@ -484,7 +477,9 @@ class Selection:
         given = np.asarray(ids)
         if given.dtype == bool and given.ndim == 1:
             if len(given) != len(self):
-                raise OptionError(f"select: expected a bool for each of {len(self)} histories, found {len(given)}")
+                raise OptionError(
+                    f"select: expected a bool for each of {counted_histories(len(self))}, found {len(given)}"
+                )
             given = self.ids[given]
         if not given.size:
             raise EmptySelectionError(f"{self.root}: select was given no history id")

@@ -22,6 +22,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.cached_arrays import cache_room, cached_arrays, new_mapped_array
 from icrl4aht_data.utils.memory import free_memory, gigabytes
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
 from icrl4aht_data.utils.threads import in_slices
 
 CacheMode = Literal["auto", "ram", "mmap", "stream"]
@@ -186,6 +187,10 @@ class FlatSource:
         self._first = {axis: np.zeros(len(entries), np.intp) for axis in ("T", "E")}
         self._rows = {"T": np.array([e.T for e in entries]), "E": np.array([e.episodes for e in entries])}
 
+    def __repr__(self) -> str:
+        size = gigabytes(sum(array.nbytes for of_layout in self._arrays for array in of_layout.values()))
+        return f"{type(self).__name__}({counted_histories(len(self._ids))}, {size} decoded)"
+
     def add(self, members: Sequence[Entry], arrays: dict[str, np.ndarray]) -> None:
         """Add the arrays with the histories of one layout, which are in order of their ids."""
         ids = np.array([entry.history_id for entry in members])
@@ -256,6 +261,10 @@ class StreamedSource:
     def __init__(self, entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> None:
         self._entries, self._shards, self._threads = entries, shards, threads
         self._remote = any(shard.is_remote for shard in shards)
+
+    def __repr__(self) -> str:
+        shards = counted_noun(len({shard.path for shard in self._shards}), "shard")
+        return f"{type(self).__name__}({counted_histories(len(self._entries))} in {shards})"
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
         if self._remote:

@@ -14,7 +14,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import MANIFEST
+from icrl4aht_data.format.schema import MANIFEST, PARQUET_EPISODES
 from icrl4aht_data.remote.addresses import without_credentials
 from icrl4aht_data.remote.download_note import read_note, write_note
 from icrl4aht_data.remote.partial_file import map_parallel
@@ -84,7 +84,7 @@ def plan_download(
         retry: policy for byte ranges.
         advance: called with the name of a stage, and the bytes compared so far and in total.
         wanted: filters as in `load_icrl4aht`: only the shards with matching histories are fetched, with their chunk
-            tables. Files that belong to no shard are always fetched.
+            tables and all files that belong to no shard, except the Parquet copy of the episodes.
 
     Raises:
         OptionError: if `url` is no address, or `to` has files of something else, or changed files of a release that
@@ -140,6 +140,8 @@ def _tables_first(name: str) -> bool:
 def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
     """Files of a release that belong to a selection: its shards, their chunk tables, and all files of no shard.
 
+    With filters, the Parquet copy of the episodes is left out: it repeats the shards, of all histories.
+
     Args:
         root: an opened release.
         wanted: filters as in `load_icrl4aht`. Without any, all files; of a folder that `download` filled those that
@@ -148,10 +150,12 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
     index = read_index(root.folder)
     listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
     all_shards = set(index.values("shard"))
-    shards = _selected_shards(index, **wanted) if any(wanted.values()) else all_shards
-    others = all_shards - shards
-    chosen = (set(listed) | shards) - others - {chunk_table_name(name) for name in others}
-    note = None if any(wanted.values()) or root.remote is not None else read_note(root.folder)
+    chosen = set(listed) | all_shards
+    if any(wanted.values()):
+        others = all_shards - _selected_shards(index, **wanted)
+        chosen -= others | {chunk_table_name(name) for name in others}
+        return {name for name in chosen if not name.startswith(f"{PARQUET_EPISODES}/")}
+    note = None if root.remote is not None else read_note(root.folder)
     if note is None or not note.belongs_to(listed):
         return chosen
     return {name for name in chosen if name in note.files or (root.folder / name).exists()}

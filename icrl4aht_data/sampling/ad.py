@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, Unpack, cas
 
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
@@ -45,6 +46,8 @@ class ADBatch(NamedTuple, Generic[A]):
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
         is_first: bool (B, L): True at a history's first step, where the `prev_*` fields are fillers.
+        families: int32 (B,): index of the family of each row's teammate in `benchmark.facts.all_families()`; None
+            unless the sampler was made with families=True.
     """
 
     obs: A
@@ -56,6 +59,7 @@ class ADBatch(NamedTuple, Generic[A]):
     prev_teammate_actions: A | None = None
     layouts: A | None = None
     is_first: A = cast(Any, None)  # needs a default after others; samplers always set it
+    families: A | None = None
 
     def describe(self) -> str:
         """Return the fields with dtypes and shapes as text, one per line."""
@@ -101,6 +105,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
             first of them is drawn for each window, and `prev_*` are of the episode before in the window.
         labels: targets are labels of this kind, "expert" or "oracle", instead of the actions that were taken; see
             `history.LABELS`.
+        families: whether batches have `families`, which a model may learn to predict.
         seed: any non-negative integer below 2**63.
         teammate_actions: whether batches have `prev_teammate_actions`.
         weights: probabilities of the histories: "uniform", "length" (proportional to the steps that windows may
@@ -129,19 +134,21 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
         length: int,
         every: int = 1,
         labels: Labels | None = None,
+        families: bool = False,
         **options: Unpack[SamplerOptions],
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=length, **options)
         self.every = check_int("every", every, 1)
         if every > 1:
             self.drawn_bytes = 32  # four numbers of each step
+        self.families = families
         self.labels = None if labels is None else check_labels(dataset, labels)
         if labels is not None:
             warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
-        chosen = {"every": self.every} if self.every > 1 else {}
-        return super().options() | chosen | ({} if self.labels is None else {"labels": self.labels})
+        chosen = {"every": self.every > 1, "labels": self.labels is not None, "families": self.families}
+        return super().options() | {name: getattr(self, name) for name, differs in chosen.items() if differs}
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
@@ -156,7 +163,13 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
             **({"prev_teammate_actions": ArraySpec("int32", shape)} if self.teammate_actions else {}),
             **self._layout_specs(),
             "is_first": ArraySpec("bool", shape),
+            **({"families": ArraySpec("int32", (self.local_size,))} if self.families else {}),
         }
+
+    @cached_property
+    def _family_numbers(self) -> np.ndarray:
+        """int32 (H,): the value of `families` for each history of the selection."""
+        return np.array([all_families().index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
 
     @property
     def _targets(self) -> str:
@@ -223,6 +236,8 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
         self._observer.observe(position, records, batch.obs)
         if batch.layouts is not None:
             batch.layouts[...] = self.dataset.layout_numbers[position]
+        if batch.families is not None:
+            batch.families[...] = self._family_numbers[position]
         batch.is_first[...] = False
         batch.is_first[:, 0] = starts == 0
         if self.every > 1:

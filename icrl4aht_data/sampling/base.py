@@ -17,6 +17,7 @@ from icrl4aht_data.sampling.draws import Curriculum, EpisodeRange, HistoryDraws,
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.memory import array_bytes, fits, free_memory, gigabytes
+from icrl4aht_data.utils.nouns import counted_histories, counted_noun
 from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B", bound=tuple)
@@ -104,8 +105,9 @@ class Sampler(Generic[B, D]):
         width = max(map(len, self.specs))
         arrays = [f"{name:<{width}}  {spec.dtype:<8} {spec.shape}" for name, spec in self.specs.items()]
         return (
-            f"{type(self).__name__}({len(self):,} batches, batch_size {self.batch_size}, {self.length_option} "
-            f"{self.length}, seed {self.seed}, of {len(self.dataset):,} histories on {layouts}; each has\n"
+            f"{type(self).__name__}({counted_noun(len(self), 'batch', 'batches')}, batch_size {self.batch_size}, "
+            f"{self.length_option} {self.length}, seed {self.seed}, of {counted_histories(len(self.dataset))} on "
+            f"{layouts}; each has\n"
             f"{indent(chr(10).join(arrays), '    ')}\n)"
         )
 

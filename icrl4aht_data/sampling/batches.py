@@ -11,6 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.signatures import show_method_types
 from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B")
@@ -213,3 +214,6 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
         return jax.block_until_ready(jax.tree.map(one, batch))
 
     return put
+
+
+show_method_types(Batches)

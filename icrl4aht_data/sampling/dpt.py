@@ -16,6 +16,7 @@ from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.signatures import show_types
+from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
@@ -32,7 +33,7 @@ class DPTBatch(NamedTuple, Generic[A]):
     """Queries with contexts (paper, App. D.4).
 
     With obs="state", observations are state records: uint8 (B, S) and (B, K, S) instead of (B, 5, 5, C) and
-    (B, K, 5, 5, C).
+    (B, K, 5, 5, C). With several queries a context, the query's arrays have an axis Q behind B.
 
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
@@ -70,7 +71,8 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
 
     For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for
     the query, whose step is drawn uniformly, and one for the context of K transitions. These are `contiguous` (as
-    published) or `random` (independent and unordered, as in the original DPT).
+    published) or `random` (independent and unordered, as in the original DPT). With `queries` = Q > 1, so many steps
+    are drawn independently from the query's history, so that a context teaches Q answers instead of one.
 
     In releases of kind `observations`, contexts skip the last kept step of each episode, whose next observation is not
     stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
@@ -82,6 +84,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         context: K, in transitions.
         order: "contiguous" or "random".
         labels: "expert" or "oracle"; see `history.LABELS`.
+        queries: Q, number of queries with each context.
         options: options shared with `ADSampler`: `seed`; `teammate_actions`, whether batches have
             `context_teammate_actions`; `weights`, probabilities of the histories of a task; `episodes` and
             `curriculum`, the part of each history that queries and contexts are drawn from; `process_index` and
@@ -108,8 +111,10 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         context: int,
         order: ContextOrder = "contiguous",
         labels: Labels = "expert",
+        queries: int = 1,
         **options: Unpack[SamplerOptions],
     ) -> None:
+        self.queries = check_int("queries", queries, 1)
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         if order not in CONTEXT_ORDERS:
             raise unknown("order", order, CONTEXT_ORDERS)
@@ -123,14 +128,16 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
 
     def options(self) -> dict[str, Any]:
         excluded = {} if self.dataset.has_states else {"excluded": "last steps of episodes"}
-        return super().options() | {"order": self.order, "labels": self.labels} | excluded
+        several = {"queries": self.queries} if self.queries > 1 else {}
+        return super().options() | {"order": self.order, "labels": self.labels} | several | excluded
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
-        rows, shape = self.local_size, (self.local_size, self.length)
+        shape = self.local_size, self.length
+        asked = (self.local_size, self.queries) if self.queries > 1 else (self.local_size,)
         return {
-            "query_obs": self._observer.spec(rows),
-            "query_target": ArraySpec("int32", (rows,)),
+            "query_obs": self._observer.spec(*asked),
+            "query_target": ArraySpec("int32", asked),
             "context_obs": self._observer.spec(*shape),
             "context_actions": ArraySpec("int32", shape),
             "context_next_obs": self._observer.spec(*shape),
@@ -141,7 +148,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
 
     def batch(self, i: int, out: DPTBatch[np.ndarray] | None = None) -> DPTBatch[np.ndarray]:
         batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
-        query, query_step, context, steps = self._draw(i)
+        query, query_steps, context, steps = self._draw(i)
 
         observer, kept_steps = self._observer, self._draws.kept_steps
         query_records = observer.records(batch.query_obs)
@@ -152,9 +159,10 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
+        asked, record = query_steps.shape, records.shape[2:]
         reads = [
-            ReadRequest(f"{self.labels}_actions", query, query_step, batch.query_target[:, None]),
-            ReadRequest(observer.field, query, query_step, query_records[:, None]),
+            ReadRequest(f"{self.labels}_actions", query, query_steps, batch.query_target.reshape(asked)),
+            ReadRequest(observer.field, query, query_steps, query_records.reshape(*asked, *record)),
             ReadRequest("actions", context, rows, batch.context_actions),
             ReadRequest("rewards", context, rows, batch.context_rewards),
             ReadRequest(observer.field, context, rows, records),
@@ -178,11 +186,13 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         return batch
 
     def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Histories (B,) and steps (B,) of queries, histories (B,) and steps (B, K) of contexts, all int64.
+        """Histories (B,) and steps (B, Q) of queries, histories (B,) and steps (B, K) of contexts, all int64.
 
         Histories are positions in the selection.
         """
-        random = self._random(i, 4 + (self.length if self.order == "random" else 1))
+        drawn_of_context = self.length if self.order == "random" else 1
+        random = self._random(i, 3 + self.queries + drawn_of_context)
+        asked = np.concatenate([random[3:4], random[4 + drawn_of_context :]]).T
         low, high = self._draws.steps(i)
         members, begins, ends = self._tasks
         task = scale_to_range(random[0], len(begins))
@@ -195,14 +205,14 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
             query, context = (
                 members[weighted_choice(number, weights, begins[task], ends[task])] for number in random[1:3]
             )
-        query_step = low[query] + scale_to_range(random[3], (high - low)[query])
+        query_steps = low[query][:, None] + scale_to_range(asked, (high - low)[query][:, None])
         low, high = self._transitions(low)[context], self._transitions(high)[context]
         if self.order == "random":
-            drawn = low[:, None] + scale_to_range(random[4:].T, (high - low)[:, None])
+            drawn = low[:, None] + scale_to_range(random[4 : 4 + drawn_of_context].T, (high - low)[:, None])
         else:
             first = low + scale_to_range(random[4], high - low - self.length + 1)
             drawn = first[:, None] + np.arange(self.length)
-        return query, query_step, context, self._step_of(drawn)
+        return query, query_steps, context, self._step_of(drawn)
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -93,11 +93,11 @@ def upgrade_advice() -> str:
     return f"`{source.installer} -U {PACKAGE}`"
 
 
-def restore_command() -> str:
-    """Return the shell command that restores the files of this package."""
+def restore_command(package: str = "icrl4aht_data") -> str:
+    """Return the shell command that restores the files of a package: this one, generation or baselines."""
     checkout = installation_source().checkout
     if checkout is not None:
-        return f"git -C {shlex.quote(str(checkout))} checkout icrl4aht_data"
+        return f"git -C {shlex.quote(str(checkout))} checkout {package}"
     return install_command(options="--force-reinstall --no-deps")
 
 

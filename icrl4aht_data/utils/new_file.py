@@ -17,8 +17,8 @@ _FORMS: dict[str, tuple[bytes, bytes]] = {
     ".pdf": (b"%PDF-", b"/Creator (" + MARK.encode() + b")"),
     ".svg": (b"<?xml ", b"<dc:title>" + MARK.encode() + b"</dc:title>"),
     ".parquet": (b"PAR1", MARK.encode() + b"\x18\x05index"),
-    ".html": (b"<!doctype html>\n", b"<title>ICRL4AHT report</title>"),
-    ".htm": (b"<!doctype html>\n", b"<title>ICRL4AHT report</title>"),
+    ".html": (b"<!doctype html>\n", b"<title>ICRL4AHT report"),
+    ".htm": (b"<!doctype html>\n", b"<title>ICRL4AHT report"),
 }
 """Suffix -> the first bytes of a file that this package writes, and a text that is near its start or end."""
 

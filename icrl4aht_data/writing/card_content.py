@@ -15,7 +15,7 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, TASKS, Entry
+from icrl4aht_data.format.schema import PARQUET_EPISODES, PROVENANCE, TASKS, Entry
 from icrl4aht_data.utils.paths import files_below
 
 PARQUET_INDEX = "index"
@@ -44,6 +44,11 @@ class CardContent:
     def has_parquet(self) -> bool:
         """Whether the release has the index as Parquet files."""
         return any(name.startswith(f"{PARQUET_INDEX}/") for name in self.files)
+
+    @property
+    def has_parquet_episodes(self) -> bool:
+        """Whether the release has the episodes as Parquet files."""
+        return any(name.startswith(f"{PARQUET_EPISODES}/") for name in self.files)
 
     def distinct(self, name: str) -> list[Any]:
         """Return the values of a field of the tasks' provenance, each once."""

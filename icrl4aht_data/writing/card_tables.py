@@ -9,13 +9,13 @@ import numpy as np
 from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import (
-    FAMILIES,
     KEPT_STEPS,
     LABEL_EPISODES,
     LEAST_HEADROOM,
     SAME_BEHAVIOUR,
     SOURCES,
     SPLITS,
+    family_order,
 )
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask
@@ -102,7 +102,7 @@ def _curve_cells(release: CardContent, members: Sequence[Entry], filtered: bool)
     tasks = list(dict.fromkeys(entry.task_id for entry in members))
     families = {entry.teammate_family for entry in members}
     learners = len({(entry.task_id, entry.learner) for entry in members if entry.source == "ppo"})
-    cells = [" ".join(family for family in (*FAMILIES[1:], FAMILIES[0]) if family in families)]
+    cells = [" ".join(sorted(families, key=_learned_last))]
     numbers = len(tasks), learners or None, len(members), sum(entry.T for entry in members)
     cells += ["" if number is None else f"{number:,}" for number in numbers]
     cells += [_mean(entry.return_start for entry in members), _mean(entry.return_end for entry in members)]
@@ -110,6 +110,10 @@ def _curve_cells(release: CardContent, members: Sequence[Entry], filtered: bool)
         filters = [release.provenance.get(task, Provenance()).filter for task in tasks]
         cells.append("" if None in filters else _mean(found.before.return_end for found in filters if found))
     return [*cells, f"{share_risen(members, LEAST_RISE):.0%}"]
+
+
+def _learned_last(family: str) -> tuple[bool, tuple[int, str]]:
+    return family == "rl", family_order(family)
 
 
 def _mean(values: Iterable[float]) -> str:
@@ -122,7 +126,7 @@ class CardTeammate(NamedTuple):
     Attributes:
         layout: short name of the layout.
         split: the split of its tasks.
-        family: "rl" or H1..H4.
+        family: of `all_families`.
         name: family or algorithm and number, such as "H3/t12".
         seed: the seed that its parameters were drawn with, or of its population.
         sources: how the histories with it were made.
@@ -161,10 +165,10 @@ def card_teammates(release: CardContent) -> list[CardTeammate]:
                 nearest=next((of_task.nearest_test for of_task in provenance if of_task.nearest_test), None),
             )
         )
-    layouts, families = list(release.info.layouts), (*FAMILIES[1:], FAMILIES[0])
+    layouts = list(release.info.layouts)
     return sorted(
         (mate for mate in teammates if mate.layout in layouts),
-        key=lambda mate: (layouts.index(mate.layout), SPLITS.index(mate.split), families.index(mate.family)),
+        key=lambda mate: (layouts.index(mate.layout), SPLITS.index(mate.split), _learned_last(mate.family)),
     )
 
 

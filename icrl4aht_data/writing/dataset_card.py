@@ -11,7 +11,6 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
-    FAMILIES,
     LEAST_HEADROOM,
     PAPER_EGO_STEPS,
     PAPER_TEAMMATE_STEPS,
@@ -19,10 +18,12 @@ from icrl4aht_data.benchmark.facts import (
     SAME_BEHAVIOUR,
     SPLITS,
     TRACKS,
+    family_order,
+    track_of,
 )
 from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
-from icrl4aht_data.format.schema import FIELDS, KINDS, Entry, are_labels_weak
+from icrl4aht_data.format.schema import FIELDS, KINDS, PARQUET_EPISODES, Entry, are_labels_weak
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.writing.card_content import PARQUET_INDEX, CardContent, mean_rise, read_content
@@ -36,7 +37,7 @@ from icrl4aht_data.writing.card_tables import (
     teammate_name,
     teammates_table,
 )
-from icrl4aht_data.writing.card_texts import card_texts, count_in_words, sentence
+from icrl4aht_data.writing.card_texts import card_texts, count_in_words, episode_texts, sentence
 from icrl4aht_data.writing.statistics import layout_statistics, statistics_rows
 
 RELEASE_CARD = "README.md"
@@ -103,7 +104,8 @@ def render_card(release: CardContent) -> str:
         splits=_splits_table(release),
         fields=_arrays_table(release),
         twin=f" and `{PARQUET_INDEX}/<layout>/<split>.parquet`" if parquet else "",
-        columns=markdown_table(["field", "what"], [[f"`{name}`", text] for name, text in card_texts("index").items()]),
+        columns=_fields_table(card_texts("index")),
+        episodes=_episodes(release),
         provenance=_bullets(_provenance(release)),
         citation=card_file("citation.bib").read_text(encoding="utf-8").strip(),
     )
@@ -121,14 +123,14 @@ def evaluated_on(layouts: Iterable[str]) -> list[str]:
     """Return the layouts on which the benchmark tests models that were trained on `layouts`."""
     names = list(layouts)
     tested: list[str] = []
-    for track in TRACKS.values():
-        own = [name for name in names if any(name in members for members in track.values())]
-        tested += [name for name in own if name in track["test"]] or (list(track["test"]) if own else [])
+    for track, splits in TRACKS.items():
+        own = [name for name in names if track_of(name) == track]
+        tested += [name for name in own if name in splits["test"]] or (list(splits["test"]) if own else [])
     return tested
 
 
 def _viewer_configs(release: CardContent) -> str:
-    """Return YAML for the Hub's viewer: one configuration of all histories, the default, and one per layout."""
+    """Return YAML for the Hub: configurations of all histories, the default, of each layout's, and of all episodes."""
     splits = {"*": {entry.split for entry in release.entries}}
     for entry in release.entries:
         splits.setdefault(entry.layout, set()).add(entry.split)
@@ -138,7 +140,28 @@ def _viewer_configs(release: CardContent) -> str:
         for split in (split for split in SPLITS if split in found):
             lines += [f"  - split: {split}", f"    path: {PARQUET_INDEX}/{folder}/{split}.parquet"]
         lines += ["  default: true"] if folder == "*" else []
+    if release.has_parquet_episodes:
+        lines += [f"- config_name: {PARQUET_EPISODES}", "  data_files:"]
+        for split in (split for split in SPLITS if split in splits["*"]):
+            lines += [f"  - split: {split}", f"    path: {PARQUET_EPISODES}/*/{split}-*.parquet"]
     return "\n".join(lines) + "\n"
+
+
+def _fields_table(texts: Mapping[str, str]) -> str:
+    return markdown_table(["field", "what"], [[f"`{name}`", text] for name, text in texts.items()])
+
+
+def _episodes(release: CardContent) -> str:
+    """Return the card's section on the episodes as Parquet files; empty if there are none."""
+    if not release.has_parquet_episodes:
+        return ""
+    return fill_template(
+        "episodes.md",
+        folder=PARQUET_EPISODES,
+        split=_example(release)["split"],
+        steps=str(release.info.environment.kept_steps),
+        columns=_fields_table(episode_texts()),
+    )
 
 
 def _example(release: CardContent) -> dict[str, str]:
@@ -154,7 +177,8 @@ def _facts(release: CardContent) -> list[str]:
     found: dict[str, set[str]] = {}
     for entry in entries:
         found.setdefault(entry.teammate_family, set()).add(entry.teammate_kind)
-    teammates = [f"the heuristic {family} (`{min(found[family])}`)" for family in FAMILIES[1:] if family in found]
+    heuristics = sorted(found.keys() - {"rl"}, key=family_order)
+    teammates = [f"the heuristic {family} (`{min(found[family])}`)" for family in heuristics]
     if algorithms := [name for name in ALGORITHMS if name in found.get("rl", ())]:
         teammates.append(f"policies learned by {', '.join(algorithms)}, which act greedily")
     sources = [f"`{source}` ({len(members):,} histories)" for (source,), members in release.groups("source").items()]
@@ -194,6 +218,7 @@ def _limits(release: CardContent) -> list[str]:
     limits = [*_heuristics_in_training(release), *_missing_teammates(release), *_smaller_scale(release)]
     if release.info.kind not in KINDS:
         limits.append(sentence("not_replayable"))
+        limits += [sentence("no_episodes")] if release.has_parquet else []
     if flat := [layout for layout, has in release.headroom.items() if not has]:
         limits.append(sentence("no_headroom", layouts=", ".join(flat), least=f"{LEAST_HEADROOM:g}"))
     if rooms := [name for name in _NO_SHARED_ROOM if name in release.info.layouts]:

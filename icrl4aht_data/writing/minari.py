@@ -80,7 +80,7 @@ def to_minari(
 
     Args:
         dataset: a release with state records, or a part of one.
-        target: the folder to write, named as Minari names datasets: <name>-v<number>.
+        target: the folder to write, named as Minari names datasets: `<name>-v<number>`.
         overwrite: replace a folder that this function wrote, or a release.
         advance: progress.
 

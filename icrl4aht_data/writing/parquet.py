@@ -1,16 +1,28 @@
-"""The index as a Parquet file."""
+"""Parquet files of a release: its index, one row per history, and its episodes, one row each."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import ENTRY_HINTS
+from icrl4aht_data.reading.arrow_tables import episode_schema, episode_table, import_pyarrow, index_schema
 from icrl4aht_data.utils.disk import explain_full_disk
 from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK, check_new_file
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ROW_GROUP = 2000
+"""Least episodes in a row group, the part of a file that is written and read at once: about 10 MB in memory."""
+
+FILE_EPISODES = 500_000
+"""Episodes after which a history starts the next file: about 100 MB."""
 
 
 def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path:
@@ -25,18 +37,65 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
         OptionError: if pyarrow is not installed, or `path` may not be written, see `new_file.check_new_file`, or
             is inside the release.
     """
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise OptionError(f"Parquet needs pyarrow: {install_command('hf')}") from error
+    arrow = import_pyarrow()
+    import pyarrow.parquet as pq
+
     check_new_file(path, overwrite)
     if path.resolve().is_relative_to(dataset.root.resolve()):
         raise OptionError(f"{path}: is inside {dataset.root}, which is read; give another path")
-    types = {float: pa.float64(), int: pa.int64(), int | None: pa.int64(), str: pa.string(), bool: pa.bool_()}
-    types |= {float | None: pa.float64(), tuple[int, int, int]: pa.list_(pa.int64())}
-    schema = pa.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()], {MARK: "index"})
-    rows = pa.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
+    schema = index_schema().with_metadata({MARK: "index"})
+    rows = arrow.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
         pq.write_table(rows, stream)  # which would leave a file open where it fails
     return path
+
+
+def write_episodes(
+    dataset: Dataset,
+    folder: Path,
+    *,
+    file_episodes: int = FILE_EPISODES,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write the episodes of a release as Parquet files `<layout>/<split>-00000-of-00001.parquet`, one row each.
+
+    Memory holds one history and one row group at a time. All episodes of a history are in one file, in order. The
+    columns are `arrow_tables.EPISODE_COLUMNS`, with records as wide as the longest one of the selection's layouts.
+
+    Args:
+        dataset: a release with state records, or a part of one.
+        folder: the folder of the layouts' folders.
+        file_episodes: episodes after which a history starts the next file of its layout and split.
+        advance: called with the number of histories written, and their total.
+
+    Raises:
+        OptionError: if pyarrow is not installed.
+        IndexFormatError: if a history's episodes do not have the release's number of steps.
+    """
+    schema = episode_schema(dataset)
+    done = 0
+    for layout, split in dict.fromkeys((entry.layout, entry.split) for entry in dataset.entries):
+        part = dataset.filter(layout=layout, split=split)
+        before = np.cumsum(part.column("episodes")) - part.column("episodes")
+        _, number = np.unique(before // file_episodes, return_inverse=True)
+        files = int(number[-1]) + 1
+        (folder / layout).mkdir(parents=True, exist_ok=True)
+        for file in range(files):
+            chosen = part.select(number == file)
+            path = folder / layout / f"{split}-{file:05}-of-{files:05}.parquet"
+            for written in _write_row_groups(chosen, path, schema):
+                done += written
+                advance(done, len(dataset))
+
+
+def _write_row_groups(part: Dataset, path: Path, schema: pa.Schema) -> Iterator[int]:
+    """Write the episodes of a file; yield the number of histories in each row group when it is written."""
+    arrow = import_pyarrow()
+    import pyarrow.parquet as pq
+
+    group = (np.cumsum(part.column("episodes")) - 1) // ROW_GROUP
+    with path.open("wb") as stream, pq.ParquetWriter(stream, schema, compression="zstd", compression_level=9) as file:
+        for number in np.unique(group):
+            members = part.select(group == number)
+            file.write_table(arrow.concat_tables([episode_table(history, schema) for history in members]))
+            yield len(members)

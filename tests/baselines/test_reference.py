@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from baselines import reference
 from baselines.commands.cli import cli
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method
-from baselines.reference import RECIPES, TEACHER_HISTORIES, TRACK_VIEWS, make_reference
+from baselines.reference import RECIPES, RL2_HISTORIES, TRACK_VIEWS, describe_times, make_reference
 from baselines.training.histories import read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
 from generation.profiles.noise_config import NoiseConfig
@@ -38,8 +40,8 @@ def test_recipes_are_valid_settings(name):
 
 
 def test_every_history_has_episodes_without_noise():
-    assert TEACHER_HISTORIES.end == (0.0, 0.0) and TEACHER_HISTORIES.finish[1] < 1
-    assert all(recipe.protocols["seeded"] == 3 for recipe in RECIPES.values() if not recipe.meets_tests)
+    assert all(noise.end == (0.0, 0.0) and noise.finish[1] < 1 for noise in RL2_HISTORIES.values())
+    assert all(dict(r.protocols) == {"seeded": 3, "published": 1} for r in RECIPES.values() if not r.meets_tests)
 
 
 def test_unknown_names(tmp_path):
@@ -51,6 +53,40 @@ def test_unknown_names(tmp_path):
     assert result.exit_code == 2 and "ad-noise" in result.output
 
 
+def test_times_of_parts(tmp_path):
+    made = reference._Making(tmp_path / "out", "teammate", print)
+    assert describe_times(made.out) == ""
+    with made.timed("one"):
+        pass
+    with made.timed("there before", was_done=True):
+        pass
+    with pytest.raises(KeyboardInterrupt), made.timed("stopped"):
+        raise KeyboardInterrupt
+    lines = [json.loads(line) for line in (made.out / "times.jsonl").read_text().splitlines()]
+    assert [line["part"] for line in lines] == ["one", "stopped"]
+    assert all(line["seconds"] >= 0 and line["cores"] >= 1 for line in lines)
+    assert re.fullmatch(
+        r"everything in .*out took 0\.00 hours on \d+ cores; see .*times\.jsonl", describe_times(made.out)
+    )
+
+
+def test_a_second_round_keeps_the_own_histories_of_the_first(tmp_path, monkeypatch):
+    combined = []
+    for name in ("load_icrl4aht", "release_teammates", "find_agent", "collect_release"):
+        monkeypatch.setattr(reference, name, lambda *given, **options: None)
+    monkeypatch.setattr(reference, "combine_releases", lambda target, roots: combined.append((target.name, roots)))
+    monkeypatch.setattr(reference._Making, "_train_once", lambda *given: None)
+    monkeypatch.setattr(reference._Making, "histories", lambda made, kind: tmp_path / kind)
+    monkeypatch.setattr(reference._Making, "play", lambda made: tmp_path)
+    monkeypatch.setattr(reference._Making, "noise_release", lambda made: tmp_path)
+    recipe = dataclasses.replace(RECIPES["ad-student"], rounds=2)
+    reference._Making(tmp_path, "layout", print).train("ad", recipe)
+    assert combined == [
+        ("ad-layout-1-mixed", [tmp_path / "student", tmp_path / "ad-layout-1-own"]),
+        ("ad-layout-mixed", [tmp_path / "ad-layout-1-mixed", tmp_path / "ad-layout-own"]),
+    ]
+
+
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> Path:
     """Recipes that take seconds, and the bundled release in place of the rebuilt one."""
@@ -58,7 +94,7 @@ def small(monkeypatch, tmp_path) -> Path:
         sizes: dict[str, Any] = TINY if recipe.data != "tasks" else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data != "tasks" else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
         monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
-    monkeypatch.setattr(reference, "TEACHER_HISTORIES", NoiseConfig(2, 10, start=(0.5, 0.5)))
+    monkeypatch.setitem(RL2_HISTORIES, "student", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
     diverse = read_tasks(manifest_path("layout", "train", "diverse"))
@@ -78,7 +114,7 @@ def test_a_model_of_histories_of_rl2_and_of_its_own(small):
     assert made == {
         "noise",
         "rl2-layout",
-        "histories-layout",
+        "student-layout",
         "ad-student-layout-first",
         "ad-student-layout-own",
         "ad-student-layout-mixed",
@@ -88,7 +124,7 @@ def test_a_model_of_histories_of_rl2_and_of_its_own(small):
     assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
     assert {cell["source"] for cell in trained.trained_on} == {"student"}
     own, mixed = (load_icrl4aht(small / f"ad-student-layout-{name}") for name in ("own", "mixed"))
-    assert len(mixed) == len(own) + len(load_icrl4aht(small / "histories-layout"))
+    assert len(mixed) == len(own) + len(load_icrl4aht(small / "student-layout"))
     times = {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")}
     make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
     assert {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")} == times

@@ -135,9 +135,8 @@ class TestHuggingFace:
         assert (row["history_id"], row["episode"], row["layout"]) == (7, 2, "demo_wide")
         for name in ("actions", "teammate_actions", "expert_actions", "rewards"):
             np.testing.assert_array_equal(row[name], written[7][name][40:60])
-        np.testing.assert_array_equal(
-            np.frombuffer(b"".join(row["state"]), np.uint8), written[7]["state"][40:60].reshape(-1)
-        )
+        np.testing.assert_array_equal(row["state"], written[7]["state"][40:60])
+        np.testing.assert_array_equal(row["episode_end_state"], written[7]["episode_end_state"][2])
         assert row["return"] == written[7]["rewards"][40:60].sum()
         assert row["oracle_actions"] is None
 

@@ -17,8 +17,13 @@ import pytest
 import icrl4aht_data
 from icrl4aht_data import ADBatch, ADSampler, Curriculum, Dataset, DPTSampler, Report, get_layout, load_icrl4aht
 from icrl4aht_data.checking.report import Finding
+from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.interop import torch_loader
-from icrl4aht_data.utils.html import curve_svg, facts_html
+from icrl4aht_data.plotting import curve_svg, return_limits
+from icrl4aht_data.reading.episodes import Episode
+from icrl4aht_data.reading.history import History
+from icrl4aht_data.sampling.batches import Batches
+from icrl4aht_data.utils.html import facts_html
 from tests.helpers.paths import ROOT
 
 
@@ -55,6 +60,9 @@ def shown(dataset: Dataset) -> dict[str, object]:
         "index": dataset.index,
         "info": dataset.info,
         "picture": history.plot(),
+        "provenance": dataset.provenance,
+        "storage": dataset[:1].with_options(cache="ram").storage,
+        "streamed storage": dataset[:1].with_options(cache="stream").storage,
     }
 
 
@@ -86,7 +94,12 @@ def test_batches_print_shapes_wherever_their_arrays_are(bundled):
 
 
 def test_html_has_a_learning_curve_and_counts(bundled):
-    for value, words in ((bundled, ["532 histories", "noise (456)", "demo_wide"]), (bundled[0], ["History 0", "H3"])):
+    shown = (
+        (bundled, ["532 histories", "noise (456)", "demo_wide"]),
+        (bundled[0], ["History 0", "H3"]),
+        (bundled[0].episodes[-1], ["Episode 195 of history 0", "+20 at step"]),
+    )
+    for value, words in shown:
         html = value._repr_html_()
         tree = ElementTree.fromstring(html)
         assert tree.findall(".//{*}polyline") or tree.findall(".//polyline")
@@ -106,6 +119,26 @@ def test_a_constant_curve_of_one_value_is_drawn():
     assert line.get("points")
 
 
+@pytest.mark.parametrize("values", [[40.0, 40.0, 40.0], [38.0, 42.0] * 3])
+def test_the_axis_of_a_curve_does_not_magnify(values):
+    """Alternating returns once filled the axis, and a constant lay on its bottom line."""
+    svg = ElementTree.fromstring(curve_svg({"ppo": np.array(values)}))
+    low, high = return_limits(values)
+    assert [text.text for text in svg.iter("text")][:2] == [f"{high:.1f}", f"{low:.1f}"]
+    (line,) = svg.iter("polyline")
+    heights = [float(point.split(",")[1]) for point in str(line.get("points")).split()]
+    assert max(heights) - min(heights) <= 0.1 * 130
+    assert max(heights) < 0.5 * 130, "near the top: 0 is at the bottom"
+
+
+def test_points_of_a_curve_are_where_their_values_are():
+    (line,) = ElementTree.fromstring(curve_svg({"ppo": np.arange(100.0)})).iter("polyline")
+    x, y = np.array([point.split(",") for point in str(line.get("points")).split()], float).T
+    assert len(x) == 60
+    slopes = np.diff(y) / np.diff(x)
+    np.testing.assert_allclose(slopes, slopes.mean(), rtol=0.1)
+
+
 @pytest.mark.parametrize("function", [Dataset.ad, Dataset.dpt, ADSampler, DPTSampler], ids=lambda f: f.__qualname__)
 def test_help_lists_the_options_with_their_types(function):
     signature = inspect.signature(function)
@@ -117,8 +150,36 @@ def test_help_lists_the_options_with_their_types(function):
     assert "weights" in signature.parameters and "Unpack" not in str(signature)
 
 
-def test_help_of_loading_shows_types():
+def test_help_of_loading_and_verifying_shows_types():
     assert inspect.signature(load_icrl4aht).return_annotation is Dataset
+    assert inspect.signature(verify_release).return_annotation is Report
+
+
+@pytest.mark.parametrize("shown", [Dataset, History, Episode, Batches], ids=lambda shown: shown.__name__)
+def test_help_of_methods_shows_types(shown):
+    """Types of libraries that are imported for type checks only stay texts."""
+    for name, method in inspect.getmembers(shown, inspect.isfunction):
+        if name.startswith("_") and name != "__init__":
+            continue
+        signature = inspect.signature(method)
+        found = [one.annotation for one in signature.parameters.values()] + [signature.return_annotation]
+        texts = {annotation for annotation in found if isinstance(annotation, str)}
+        assert texts <= {"gymnasium.Env", "pandas.DataFrame"}, name
+
+
+def test_one_history_is_singular(bundled):
+    one = bundled[:1]
+    assert "1 history of 1 task on" in repr(one) and "1 history of 1 task<" in one._repr_html_()
+    assert "1 history on" in repr(one.ad(batch_size=2, length=30))
+
+
+def test_provenance_is_a_read_only_mapping_with_a_short_repr(bundled):
+    found = bundled.provenance
+    assert set(found) == set(bundled.counts("task_id")) and repr(found) == f"ProvenanceByTask({len(found)} tasks)"
+    task_id = bundled[0].entry.task_id
+    assert found[task_id] is found.get(task_id) and found.get("none") is None
+    with pytest.raises(TypeError):
+        found[task_id] = found[task_id]  # type: ignore[index]
 
 
 SCRIPT = Path(__file__).with_name("user_script.py")

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import io
+import json
+import os
 import pydoc
 import re
 import shutil
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -34,13 +37,19 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.old_releases import as_version
 from tests.helpers.paths import ROOT
+from tests.helpers.plugins import installed, write_package
 from tests.helpers.random_releases import random_history, random_release
-from tests.helpers.tiny import start
+from tests.helpers.tiny import TINY
 from tests.packaging.test_readme import PROGRAMS, blocks, commands, understand
+from tests.servers.common import hub_server, uploads
 
-PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))}
+DOCS = ROOT / "docs"
+PAGES = {
+    path.relative_to(DOCS).with_suffix("").as_posix(): path.read_text(encoding="utf-8")
+    for path in sorted(DOCS.rglob("*.md"))
+}
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES)
-COMPILING = ("adapters", "extending", "protocol")
+COMPILING = ("adapters", "evaluating", "protocol")
 """Pages whose snippets compile environments and models."""
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -49,7 +58,8 @@ pytestmark = pytest.mark.usefixtures("compiled_quickly")
 def run_snippets(page: str, folder: Path) -> dict[str, Any]:
     """Run a page's snippets in order, in a folder with the package's data, and return the names they define.
 
-    Each must print exactly the text block that follows it. Line numbers in tracebacks are those of the page.
+    Each must print exactly the text block that follows it, where "..." is the folder of the package. Line numbers in
+    tracebacks are those of the page.
     """
     names: dict[str, Any] = {}
     (folder / "icrl4aht_data").symlink_to(ROOT / "icrl4aht_data")
@@ -58,7 +68,7 @@ def run_snippets(page: str, folder: Path) -> dict[str, Any]:
             lines_before = "\n" * PAGES[page].count("\n", 0, snippet.start(1))
             with contextlib.redirect_stdout(io.StringIO()) as printed:
                 exec(compile(lines_before + snippet[1], f"docs/{page}.md", "exec"), names)
-            assert printed.getvalue() == (snippet[2] or "")
+            assert printed.getvalue().replace(str(ROOT), "...") == (snippet[2] or "")
     return names
 
 
@@ -70,9 +80,12 @@ def rows(page: str, heading: str) -> list[list[str]]:
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=pytest.mark.slow if page in COMPILING else ()) for page in PAGES if page != "results"],
+    [
+        pytest.param(page, marks=pytest.mark.slow if page in COMPILING else ())
+        for page in PAGES
+        if blocks("python", PAGES[page]) and page != "extending"
+    ],
 )
-@mock.patch.dict(METHODS)
 def test_snippets(page, tmp_path, monkeypatch):
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))  # a page sets it
@@ -80,18 +93,58 @@ def test_snippets(page, tmp_path, monkeypatch):
     assert run_snippets(page, tmp_path)
 
 
+@pytest.fixture
+def own_package(tmp_path) -> Iterator[None]:
+    """The package of docs/extending.md, installed."""
+    with installed(write_own_package(tmp_path / "site")):
+        yield
+
+
 @EVERY_PAGE
-def test_commands_are_accepted(page, tmp_path, monkeypatch):
+def test_commands_are_accepted(page, request, tmp_path, monkeypatch):
     """The commands are not run: most of them would take too long here."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "shared" / "lite").mkdir(parents=True)
+    (tmp_path / "icrl4aht_data").symlink_to(ROOT / "icrl4aht_data")
+    if page == "extending":
+        request.getfixturevalue("own_package")
+        (tmp_path / "mine.jsonl").touch()
     for line in "".join(blocks("sh", PAGES[page])).splitlines():
         assert line.startswith((*PROGRAMS, "ray "))
     for program, group in PROGRAMS.items():
         for arguments in commands(program, PAGES[page]):
             understand(group, arguments)
-        for name in re.findall(rf"`{program} ([a-z-]+)", PAGES[page]):  # in the text, without options
+        for name in re.findall(rf"`{program} ([a-z][a-z-]*)", PAGES[page]):  # in the text, without options
             assert name in group.commands, name
+
+
+def run(arguments: list[str]) -> None:
+    result = CliRunner().invoke(PROGRAMS["icrl4aht-data"], arguments)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        pytest.param(arguments, marks=[pytest.mark.slow] * ("--deep" in arguments), id=" ".join(arguments))
+        for arguments in commands("icrl4aht-data", PAGES["start"])
+    ],
+)
+def test_first_commands(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(arguments)
+
+
+@pytest.mark.slow
+@uploads
+def test_hub_commands(tmp_path, monkeypatch):
+    """Upload the bundled release to a local hub, then read it from there: the commands of both pages in their order."""
+    monkeypatch.chdir(tmp_path)
+    with hub_server(tmp_path / "hub") as hub:
+        for page in ("publishing", "remote"):
+            for arguments in commands("icrl4aht-data", PAGES[page]):
+                run(arguments)
+        assert "README.md" in hub.files("you/icrl4aht")
 
 
 @pytest.mark.slow
@@ -104,25 +157,14 @@ def test_ray_has_the_commands(arguments):
 
 
 @EVERY_PAGE
-def test_names_and_links_exist(page):
+def test_names_exist(page):
     text = PAGES[page]
     for name in re.findall(r"`((?:icrl4aht_data|generation|baselines)(?:\.\w+)+)(?:\(.*?\))?`", text):
         assert pydoc.locate(name) is not None, name
     files = r"`((?:icrl4aht_data|generation|baselines|cards|tests)/[\w/]+\.\w+)(?:::(\w+))?`"
     for path, test in re.findall(files, text):
-        if path != "generation/teammates/waiter.py":  # an example that the page itself defines
-            source = (ROOT / path).read_text(encoding="utf-8")
-            assert not test or f"def {test}(" in source, test
-    for target in re.findall(r"\]\((.*?)\)", text):
-        path, _, anchor = target.partition("#")
-        file = ROOT / "docs" / path
-        if path and file.suffix != ".md":
-            assert file.is_file(), target
-            continue
-        linked = file.read_text(encoding="utf-8") if path else text
-        titles = re.findall(r"^#+ (.*)$", linked, flags=re.MULTILINE)
-        anchors = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
-        assert not anchor or anchor in anchors, target
+        source = (ROOT / path).read_text(encoding="utf-8")
+        assert not test or f"def {test}(" in source, test
 
 
 @pytest.fixture(scope="module")
@@ -256,75 +298,52 @@ def stored_type(field: Field, kind: Kind) -> str:
     return TYPE_NAMES[field.compact if kind == "lite" else field.dtype]
 
 
-def apply(text: str, lines: list[str]) -> str:
-    """Return a text with a diff's lines applied; each hunk must match exactly one position of the text."""
-    hunks: list[list[str]] = []
-    for before, line in zip([" ", *lines], lines, strict=False):
-        if (before[0] == "+" and line[0] != "+") or not hunks:
-            hunks.append([])
-        hunks[-1].append(line)
-    for hunk in hunks:
-        old, new = ("\n".join(line[1:] for line in hunk if line[0] in signs) for signs in (" -", " +"))
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    return text
+SMALL = "--steps 3 --width 16 --heads 2 --batch-size 2 --context 40"
+"""Options of a training that takes seconds."""
+
+
+def write_own_package(folder: Path) -> Path:
+    """Write the package of docs/extending.md as if it was installed; returns the folder for Python's path."""
+    page = PAGES["extending"]
+    (about,) = blocks("toml", page)
+    project = tomllib.loads(about)["project"]
+    modules = dict(re.findall(r"`my_overcooked/(\w+).py`:\n\n```python\n(.*?)```", page, flags=re.DOTALL))
+    return write_package(folder, project["name"], modules, project["entry-points"])
 
 
 class TestExtending:
-    def write_changes(self, root: Path) -> None:
-        """Apply the diffs of docs/extending.md to the checkout and write the changed files to another folder."""
-        for change in "\n".join(blocks("diff", PAGES["extending"])).split("--- ")[1:]:
-            name, *lines = change.strip("\n").splitlines()
-            path = root / name
-            text = (path if path.exists() else ROOT / name).read_text(encoding="utf-8")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(apply(text, lines), encoding="utf-8")
-
-    def test_changes_apply(self, tmp_path):
-        self.write_changes(tmp_path)
-        assert "open_kitchen" in (tmp_path / "icrl4aht_data/overcooked/layouts.py").read_text()
-        assert "waiter" in (tmp_path / "generation/teammates/registry.py").read_text()
-
     @pytest.mark.slow
-    def test_registered_names_are_accepted_everywhere(self, tmp_path):
-        """Evaluate and report a task with the page's teammate on its layout, and verify a release of that layout."""
-        for folder in ("icrl4aht_data", "generation", "baselines", "cards"):
-            shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("mini", "__pycache__"))
-        self.write_changes(tmp_path)
-        (module,) = (block for block in blocks("python", PAGES["extending"]) if block.startswith('"""`waiter`'))
-        (tmp_path / "generation" / "teammates" / "waiter.py").write_text(module, encoding="utf-8")
-        process = start("-c", NAMED, str(tmp_path), str(ROOT), JAX_DISABLE_MOST_OPTIMIZATIONS="true")
-        out, error = process.communicate(timeout=240)
-        assert process.returncode == 0, error
-        assert ast.literal_eval(out.splitlines()[-1]) == ("H5", "open_kitchen", 1, True)
+    def test_page(self, tmp_path, monkeypatch):
+        """Run the snippets, then the commands, which are processes of their own."""
+        package = write_own_package(tmp_path / "site")
+        (tmp_path / "page").mkdir()
+        with installed(package), mock.patch.dict(METHODS):
+            names = run_snippets("extending", tmp_path / "page")
+        assert names["task"].teammate_family == "waiter"
+        shutil.copy(tmp_path / "page/mine.jsonl", tmp_path)
+        (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
+        for line in blocks("sh", PAGES["extending"])[0].splitlines():
+            line = line.replace("--profile smoke", "--profile tiny.toml").replace("--steps 2000", SMALL)
+            self.run(line, tmp_path, package)
+        results, config = (
+            (tmp_path / "runs" / name).read_text(encoding="utf-8")
+            for name in ("oracle/report/report.md", "mean_open/config.json")
+        )
+        assert "| waiter (training) |" in results
+        assert "open_kitchen" in results
+        assert json.loads(config)["method"] == "mean_ad"
 
-
-NAMED = """
-import os, sys
-sys.path[:0] = sys.argv[1:]
-os.chdir(sys.argv[1])
-import dataclasses
-from pathlib import Path
-from tests.helpers.random_releases import random_release
-from baselines.agents import stay
-from baselines.evaluate import evaluate, get_protocol
-from baselines.report import as_run, markdown, rows
-from generation.teammates.registry import heuristic_teammate, sample_teammate
-from icrl4aht_data import __file__, verify_release
-from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
-assert __file__.startswith(sys.argv[1])
-preset = make_task("layout", "train", "open_kitchen", heuristic_teammate("waiter", "lazy", 0), 0)
-drawn = make_task("layout", "train", "open_kitchen", sample_teammate("waiter", 1, "test"), 1)
-write_tasks(Path("mine.jsonl"), [preset, drawn])
-tasks = read_tasks(Path("mine.jsonl"))
-short = dataclasses.replace(get_protocol("seeded"), episodes=1, steps=10)
-run = as_run(evaluate("stay", stay, tasks[:1], short), tasks=tasks)
-assert "| H5 (training) |" in markdown([run])
-(row,) = rows(run)
-random_release(Path("release"), layouts=("open_kitchen",))
-ok = verify_release("release", level="deep").ok
-print((row["family"], row["layout"], row["instances"], ok))
-"""
+    def run(self, line: str, folder: Path, package: Path) -> None:
+        path = os.pathsep.join(map(str, (package, ROOT)))
+        done = subprocess.run(
+            [sys.executable, *line.split()[1:]],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": path, "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{line}: {done.stderr}"
 
 
 class TestScale:

@@ -17,12 +17,13 @@ import h5py
 import pytest
 from click.testing import CliRunner
 
-from icrl4aht_data.commands import doctor, requirements
+from icrl4aht_data.commands import doctor
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.commands.requirements import dependencies, extras_with
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import read_info
+from icrl4aht_data.utils import requirements
 from icrl4aht_data.utils.installation import install_command, installation_source, restore_command
+from icrl4aht_data.utils.requirements import dependencies, extras_with
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import SHARD
 
@@ -238,11 +239,11 @@ def test_dependencies_come_from_the_metadata(monkeypatch):
 
 def test_every_extra_for_users_installs_something():
     extras = {"plot", "jax", "tensorboard", "hf", "pandas", "s3", "grain", "torch", "cluster"}
-    extras |= {"gym", "pettingzoo", "jaxmarl", "minari"}
+    extras |= {"gym", "pettingzoo", "jaxmarl", "minari", "baselines", "notebooks"}
     assert {one.extra for one in dependencies()} == {None, *extras}
     adapters = ["gym", "jaxmarl", "pettingzoo"]
-    assert extras_with("PIL.Image") == ["plot", "baselines", "generation", *adapters]
-    assert extras_with("optax") == ["jax", "baselines", "generation", *adapters]
+    assert extras_with("PIL.Image") == ["plot", "generation", "baselines", *adapters, "notebooks"]
+    assert extras_with("optax") == ["jax", "generation", "baselines", *adapters, "notebooks"]
 
 
 def test_package_that_is_not_installed(elsewhere, monkeypatch):

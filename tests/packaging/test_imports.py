@@ -167,7 +167,7 @@ def at_the_top(tree: Tree) -> Iterator[str]:
 
 
 def reader_without_jax(tree: Tree) -> Iterator[str]:
-    """Imports of JAX by the reader: none at the top level but for types, and few in functions."""
+    """Imports of JAX by the reader that are neither for types nor in a function of the modules that may import it."""
     for found in tree.imports:
         of_reader = found.importer.split(".")[0] == "icrl4aht_data" and found.imported.split(".")[0] in JAX
         on_demand = found.how == "in a function" and found.importer in JAX_ON_DEMAND

@@ -92,6 +92,7 @@ baselines: collect --agent stay --out c --episodes 5 | 5 is not in the range x>=
 baselines: collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<=x<=1
 baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-tests, ad-noise,
 baselines: reference --name rl2 --no-evaluate --bundle-as x | its card states its results
+baselines: reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 baselines: results empty | Missing option '--out'
 baselines: collect --agent stay --out file | 'file' is a file
 baselines: tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.

@@ -144,6 +144,7 @@ FOREIGN = (
     *("sitecustomize.py", "conftest.py", "evil.pth", "meta/__pycache__/info.pyc", "Makefile", "setup.cfg", "a.so"),
     *("meta/new.json", "meta/info.json/x", "data/teammate/x.py", "figures/x.html", "MANIFEST.sha256"),
     *(f"teammates/{'0' * 64}/policy.pt", "teammates/m0/policy.json", "index/x/../../x/a.parquet"),
+    *("episodes/a.parquet", "episodes/demo_wide/train.py", "episodes/demo_wide/x/train.parquet"),
 )
 
 
@@ -165,6 +166,7 @@ def test_files_that_no_release_has_are_refused(damaged, name):
     [
         *("README.md", "LICENSE", "CITATION.cff", "croissant.json", "meta/source_card.md", "figures/headroom.png"),
         *("index/demo_wide/train.parquet", f"experts/{'a' * 64}/policy.safetensors", f"teammates/{'a' * 64}/README.md"),
+        "episodes/demo_wide/train-00000-of-00002.parquet",
         *("data/layout/coord_ring/train-00000-of-00010.h5", "meta/chunks/layout/coord_ring/train-00000-of-00010.npy"),
     ],
 )

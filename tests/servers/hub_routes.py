@@ -7,6 +7,7 @@ import binascii
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote, urlsplit
 
@@ -70,9 +71,15 @@ def info(call: Call) -> Answer:
 
 
 def tree(call: Call) -> Answer:
-    """All files and folders; requests for one level are not needed here."""
+    """All files and folders below a folder, the root by default; requests for one level are not needed here."""
+    folder = f"{call.names['path']}/".lstrip("/")
     files = call.repo.resolve(call.names["revision"]).files
-    return answer([file.entry(path) for path, file in files.items()])
+    found = {path: file.entry(path) for path, file in files.items() if path.startswith(folder)}
+    if not found:
+        raise Refusal(404, f"{folder} does not exist", "EntryNotFound")
+    parents = {str(parent) for path in found for parent in PurePosixPath(path.removeprefix(folder)).parents} - {"."}
+    below = [{"type": "directory", "oid": "0" * 40, "size": 0, "path": folder + parent} for parent in sorted(parents)]
+    return answer([*below, *found.values()])
 
 
 def refs(call: Call) -> Answer:
@@ -216,7 +223,7 @@ ROUTES: list[tuple[str, str, Route]] = [
     ("POST", "/api/repos/create", create),
     ("GET", REPO, info),
     ("GET", f"{REPO}/revision{AT}", info),
-    ("GET", f"{REPO}/tree{AT}", tree),
+    ("GET", f"{REPO}/tree{AT}/?(?P<path>.*)", tree),
     ("GET", f"{REPO}/refs", refs),
     ("POST", f"{REPO}/preupload{AT}", preupload),
     ("POST", f"{REPO}/commit{AT}", commit),

@@ -31,7 +31,7 @@ class Sampling(NamedTuple):
     """
 
     presets: tuple[str, ...]
-    ranges: dict[str, tuple[float, float] | list[float]]
+    ranges: Mapping[str, tuple[float, float] | list[float]]
 
 
 @dataclass(frozen=True, eq=False)

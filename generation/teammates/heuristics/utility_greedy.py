@@ -122,6 +122,20 @@ def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
     return jnp.where(yields, STAY, action), jnp.where(yields, 1 + (roll % 2).astype(jnp.int32), 0)
 
 
+_SPANS = {
+    "w_deliver": (5.0, 20.0),
+    "w_pickup_cooked": (3.0, 15.0),
+    "w_get_plate": (2.0, 10.0),
+    "w_add_ingredient": (3.0, 12.0),
+    "w_fetch_ingredient": (2.0, 10.0),
+    "w_stage_on_counter": (0.5, 5.0),
+    "w_start_cooking": (3.0, 15.0),
+    "w_press_L": (1.0, 8.0),
+    "dist_weight": (0.1, 1.5),
+    "inertia": (0.0, 1.0),
+    "counter_preference": (0.0, 1.0),
+}
+
 UTILITY_GREEDY = Heuristic(
     kind="utility_greedy",
     begin=begin_utility_greedy,
@@ -192,32 +206,9 @@ UTILITY_GREEDY = Heuristic(
     ),
     diverse=Sampling(
         ("default",),
-        {
-            "w_deliver": (5.0, 20.0),
-            "w_pickup_cooked": (3.0, 15.0),
-            "w_get_plate": (2.0, 10.0),
-            "w_add_ingredient": (3.0, 12.0),
-            "w_fetch_ingredient": (2.0, 10.0),
-            "w_stage_on_counter": (0.5, 5.0),
-            "w_press_L": (0.0, 8.0),
-            "dist_weight": (0.1, 1.5),
-            "inertia": (0.0, 1.0),
-            "counter_preference": (0.0, 1.0),
-        },
+        {name: span for name, span in _SPANS.items() if name != "w_start_cooking"} | {"w_press_L": (0.0, 8.0)},
     ),
-    spans={
-        "w_deliver": (5.0, 20.0),
-        "w_pickup_cooked": (3.0, 15.0),
-        "w_get_plate": (2.0, 10.0),
-        "w_add_ingredient": (3.0, 12.0),
-        "w_fetch_ingredient": (2.0, 10.0),
-        "w_stage_on_counter": (0.5, 5.0),
-        "w_start_cooking": (3.0, 15.0),
-        "w_press_L": (1.0, 8.0),
-        "dist_weight": (0.1, 1.5),
-        "inertia": (0.0, 1.0),
-        "counter_preference": (0.0, 1.0),
-    },
+    spans=_SPANS,
     unbounded=frozenset(
         {
             "w_deliver",

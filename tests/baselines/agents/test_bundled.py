@@ -16,6 +16,7 @@ from baselines.agents import Percept, bundled
 from baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from baselines.agents.egos import PlayMode, find_agent
 from baselines.commands.cli import cli
+from baselines.commands.options import find_ego
 from baselines.evaluate.evaluator import evaluate
 from baselines.evaluate.protocols import get_protocol
 from baselines.evaluate.results import Result
@@ -72,6 +73,20 @@ def test_it_plays_as_the_run_does(run, models, tmp_path):
     assert found[1].settings["details"]["trained_on"] == {"teammate": read_trained(run).trained_on}
 
 
+def test_a_bundled_model_plays_in_its_own_way(run, tmp_path, monkeypatch):
+    bundle_run(run, "ad-drawn", "teammate", tmp_path, sampled=True)
+    monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
+    by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", PlayMode())
+    assert by_default.name == "ad-drawn" and by_default.details and by_default.details["sampled"] is True
+    assert greedy.name == "ad-drawn (greedy)" and greedy.details and "sampled" not in greedy.details
+    assert find_agent("ad-drawn", PlayMode(greedy=False, forget=True)).name == "ad-drawn (forgets)"
+    assert find_ego("--agent", "ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
+    assert find_ego("--agent", "ad-drawn", greedy=True).name == "ad-drawn (greedy)"
+    assert find_ego("--agent", str(run), greedy=False).name == "AD+mlp (sampled)"
+    result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
+    assert result.output.endswith("(source noise), draws its actions\n")
+
+
 def test_marks_are_those_of_the_model_of_the_track():
     """The model of one track was trained with H2, that of the other was not."""
     entries = {
@@ -119,9 +134,10 @@ def test_large_models_are_refused(run, tmp_path, monkeypatch):
 
 
 def test_the_package_bundles_models_that_play_and_have_cards():
-    assert set(bundled_models(MODELS)) == {"ad-reference", "rl2-reference"}
+    assert set(bundled_models(MODELS)) == {"ad-reference", "ad-rising", "dpt-reference", "rl2-reference"}
     for model in bundled_models(MODELS).values():
         assert (MODELS / model.name / MODEL_CARD).is_file()
+        assert model.sampled == (model.name != "ad-reference")
         for track, folder in model.runs.items():
             size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
             assert size < 2.1e6, folder
@@ -129,6 +145,16 @@ def test_the_package_bundles_models_that_play_and_have_cards():
             for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
                 policy = find_agent(model.name).make(get_layout(layout))
                 assert policy.sees == "percept" and trained.channels == "canonical"
+
+
+def test_parameters_of_another_model_are_refused(run, tmp_path):
+    out = str(tmp_path / "out")
+    arguments = ["train", "ad", "--layout", "demo_wide", "--channels", "canonical", "--out", out, "--init", str(run)]
+    small = ["--steps", "1", "--batch-size", "2", "--context", "6", "--heads", "2", "--dropout", "0.1"]
+    result = CliRunner().invoke(cli, [*arguments, *small, "--layers", "1", "--width", "12", "--positions", "none"])
+    message = f"{run}: its parameters are of another model (width = 8, not 12): give its options, or another run"
+    assert isinstance(result.exception, OptionError) and str(result.exception) == message
+    assert not Path(out).exists()
 
 
 def test_models_command(models):

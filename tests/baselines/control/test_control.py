@@ -48,6 +48,7 @@ def test_sources_learn():
     assert shares[:, -4:].mean() > 0.8
 
 
+@pytest.mark.slow
 def test_a_part_of_the_control_trains_and_fails(tmp_path):
     """A model without its context cannot have twice the regret of the algorithm within four steps."""
     checks = control.ad_on_bandits(tmp_path, TINY, lambda step, loss: None)

@@ -19,9 +19,11 @@ from baselines.commands.cli import cli
 from baselines.evaluate.evaluator import evaluate, play_tasks
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
 from baselines.evaluate.results import Result, read_result, write_result
+from baselines.report import results as results_of_runs
 from baselines.report.headroom import write_headroom_cards
+from baselines.report.intervals import bootstrap_interval
 from baselines.report.results import OWN_TASKS, EvaluationRun, as_run, normalized_return, read_run
-from baselines.report.summary import bootstrap_interval, csv_text, markdown
+from baselines.report.summary import csv_text, markdown
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -305,6 +307,8 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     write_tasks(path("layout", "validation"), [])
     write_tasks(path("layout", "test"), [])
     monkeypatch.setattr("baselines.evaluate.protocols.manifest_path", path)
+    for name in ("_bundled_by_id", "_instances"):  # what is cached of other manifests would outlast this test
+        monkeypatch.setattr(results_of_runs, name, getattr(results_of_runs, name).__wrapped__)
     monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name)))
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
 

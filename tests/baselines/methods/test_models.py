@@ -144,6 +144,30 @@ def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positi
     assert of_query.all()
 
 
+def test_several_queries_are_posed_in_turn():
+    method, params = tiny("dpt")
+    batch = dpt_batch(rows=2)
+    other = batch._replace(query_obs=batch.query_obs[::-1], query_target=1 + batch.query_target)
+    both = batch._replace(
+        query_obs=np.stack([batch.query_obs, other.query_obs], axis=1),
+        query_target=np.stack([batch.query_target, other.query_target], axis=1),
+    )
+
+    def logits(asked):
+        return run(method, params, *batch_transitions(asked, plain_view)).logits
+
+    found, first, second = map(logits, (both, batch, other))
+    np.testing.assert_allclose(found[:, 0::2], first[:, 0::2], atol=1e-6)
+    np.testing.assert_allclose(found[:, 1::2], second[:, 1::2], atol=1e-6)
+    losses = [
+        float(optax.softmax_cross_entropy_with_integer_labels(answers, asked.query_target[:, None]).mean(axis=0)[j])
+        for answers, asked in ((first, batch), (second, other))
+        for j in range(7)
+    ]
+    expected = np.mean([losses[j if j % 2 == 0 else 7 + j] for j in range(7)])
+    assert method.loss(params, None, both, None)[1]["action_loss"] == pytest.approx(expected, rel=1e-5)
+
+
 def query_mask(context: int) -> np.ndarray:
     """Mask of [c_1 .. c_K, q_0 .. q_K]: a transition sees those up to itself, query j the first j and itself."""
     to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
@@ -290,6 +314,19 @@ def test_the_teammates_action_is_predicted_from_the_steps_before_it():
             tiny(name, layers=1, teammate_actions=True, teammate_loss=True)
     with pytest.raises(OptionError, match="expected teammate_actions as well; give --ta, or leave it out"):
         ModelOptions(teammate_loss=True)
+
+
+def test_the_teammates_family_is_predicted_at_every_step():
+    method, params = tiny("ad", layers=1, family_loss=True)
+    batch = ad_batch()._replace(families=np.array([1, 4], np.int32))
+    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1])
+    log, other = loss(batch), loss(batch._replace(families=np.array([1, 2], np.int32)))
+    total = log["action_loss"] + log["next_obs_loss"] + log["family_loss"]
+    np.testing.assert_allclose(log["loss"], total, rtol=1e-5)
+    assert log["family_loss"] != other["family_loss"] and log["action_loss"] == other["action_loss"]
+    for name in ("dpt", "amago_offline"):
+        with pytest.raises(OptionError, match=f"family_loss = True: {name} does not predict the teammate's family"):
+            tiny(name, layers=1, family_loss=True)
 
 
 def percepts(steps: int, episode: int, seed=0) -> Percept:

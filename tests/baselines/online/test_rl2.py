@@ -303,7 +303,7 @@ class TestPreparing:
         assert len(_played(everywhere, groups)) == 9  # those of a rearranged layout
 
     def test_shares_follow_what_was_measured(self):
-        """The ego matters on demo_simple beside diverse teammates, on coord_simple beside none."""
+        """The ego matters with diverse teammates on demo_simple, and with none of them on coord_simple."""
         tasks = read_tasks(manifest_path("teammate", "train", "diverse"))
         assert _shares(None, [task for task in tasks if task.layout.name in ("demo_simple", "coord_simple")]) == {
             "coord_simple": FLAT_SHARE,
@@ -362,6 +362,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
+            (["--queries", "7"], "queries = 7: rl2 learns by playing, not from histories; leave it out"),
             (["--every", "2"], "every = 2: rl2 learns by playing, not from histories; leave it out"),
             (["--channels", "own"], "channels = own: rl2 takes canonical channels; leave it out"),
         ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
 
 import numpy as np
@@ -11,29 +12,31 @@ from click.testing import CliRunner
 
 from baselines.commands.cli import cli
 from baselines.evaluate.protocols import bundled_tasks, get_protocol
-from baselines.evaluate.results import Result, write_result
-from baselines.report import comparison
+from baselines.evaluate.results import Result, read_result, write_result
+from baselines.report import stored_results
 from baselines.report.comparison import (
     FORGETS,
-    CellReturns,
-    StoredResults,
     ablation_table,
-    add_ablation,
-    add_results,
     cells_with_headroom,
     gains_table,
     layouts_above_paper,
     normalised_interval,
-    read_stored,
     render_page,
-    results_file,
     rising_cells,
     shown_agents,
     summary_table,
-    write_stored,
 )
 from baselines.report.overlap import OVERLAPS
 from baselines.report.results import OWN_TASKS, cell_of, published_cells, published_test_tasks
+from baselines.report.stored_results import (
+    CellReturns,
+    StoredResults,
+    add_ablation,
+    add_results,
+    read_stored,
+    results_file,
+    write_stored,
+)
 from baselines.training.ablations import ABLATIONS
 from baselines.training.run_folder import RUN_FORMAT
 from icrl4aht_data.benchmark.reference_returns import read_headroom
@@ -43,8 +46,13 @@ from tests.helpers.paths import ROOT
 
 
 def cell(mean: float, gain: float = 0.0) -> CellReturns:
-    values = np.full(15, mean)
+    values = np.full((5, 3), mean)
     return CellReturns(values, values - gain / 2, values + gain / 2, values - gain)
+
+
+def same(values: np.ndarray) -> CellReturns:
+    """Returns that are equal in all episodes."""
+    return CellReturns(values, values, values, values)
 
 
 def everywhere(share: float, gain: float = 0.0) -> dict:
@@ -63,21 +71,26 @@ class TestNumbers:
 
     @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
     def test_normalised_return(self, share):
-        mean, low, high, count = normalised_interval(everywhere(share), "seeded")
-        assert (mean, low, high, count) == (pytest.approx(share), pytest.approx(share), pytest.approx(share), 20)
+        found = normalised_interval(everywhere(share), "seeded", cells_with_headroom("seeded"))
+        assert found == (pytest.approx(share), pytest.approx(share), pytest.approx(share))
 
     def test_the_interval_shrinks_with_the_spread(self):
         wide = {
-            one: CellReturns(*[found.mean + 5 * np.linspace(-1, 1, 15)] * 4) for one, found in everywhere(0.5).items()
+            one: CellReturns(*[found.mean + 5 * np.linspace(-1, 1, 15).reshape(5, 3)] * 4)
+            for one, found in everywhere(0.5).items()
         }
-        mean, low, high, _ = normalised_interval(wide, "seeded")
+        chosen = cells_with_headroom("seeded")
+        mean, low, high = normalised_interval(wide, "seeded", chosen)
         assert low < mean - 0.01 and high > mean + 0.01 and mean == pytest.approx(0.5)
+        mixed = {one: same(np.sort(found.mean, axis=None).reshape(3, 5).T) for one, found in wide.items()}
+        narrow = normalised_interval(mixed, "seeded", chosen)
+        assert narrow.low > low and narrow.high < high  # the same values, but teammates that differ by less
 
     def test_rising_cells(self):
         cells = everywhere(0.5, gain=2.0)
         cells["demo_wide", "H4"] = cell(20.0, gain=-1.0)
         noisy = cell(20.0)
-        cells["demo_wide", "H3"] = noisy._replace(last=noisy.first + 20 * np.linspace(-1, 1.01, 15))
+        cells["demo_wide", "H3"] = noisy._replace(last=noisy.first + 20 * np.linspace(-1, 1.01, 15).reshape(5, 3))
         found = rising_cells(cells, "seeded")
         assert len(found) == 18 and ("demo_wide", "H4") not in found and ("demo_wide", "H3") not in found
 
@@ -109,9 +122,9 @@ class TestStoring:
     def test_from_results_to_a_file_and_back(self, results, tmp_path):
         stored = add_results(StoredResults({}, {}), results, "a ramp")
         found = stored.cells["ramp", "seeded"]["demo_wide", "H4"]
-        assert found.mean.tolist() == [49.5, 50.5] * 5
-        assert found.opening.tolist() == [0.0, 1.0] * 5
-        assert found.first.tolist() == [9.5, 10.5] * 5 and found.last.tolist() == [89.5, 90.5] * 5
+        assert found.mean.tolist() == [[49.5, 50.5]] * 5
+        assert found.opening.tolist() == [[0.0, 1.0]] * 5
+        assert found.first.tolist() == [[9.5, 10.5]] * 5 and found.last.tolist() == [[89.5, 90.5]] * 5
         assert found.overlaps == ("family",)
         write_stored(tmp_path / "results.json", stored)
         again = read_stored(tmp_path / "results.json")
@@ -136,14 +149,19 @@ class TestStoring:
         with pytest.raises(OptionError, match="30 episodes, expected at least 40; evaluate more"):
             add_results(StoredResults({}, {}), results, "short")
 
+    def test_published_tasks_that_are_missing(self, results):
+        next((results / "tasks").iterdir()).unlink()
+        with pytest.raises(OptionError, match="4 of the 5 published tasks of demo_wide H4; evaluate all of them"):
+            add_results(StoredResults({}, {}), results, "a part")
+
     def test_the_command(self, results, tmp_path, monkeypatch):
         target = tmp_path / "stored.json"
-        monkeypatch.setattr(comparison, "results_file", lambda: target)
+        monkeypatch.setattr(stored_results, "results_file", lambda: target)
         arguments = ["results", str(results), "--about", "a ramp", "--out", str(tmp_path / "page"), "--store"]
         result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         page = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
-        assert "* `ramp`: a ramp" in page and "| `ramp`† | 1.1" in page
+        assert "* `ramp`: a ramp" in page and "| `ramp`† |  |  |  | 1 of 1 |" in page
         assert (tmp_path / "page" / "results.png").stat().st_size > 10_000
         assert read_stored(target).about == {"ramp": "a ramp"}
 
@@ -160,7 +178,8 @@ def test_agents_that_forget_have_no_columns_of_their_own_beside_the_others():
     parts = render_page(stored, shown_agents(stored)).split("\n## ")
     named = {part.splitlines()[0] for part in parts if f"| `a{FORGETS}`" in part}
     assert named == {"Summary", "First and last episodes, protocol `seeded`"}
-    assert "| `a` | 0.50 (0.50 to 0.50)" in summary_table(stored, "seeded")
+    halves = " | ".join(["0.50 (0.50 to 0.50)"] * 3)
+    assert f"| `a` | {halves} | 0 of 20 |" in summary_table(stored, "seeded")
 
 
 def test_the_summary_compares_the_very_first_episode_with_the_last():
@@ -223,6 +242,18 @@ class TestAblations:
         assert "| +2.0 (+2.0 to +2.0) | +0.0 (+0.0 to +0.0) |" in longer
         assert "`K500`" not in ablation_table(again, "ablate contexts")
 
+    def test_entries_stay_while_the_first_is_the_same(self, folder):
+        """So that entries may be added in several experiments with equal settings."""
+        both = add_ablation(StoredResults({}, {}), self.WINDOWS, folder)
+        shutil.rmtree(folder / "ad-K500")
+        again = add_ablation(both, self.WINDOWS, folder)
+        assert set(again.cells) == set(both.cells)
+        path = next(folder.glob("ad-plain/*/results/tasks/*.json"))
+        result = read_result(path)
+        result.returns[0][0] += 1
+        write_result(path.parents[1], result)
+        assert set(add_ablation(both, self.WINDOWS, folder).cells) == {("plain", self.WINDOWS)}
+
     def test_settings_that_are_not_the_entrys(self, folder):
         path = folder / "ad-K500" / "demo_wide" / "run" / "config.json"
         config = json.loads(path.read_text())
@@ -232,7 +263,7 @@ class TestAblations:
             add_ablation(StoredResults({}, {}), self.WINDOWS, folder)
 
     def test_test_tasks_are_refused(self, tmp_path):
-        self.write(tmp_path, [task for task in published_test_tasks().values() if task.layout.name == "demo_wide"][:3])
+        self.write(tmp_path, [task for task in published_test_tasks().values() if task.layout.name == "demo_wide"])
         with pytest.raises(OptionError, match="plain has results of test tasks, expected diverse ones"):
             add_ablation(StoredResults({}, {}), self.WINDOWS, tmp_path)
 
@@ -245,7 +276,7 @@ class TestAblations:
 
 def test_agents_without_cells_with_headroom_have_a_row():
     stored = StoredResults({("a", "seeded"): {("coord_simple", "H1"): cell(1.0)}}, {})
-    assert "| `a` | nan" in summary_table(stored, "seeded")
+    assert "| `a` |  |  |  | 0 of 0 |  | none |  |" in summary_table(stored, "seeded")
 
 
 def test_the_summary_marks_agents_that_met_the_teammates():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 from html.parser import HTMLParser
 
 import numpy as np
@@ -14,15 +15,18 @@ from matplotlib.figure import Figure
 from baselines.commands.cli import cli
 from baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from baselines.report import episode_gifs as gifs
-from baselines.report.episode_gifs import EpisodeGif, restore_ego
+from baselines.report import rendering
+from baselines.report.episode_gifs import EpisodePair, ShownEpisode, restore_ego
 from baselines.report.model_card import model_card, write_model_cards
 from baselines.report.page import write_page, write_page_with_episodes
-from baselines.report.results import TEST_LAYOUTS, EvaluationRun, merge, read_published
-from baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, score_cells, sweep_points
+from baselines.report.results import TEST_LAYOUTS, EvaluationRun, merge, read_published, split_cells
+from baselines.report.summary import report_begins, write_report
+from baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, returns_table, score_cells, sweep_points
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import legend_below
+from icrl4aht_data.utils.installation import install_command
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
 GIF = b"GIF89a"  # the page does not look inside
@@ -46,7 +50,7 @@ class Outside(HTMLParser):
             self.images.append(values["src"].split(";")[0])
             assert values["alt"]
         self.found += [
-            value for name, value in values.items() if name in ("src", "href") and not value.startswith("data:")
+            value for name, value in values.items() if name in ("src", "href") and not value.startswith(("data:", "#"))
         ]
 
     def handle_endtag(self, tag):
@@ -63,27 +67,37 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
     path = tmp_path / "r" / "report.html"
     runs = [published("AD", TEST_LAYOUTS), published("random", TEST_LAYOUTS, 1.0), *sweeps]
     runs.append(published("AD+TA", ("cramped_down",)))
+    shown = [ShownEpisode(number, 20.0 * number, tmp_path / "a.gif") for number in (1, 2)]
     episodes = [
-        EpisodeGif("H1", "H1 & an ego", tmp_path / "a.gif"),
-        EpisodeGif("rl", "no picture: <its run> is gone", None),
+        EpisodePair("H1", "H1 & an ego", "task 1", tuple(shown)),
+        EpisodePair("rl", "an ego", "No picture: <its run> is gone"),
     ]
     write_page(runs, path, episodes, ["left out: <nothing>"])
     text = path.read_text()
     page = Outside(text)
     assert page.found == []
     assert page.open == []
-    assert page.images.count("data:image/gif") == 1
-    assert page.images.count("data:image/png") == 5, "two sweeps, curves of agents and of sweeps, gain"
-    for text_part in (
+    assert page.images == ["data:image/gif"] * 2
+    for section in ("summary", "curves", "sweeps", "episodes", "tables", "settings", "paper"):
+        assert f'<section id="{section}">' in text
+        assert f'href="#{section}"' in text
+    for part in (
         "Table 5. Offline Meta-RL Comparison",
         "left out: &lt;nothing&gt;",
         "H1 &amp; an ego",
-        "<h3>Learned teammates</h3>\n<figure class=episode><figcaption>no picture: &lt;its run&gt; is gone",
+        "Episode 2: return 40",
+        "No picture: &lt;its run&gt; is gone",
         "paper 12.5 ± 11.3",
+        "Context length",
+        "Model scale",
+        "the paper&#39;s AD",
+        "runs/AD+TA",
+        '<meta name="viewport"',
+        "prefers-color-scheme: dark",
     ):
-        assert text_part in text
-    for part in ("Context length", "Model scale", "Adaptation gain", "Headroom", "Settings and hashes", "runs/AD+TA"):
         assert part in text
+    assert text.count("<th ") == text.count('<th scope="')
+    assert text.count("<table") == text.count("<caption>")
     assert "url(" not in text
     assert "@import" not in text
     with pytest.raises(OptionError, match=r"report\.txt: expected a name that ends in \.html"):
@@ -178,6 +192,23 @@ def test_models_of_different_layouts_are_one_agent():
     assert len(merge([one, evaluated_run("AD", ("coord_simple",), variant=("K", 250))])) == 2
 
 
+def test_ways_of_playing_are_stated_and_not_merged():
+    one = evaluated_run("AD", ("demo_wide",), acting="cached")
+    drawn, forgets = (
+        _played_with(evaluated_run("AD", ("coord_simple",), acting="cached"), w) for w in ("sampled", "forget")
+    )
+    assert one.sources[0].conditions.endswith(", cached acting")
+    assert drawn.sources[0].conditions.endswith(", cached acting, sampled actions")
+    assert forgets.sources[0].conditions.endswith(", cached acting, memory cleared before each episode")
+    assert [len(merge([one, other])) for other in (drawn, forgets)] == [2, 2]
+
+
+def _played_with(run: EvaluationRun, way: str) -> EvaluationRun:
+    settings = run.sources[0].settings
+    changed = settings | {"details": settings["details"] | {way: True}}
+    return dataclasses.replace(run, sources=(run.sources[0]._replace(settings=changed),))
+
+
 def test_trained_models_have_cards(tmp_path):
     def trained(layout, tested_on, size, layers=4, channels=None, data=None, **options):
         histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [layout], "data_version": "1.0.0"}
@@ -230,10 +261,27 @@ def test_trained_models_have_cards(tmp_path):
     assert "* ? unknown training data" in card
 
 
+def test_cards_of_bundled_models():
+    model = {"layers": 2, "recurrent_layers": 2, "discounts": [0.9]}
+    histories = {"root": "x", "layouts": ["demo_wide"], "data_version": "1.0.0", "sizes": {"train": 3}}
+    histories |= {"mirror": True, "queries": 201, "every": 1, "weights": "uniform", "labels": None}
+    config = {"method": "dpt", "model": model, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+    run = evaluated_run("dpt-student", trained_on=())
+    trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
+    run = dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained),))
+    own = [make_task("teammate", "validation", "demo_wide", TEST_TASKS[0].teammate, number) for number in (1, 2)]
+    card = model_card(run, "dpt-reference", "python -m x", [evaluated_run("dpt-student", tasks=own)])
+    assert "\n# dpt-reference, trained on" in card and "dpt-student" not in card
+    assert "| method | dpt |" in card and "| made by | `python -m x` |" in card
+    assert "\n* layers: 2\n* seed: 3\n* channels: own\n* queries: 201\n* mirror: True\n" in card
+    assert "### Track teammate\n" in card and "### Track teammate, validation tasks\n" in card
+
+
 def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
     """Tasks with headroom, every agent once before any twice, reference egos last."""
     (tmp_path / "a.gif").write_bytes(GIF)
-    monkeypatch.setattr(gifs, "episode_gif", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    shown = (ShownEpisode(1, 7.0, tmp_path / "a.gif"),)
+    monkeypatch.setattr(gifs, "first_and_last", lambda *a, **k: shown)
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
 
     def with_tasks(agent: str, **options) -> EvaluationRun:
@@ -250,14 +298,14 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
 
     text = write_page_with_episodes(runs, tmp_path / "report.html", progress=progress).read_text()
     assert drawn == [(done, 6) for done in range(7)]
-    found = re.findall(r"<figcaption>([^<]+? with \S+ on \S+): team return 7 ", text)
+    found = re.findall(r"<h4>([^<]+? with \S+ on \S+)</h4>", text)
+    assert text.count("Episode 1: return 7<") == 6
     assert found == [
         f"{agent} with {mate} on demo_wide" for mate in ("H1/t0", "H4/t0") for agent in ("AD", "DPT", "AD, K = 250")
     ]
     assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
-    assert (
-        "An episode per family" not in write_page_with_episodes(runs, tmp_path / "r.html", episodes=False).read_text()
-    )
+    without = write_page_with_episodes(runs, tmp_path / "r.html", episodes=False).read_text()
+    assert 'id="episodes"' not in without
 
 
 def test_egos_that_cannot_be_made_again_say_why(tmp_path):
@@ -268,25 +316,70 @@ def test_egos_that_cannot_be_made_again_say_why(tmp_path):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 
-def test_the_report_command_with_tasks_of_ones_own(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("compiled_quickly")
+def test_commands_with_tasks_of_ones_own(tmp_path, monkeypatch):
+    """Evaluates, prints the summary, and draws the first and the last episode, which earn what the results say."""
     theta = next(task for task in TEST_TASKS if task.teammate_family == "H4").teammate
     write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
-    monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 2, 5))
+    monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 3, 5))
     played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
-    assert CliRunner().invoke(cli, played, catch_exceptions=False).exit_code == 0
-    monkeypatch.setattr(gifs, "episode_gif", lambda path, *a, **k: path.write_bytes(GIF) + 1)
+    result = CliRunner().invoke(cli, played, catch_exceptions=False)
+    summary = (
+        "stay (seeded), 1 training cell: return 0.0; gain +0.0: 0.0 in the first, 0.0 in the last episode. No score:"
+    )
+    assert summary in result.output
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
+    assert f"* {summary}" in result.stdout
     started, ended = (line for line in result.stderr.splitlines() if line.startswith("episodes of the report: "))
     assert started.endswith("started, 1")
     assert ": 1 of 1 after" in ended
     text = (tmp_path / "report.html").read_text()
-    assert Outside(text).images.count("data:image/gif") == 1
+    assert Outside(text).images.count("data:image/gif") == 2
     (task,) = read_tasks(tmp_path / "own.jsonl")
-    assert (
-        f"stay with H4/t77 (training) on demo_wide: team return 7 in episode 1 of 2. Task {task.task_id}, pro" in text
-    )
+    assert "<h4>stay with H4/t77 (training) on demo_wide</h4>" in text
+    assert f"Task {task.task_id}, protocol seeded, seed 0." in text
+    assert re.findall(r"<figcaption>(Episode [^<]+)<", text) == ["Episode 1: return 0", "Episode 3: return 0"]
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
         CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)
+
+
+def test_what_a_page_lacks_is_named(tmp_path, monkeypatch):
+    picture = EpisodePair("H1", "an ego", "", (ShownEpisode(1, 0.0, tmp_path / "gone.gif"),))
+    with pytest.raises(OptionError, match=r"gone\.gif: missing, expected a picture .* draw it again, or .*--no-gifs"):
+        write_page([evaluated_run("AD")], tmp_path / "report.html", [picture])
+    with pytest.raises(
+        OptionError, match=r"page\.html, line \d+: 'title' is undefined, expected .*; restore the templ"
+    ):
+        rendering.render("page.html", {})
+    with pytest.raises(OptionError, match=r"templates/none\.html: missing; restore it: `.*baselines"):
+        rendering.render("none.html", {})
+    rendering.check_can_render()
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    rendering._environment.cache_clear()
+    with pytest.raises(
+        OptionError, match=rf"a page of results needs jinja2: {re.escape(install_command('baselines'))}"
+    ):
+        rendering.check_can_render()
+    assert not list(tmp_path.iterdir())
+
+
+def test_tables_have_only_what_was_run():
+    run = evaluated_run("AD", ("demo_wide", "cramped_down"), families=("H1", "H4"))
+    columns, rows = returns_table([run], list(run.cells), "seeded")
+    assert columns == ["demo_wide", "cramped_down", AVERAGE]
+    assert [row.label for row in rows] == ["H1", "H4", AVERAGE]
+    assert [score.played for score in rows[-1].scores] == [(2, 2), (2, 2), (4, 4)]
+    assert {score.gain for row in rows for score in row.scores} == {2.0}
+
+
+def test_pictures_have_at_most_twelve_panels(tmp_path):
+    run = evaluated_run("AD", ("coord_ring", "test_wide", "demo_simple", "demo_wide"))
+    names = [path.name for path in write_report([run], tmp_path / "report")]
+    assert names == ["report.md", "report.csv", "curves.png", "curves-2.png"]
+    assert names == list(report_begins([run]))
+    parts = split_cells(run.cells, 12)
+    assert [len(part) for part in parts] == [12, 4]
+    assert [cell for part in parts for cell in part] == list(run.cells)

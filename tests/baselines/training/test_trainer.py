@@ -188,6 +188,19 @@ class TestStopping:
         for name in ("metrics.jsonl", "config.json"):
             assert (tmp_path / name).read_bytes() == (through[0] / name).read_bytes()
 
+    def test_a_run_that_is_older_than_an_option_has_its_default(self, through, tmp_path, monkeypatch):
+        def before(options: Any) -> dict[str, Any]:
+            return {name: value for name, value in dataclasses.asdict(options).items() if name != "weight_decay"}
+
+        with monkeypatch.context() as older, pytest.raises(TrainingStopped):
+            older.setattr("baselines.training.trainer.asdict", before)
+            trained(tmp_path, done=terminate_at_4)
+        assert "weight_decay" not in json.loads((tmp_path / "config.json").read_text())["train"]
+        method, other = get_method("amago_offline")(MODEL, FLAT), dataclasses.replace(OPTIONS, weight_decay=0.5)
+        with pytest.raises(OptionError, match=r"\(train.weight_decay: the run has 0.0, expected 0.5\)"):
+            train(method, TrainingData(Rows(), {}), other, tmp_path, {})
+        assert_same(trained(tmp_path), through[1])
+
     def test_a_second_sigint_does_not_wait(self):
         before = signal.getsignal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt), StopSignals() as stop:
@@ -355,6 +368,12 @@ class TestHeldOut:
             job("ad", 3, 41)
         with pytest.raises(OptionError, match="every = 2: dpt learns from contexts of one part"):
             job("dpt", 2)
+
+    def test_queries_are_for_dpt(self):
+        with pytest.raises(OptionError, match="queries = 3: ad learns from windows without queries"):
+            prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), queries=3))
+        found = prepare("dpt", MODEL, OPTIONS, HistoryOptions(("asymm_both",), queries=3))
+        assert found.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
     def test_one_teammate_cannot_be_held_out(self):
         dataset = load_icrl4aht(layout="coord_simple")

@@ -224,6 +224,10 @@ def test_wrong_use_is_an_error():
     task = asdict(published_task("demo_wide", "H4/t0"))
     with pytest.raises(TaskFormatError, match="expected the fields"):
         TaskEnv({name: value for name, value in task.items() if name != "seed"})
+    for wrong_task in ("foo", published_task("demo_wide", "H4/t0")):
+        with pytest.raises(TaskFormatError, match=r"task = .*: expected the fields of a task by name"):
+            gymnasium.make("icrl4aht/task-v0", task=wrong_task)
+    assert repr(fresh) == f"TaskEnv(demo_wide, task {task['task_id']})"
     wrong_options: list[dict[str, Any]] = [{"noise": "loud"}, {"channels": "all"}, {"render_mode": "human"}]
     for wrong in wrong_options:
         with pytest.raises(UnknownNameError, match=f"unknown {next(iter(wrong))}"):

@@ -54,6 +54,7 @@ def test_pictures():
 
 def test_wrong_use_is_an_error():
     env = BothAgentsEnv("demo_wide", max_steps=1)
+    assert repr(env) == "BothAgentsEnv(demo_wide, episodes of 1 step)"
     with pytest.raises(OptionError, match="call reset"):
         env.step({"ego": 0, "teammate": 0})
     with pytest.raises(OptionError, match="call reset"):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from functools import cache
 from typing import Any, cast
 
 import jax
@@ -19,24 +17,20 @@ from generation.profiles import load_profile
 from generation.profiles.work import Work
 from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.tasks import make_task
-from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.progress import LineProgress
 from tests.helpers.tiny import LEARNED, NOISE, artefact
 
-
-@pytest.fixture(scope="module")
-def measure_size() -> Callable[[Kind], float]:
-    """`plan.bytes_per_transition`, which writes a release of each kind once."""
-    return cache(plan.bytes_per_transition)
+SIZES = {"lite": 1.85, "full": 9.25}
+"""Bytes of a transition."""
 
 
 @pytest.fixture
-def measured(monkeypatch, measure_size) -> None:
+def measured(monkeypatch) -> None:
     """A machine that trains egos at 100,000 steps/s, populations at 50,000, and compiles in 36 s."""
     speeds = {1024: 100_000.0, 64: 100_000.0, 256: 50_000.0}
     monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.LearnerSpeed(speeds[config.environments], 36.0))
-    monkeypatch.setattr(plan, "bytes_per_transition", measure_size)
+    monkeypatch.setattr(plan, "bytes_per_transition", lambda kind, source: SIZES[kind])
 
 
 def test_the_papers_numbers(measured):
@@ -53,7 +47,15 @@ def test_the_papers_numbers(measured):
     assert found.teammate_hours_on_one == pytest.approx(teammate_hours, abs=0.01)
     assert found.hours_on_one == pytest.approx(640 * hours + teammate_hours, abs=0.01)
     assert found.hours_on_devices == pytest.approx(40 * hours + teammate_hours, abs=0.01)
-    assert 1 < found.lite_bytes / found.kept_transitions < 3 < found.full_bytes / found.kept_transitions < 12
+    assert found.lite_bytes == pytest.approx(1.85 * found.kept_transitions)
+    assert found.full_bytes == pytest.approx(9.25 * found.kept_transitions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("source", "lite", "full"), [("ppo", 1.85, 9.23), ("noise", 2.55, 12.01)])
+def test_sizes_are_measured_on_the_bundled_release(source, lite, full):
+    assert plan.bytes_per_transition("lite", source) == pytest.approx(lite, rel=0.05)
+    assert plan.bytes_per_transition("full", source) == pytest.approx(full, rel=0.05)
 
 
 def test_disk_of_artefacts(built):

@@ -32,7 +32,6 @@ from generation.policy import stacked
 from generation.populations import cross_play
 from generation.populations.select import (
     TeammateSelection,
-    layout_number,
     make_tasks,
     select_teammates,
     write_manifests,
@@ -48,7 +47,7 @@ from generation.populations.train import (
 from generation.profiles import load_profile
 from generation.releases.check import compare_rebuilds
 from generation.teammates import learned
-from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.benchmark.facts import ALGORITHMS, layout_number
 from icrl4aht_data.benchmark.tasks import read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE

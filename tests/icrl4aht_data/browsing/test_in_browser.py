@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,12 +19,12 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import draw_frame
+from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
 from tests.helpers.random_releases import random_release
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
+pytestmark = NEEDS_CHROMIUM
 
 OpenPage = Callable[..., Any]
 
@@ -210,10 +209,10 @@ def test_a_page_with_some_episodes_says_which(open_page, dataset, tmp_path):
     page = open_page("#history=0", tmp_path / "small.html")
     shown = page.evaluate("index.histories[0].shown.map((episode) => episode + 1)")
     assert len(shown) < 6
-    told = (
+    expected_text = (
         f"{len(shown)} of 6 episodes can be watched, those with a mark below the curve: {', '.join(map(str, shown))}."
     )
-    assert page.inner_text("#shown-text") == told
+    assert page.inner_text("#shown-text") == expected_text
     page.close()
 
 

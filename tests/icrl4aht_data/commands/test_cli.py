@@ -11,9 +11,10 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from icrl4aht_data import load_icrl4aht, plotting
+from icrl4aht_data import get_layout, load_icrl4aht, plotting
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run as run_command
+from icrl4aht_data.commands.summaries import id_ranges
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import FORMAT_VERSION
@@ -93,7 +94,10 @@ def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
     listed = on_terminal("list", root)
     for task_id in tasks:
         assert sum(line.rstrip().endswith(f" {task_id[-8:]}") for line in listed) == 1
-    assert listed[-1].split() == [str(len(tasks)), "tasks", "40", "4,800"]
+    assert [line.split() for line in listed[-2:]] == [[str(len(tasks)), "tasks", "40"], ["4,800"]]
+    assert any("H4 utility_greedy" in line for line in listed), "names as the filters take them"
+    ids = load_icrl4aht(root, task_id=next(iter(tasks))).ids.tolist()
+    assert listed[3].split()[-1] == id_ranges(ids) == f"{ids[0]}-{ids[-1]}"
     assert all(" 5.0" in line for line in listed if line.startswith(("coord_simple", "demo_wide")) and "noise" in line)
     shown = on_terminal("show", root)
     paragraph = " ".join(" ".join(shown[: shown.index("")]).split())
@@ -103,8 +107,24 @@ def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
     assert total[1:5] == [str(len(tasks)), "40", "240", "4,800"]
     one = on_terminal("show", root, "--history", "3")
     assert "history id" in " ".join(one) and "seed" in " ".join(one)
+    rows = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in map(str.strip, one) if line}
+    assert rows["map"] == get_layout(rows["layout"]).rows[0]
+    assert rows["return start"] == f"{load_icrl4aht(root)[3].entry.return_start:.4g}"
+    assert not any(sign in line for line in one for sign in '{}"[')
     for line in (*listed, *shown, *one):
         assert len(line) <= 80, line
+
+
+def test_ranges_of_ids():
+    assert [id_ranges(ids) for ids in ([7], [5, 4, 3], [1, 2, 5, 9, 8])] == ["7", "3-5", "1-2,5,8-9"]
+
+
+def test_list_gives_ids_of_histories_that_show_takes(lite):
+    root = str(lite[0])
+    for task in json.loads(CliRunner().invoke(cli, ["list", "--json", root]).output):
+        assert len(task["history_ids"]) == task["histories"]
+        arguments = ["show", "--json", "--history", str(task["history_ids"][-1]), root]
+        assert json.loads(CliRunner().invoke(cli, arguments).output)["task_id"] == task["task_id"]
 
 
 def test_piped_output_is_tab_separated_and_complete(lite):

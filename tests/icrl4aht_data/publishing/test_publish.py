@@ -28,9 +28,10 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
+from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.templates import card_file, fill_template
-from icrl4aht_data.writing.card_texts import card_texts
+from icrl4aht_data.writing.card_texts import card_texts, episode_texts
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.dataset_card import dataset_card, evaluated_on, size_category
@@ -99,6 +100,9 @@ def test_it_contains_the_source_and_is_valid(release, published):
         "CITATION.cff",
         "LICENSE",
         "croissant.json",
+        "episodes/coord_simple/train-00000-of-00001.parquet",
+        "episodes/cramped_down/test-00000-of-00001.parquet",
+        "episodes/cramped_up/train-00000-of-00001.parquet",
         "figures/headroom.png",
         "figures/layouts.png",
         "figures/learning_curves.png",
@@ -180,7 +184,7 @@ def test_datasets_loads_every_configuration(published, tmp_path):
     import datasets
 
     names = datasets.get_dataset_config_names(str(published))
-    assert names == ["default", "coord_simple", "cramped_up", "cramped_down"]
+    assert names == ["default", "coord_simple", "cramped_up", "cramped_down", "episodes"]
     found = {}
     for name in (None, "cramped_down"):
         loaded: Any = datasets.load_dataset(str(published), name, cache_dir=str(tmp_path))
@@ -192,6 +196,21 @@ def test_datasets_loads_every_configuration(published, tmp_path):
     }
 
 
+@pytest.mark.parametrize(
+    "name", ["episodes/coord_simple/train-00000-of-00001.parquet", "index/cramped_up/train.parquet"]
+)
+def test_damaged_and_missing_parquet_files_are_found(published, tmp_path, name):
+    root = shutil.copytree(published, tmp_path / "release")
+    content = bytearray((root / name).read_bytes())
+    content[len(content) // 2] ^= 1
+    (root / name).write_bytes(content)
+    (found,) = verify_release(root).findings
+    assert found.file == name and found.problem.startswith("sha256: expected ")
+    (root / name).unlink()
+    (found,) = verify_release(root, level="quick").findings
+    assert (found.file, found.problem) == (name, "listed in the manifest, but missing")
+
+
 def test_croissant_is_valid_and_its_records_are_the_index(published):
     import mlcroissant
 
@@ -199,6 +218,7 @@ def test_croissant_is_valid_and_its_records_are_the_index(published):
         warnings.simplefilter("ignore")  # raised by libraries that mlcroissant is built on
         described = mlcroissant.Dataset(str(published / "croissant.json"))
         records = list(described.records("histories"))
+        episodes = list(described.records("episodes"))
     assert (described.metadata.ctx.issues.errors, described.metadata.ctx.issues.warnings) == (set(), set())
     lines = [json.loads(line) for line in (published / "meta/histories.jsonl").read_text().splitlines()]
     assert len(records) == len(lines)
@@ -210,6 +230,9 @@ def test_croissant_is_valid_and_its_records_are_the_index(published):
         line = lines[plain["history_id"]]
         assert plain.pop("h5_row") in (line.pop("h5_row"), None) or np.isnan(found["h5_row"])
         assert plain == line
+    history = load_icrl4aht(published).history(int(episodes[0]["episodes/history_id"]))
+    np.testing.assert_array_equal(episodes[0]["episodes/actions"], history.episodes[0].actions)
+    assert len(episodes) == 12 * 6
     content = json.loads((published / "croissant.json").read_text())
     assert content["datePublished"] == "2026-01-02"
     assert content["conformsTo"].endswith("/1.1")
@@ -240,8 +263,10 @@ def test_the_card_describes_the_release(published):
 
 
 def test_the_cards_snippet_runs(published, monkeypatch):
-    (snippet,) = re.findall(r"```python\n(.*?)```", (published / "README.md").read_text(), re.DOTALL)
-    exec(snippet.replace("path/of/this/folder", str(published)), {})
+    snippets = re.findall(r"```python\n(.*?)```", (published / "README.md").read_text(), re.DOTALL)
+    assert len(snippets) == 2
+    for snippet in snippets:
+        exec(snippet.replace("path/of/this/folder", str(published)), {})
 
 
 def test_the_card_of_an_unpublished_release_has_no_figures(release):
@@ -290,6 +315,8 @@ def test_layouts_of_the_evaluation():
 def test_every_field_is_described():
     assert list(card_texts("arrays")) == list(FIELDS)
     assert list(card_texts("index")) == list(ENTRY_HINTS)
+    assert list(episode_texts()) == list(EPISODE_COLUMNS)
+    assert card_texts("episodes").keys() <= EPISODE_COLUMNS.keys()
 
 
 def test_learned_teammates_have_cards(with_learned, tmp_path):
@@ -326,6 +353,9 @@ def test_releases_of_observations_are_built(release, tmp_path):
     assert verify_release(out).ok
     card = (out / "README.md").read_text()
     assert "without state records nothing can be replayed" in card
+    assert "there is no configuration `episodes`" in card
+    assert not (out / "episodes").exists()
+    assert [config["config_name"] for config in front_matter(card)["configs"]][-1] == "cramped_down"
     assert "`state`" not in card
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,3 +169,15 @@ def test_missing_labels_are_an_error(tmp_path):
         history.expert_actions  # noqa: B018
     with pytest.raises(LabelsMissingError, match="6 of 6 histories"):
         load_icrl4aht(tmp_path / "r").dpt(batch_size=1, context=5)
+
+
+def test_ids_that_are_no_integers(lite):
+    dataset = load_icrl4aht(lite[0])
+    wrong_ids: list[Any] = ["x", 1.5, None]
+    for call in (dataset.history, dataset.recover_environment, dataset.environment_parameters, dataset.reset_options):
+        for wrong in wrong_ids:
+            with pytest.raises(OptionError, match=f"history_id = {wrong!r}: expected an integer"):
+                call(wrong)
+        for absent in (-1, 12):
+            with pytest.raises(UnknownNameError, match=f"no history with id {absent}; ids: 0..11"):
+                call(absent)

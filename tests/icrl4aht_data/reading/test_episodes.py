@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import Dataset, load_icrl4aht
-from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.errors import (
+    EmptySelectionError,
+    NotStoredError,
+    OptionError,
+    PositionError,
+    PositionTypeError,
+    UnknownNameError,
+)
 from icrl4aht_data.writing.convert import to_release
 
 STEPS = 20
@@ -51,8 +58,17 @@ class TestEpisodes:
         np.testing.assert_array_equal(episodes[::-2].returns(), history.returns()[::-2])
         assert [one.total_return for one in episodes] == history.returns().tolist()
         for wrong in (6, -7):
+            with pytest.raises(PositionError, match=r"position .* of Episodes\(6 of .*expected a number from -6 to 5"):
+                episodes[wrong]
             with pytest.raises(IndexError):
                 episodes[wrong]
+        with pytest.raises(TypeError, match=r"position 'a' of Episodes.*: expected an integer or a slice") as raised:
+            episodes["a"]  # type: ignore[call-overload]
+        assert isinstance(raised.value, PositionTypeError)
+        with pytest.raises(PositionError, match="expected no position, as it is empty"):
+            episodes[:0][0]
+        with pytest.raises(PositionError, match="position 99 of the selection's histories: expected a number from -12"):
+            dataset[99]
 
     def test_fields_by_name(self, dataset):
         history = dataset[0]
@@ -124,11 +140,9 @@ class TestSplit:
             one.split()
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")
-        for share in (0, 1, 1.5):
-            with pytest.raises(OptionError, match=rf"share = {share}: expected a number between 0 and 1"):
+        for share in (0, 1, 1.5, True, "a"):
+            with pytest.raises(OptionError, match=rf"validation = {share!r}: expected the share .* between 0 and 1"):
                 two_sourced.split(share)
-        with pytest.raises(OptionError, match="validation = True: expected the share"):
-            two_sourced.split(True)
         with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
             two_sourced.split(by="task")  # type: ignore[arg-type]
 
@@ -187,6 +201,9 @@ class TestOrder:
             two_sourced.sort("return")
         with pytest.raises(OptionError, match="expected the name of an index field"):
             two_sourced.sort()
+        for wrong in (["layout", "return_end"], lambda entry: entry.T):
+            with pytest.raises(OptionError, match=r'one after the other, such as ds.sort\("layout", "return_end"\)'):
+                two_sourced.sort(wrong)  # type: ignore[arg-type]
 
 
 class TestPredicates:
@@ -208,3 +225,11 @@ class TestPredicates:
             two_sourced.filter(lambda entry: False)
         with pytest.raises(OptionError, match=r"filter: expected a function .*found 'demo_wide'"):
             two_sourced.filter("demo_wide")
+
+    def test_wrong_functions(self, two_sourced):
+        with pytest.raises(UnknownNameError, match=r"unknown field of an index entry 'layuot'; .* mean 'layout'"):
+            two_sourced.filter(lambda entry: entry.layuot == "demo_wide")
+        with pytest.raises(OptionError, match=r"expected the function to return True or False, .* found '\w+' for his"):
+            two_sourced.filter(lambda entry: entry.layout)
+        with pytest.raises(AttributeError, match="nothing"):
+            two_sourced.filter(lambda entry: entry.layout.nothing)

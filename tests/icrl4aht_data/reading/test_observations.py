@@ -310,7 +310,8 @@ class TestBatches:
         low, high = {(1, 3): (20, 60), (-1, None): (100, 130)}.get(options.get("episodes"), (0, 130))
         met = set()
         for i in range(6):
-            batch, (_, query, _, steps) = sampler[i], sampler._draw(i)
+            batch, (_, queries, _, steps) = sampler[i], sampler._draw(i)
+            query = queries[:, 0]
             met |= set(steps.ravel().tolist())
             assert (np.diff(steps) == np.where((steps[:, :-1] + 2) % KEPT, 1, 2)).all() or order == "random"
             np.testing.assert_array_equal(batch.query_obs, arrays["obs"][query])
@@ -324,7 +325,7 @@ class TestBatches:
 
     def test_queries_are_at_every_step(self, converted_release):
         sampler = load_icrl4aht(converted_release).select([0]).dpt(batch_size=2000, context=1)
-        assert set(sampler._draw(0)[1].tolist()) == set(range(120))
+        assert set(sampler._draw(0)[1].ravel().tolist()) == set(range(120))
 
     def test_impossible_contexts(self, converted_release, tmp_path):
         dataset = load_icrl4aht(

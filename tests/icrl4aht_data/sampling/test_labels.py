@@ -29,9 +29,9 @@ def sampler(two_sources):
 
 def expected_targets(written, sampler, i: int) -> np.ndarray:
     """The labels at the query steps of batch i."""
-    query, step, *_ = sampler._draw(i)
+    query, steps, *_ = sampler._draw(i)
     ids = sampler.dataset.ids[query].tolist()
-    return np.array([written[k][f"{sampler.labels}_actions"][t] for k, t in zip(ids, step, strict=True)])
+    return np.array([written[k][f"{sampler.labels}_actions"][t] for k, (t,) in zip(ids, steps, strict=True)])
 
 
 @pytest.mark.parametrize("order", ["contiguous", "random"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.errors import MixedSplitsWarning, OptionError, UnknownNameError
 from tests.helpers.batches import digest
 from tests.helpers.paths import ROOT
@@ -64,6 +65,17 @@ def test_short_histories_are_padded_at_the_end(lite):
     assert np.argwhere(batch.is_first).tolist() == [[0, 0], [1, 0], [2, 0]]
 
 
+def test_families_of_teammates():
+    dataset = load_icrl4aht(layout=["demo_wide", "cramped_up"], obs="state", channels="canonical", split="train")
+    sampler = dataset.ad(batch_size=64, length=20, families=True)
+    batch, ids = sampler[0], sampler.windows(0)[0]
+    assert batch.families is not None and batch.families.dtype == np.int32
+    found = [all_families()[number] for number in batch.families]
+    assert found == [dataset.index.entry(int(history)).teammate_family for history in ids] and len(set(found)) > 1
+    plain = dataset.ad(batch_size=64, length=20)
+    assert plain[0].families is None and sampler.options() == {**plain.options(), "families": True}
+
+
 @pytest.mark.parametrize("order", ["contiguous", "random"])
 def test_dpt_batches_are_transitions_of_the_same_task(lite_or_full, order):
     root, written = lite_or_full
@@ -91,6 +103,28 @@ def test_dpt_batches_are_transitions_of_the_same_task(lite_or_full, order):
                 assert any(_is_slice(context["obs"], written[k]["state"]) for k in known)
             ends += (context["next_obs"][:-1] != context["obs"][1:]).any()
     assert ends, "no context has an episode's last step"
+
+
+@pytest.mark.parametrize("order", ["contiguous", "random"])
+def test_several_queries_of_a_context_are_steps_of_one_history(lite_or_full, order):
+    root, written = lite_or_full
+    dataset = load_icrl4aht(root, layout="demo_wide", obs="state")
+    steps = {k: set(_rows(written[k], "state", "expert_actions")) for k in dataset.ids.tolist()}
+    one, three = (dataset.dpt(batch_size=32, context=25, order=order, seed=1, queries=n) for n in (1, 3))
+    batch, alone = three[2], one[2]
+    assert batch.query_target.shape == (32, 3)
+    assert batch.query_obs.shape == (32, 3, *alone.query_obs.shape[1:])
+    for row in range(32):
+        asked = set(_rows({"state": batch.query_obs[row], "action": batch.query_target[row]}))
+        assert any(asked <= known for known in steps.values()), f"row {row}"
+    assert (batch.query_obs[:, 0] != batch.query_obs[:, 1]).any(), "the queries are the same"
+    np.testing.assert_array_equal(batch.query_obs[:, 0], alone.query_obs)
+    np.testing.assert_array_equal(batch.context_obs, alone.context_obs)
+    rendered = load_icrl4aht(root, layout="demo_wide").dpt(batch_size=32, context=25, order=order, seed=1, queries=3)[2]
+    plain = load_icrl4aht(root, layout="demo_wide").dpt(batch_size=32, context=25, order=order, seed=1)[2]
+    np.testing.assert_array_equal(rendered.query_obs[:, 0], plain.query_obs)
+    with pytest.raises(OptionError, match=r"queries = 0"):
+        dataset.dpt(batch_size=1, context=2, queries=0)
 
 
 def _rows(arrays, *names):

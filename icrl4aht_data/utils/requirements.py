@@ -9,10 +9,10 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from icrl4aht_data.utils.installation import PACKAGE
+from icrl4aht_data.utils.installation import PACKAGE, install_command
 
-_UNNAMED_EXTRAS = ("dev", "browser", "peers", "all", "cuda12", "cuda13")
-"""Extras that are never suggested: four for work on this project; the others install JAX for GPUs."""
+_UNNAMED_EXTRAS = ("dev", "docs", "browser", "peers", "all", "cuda12", "cuda13")
+"""Extras that are never suggested: five for work on this project; the others install JAX for GPUs."""
 
 _DISTRIBUTIONS = {"PIL": "pillow"}
 """Module -> distribution, where the names differ."""
@@ -55,8 +55,29 @@ def installed_version(name: str) -> str | None:
         return None
 
 
+def missing_library(module: str, extra: str | None) -> str | None:
+    """Return a message that says how to install a missing module of another library; None if no extra has it.
+
+    Args:
+        module: name of the module.
+        extra: the extra to suggest if it has the module.
+    """
+    try:
+        extras = extras_with(module)
+    except PackageNotFoundError:
+        return None
+    if not extras:
+        return None
+    chosen = extra if extra in extras else extras[0]
+    return f"this needs {module}, which is not installed: {install_command(chosen)}"
+
+
 def extras_with(module: str) -> list[str]:
-    """Return the extras that install a module, the smallest first; none for a required one."""
+    """Return the extras that install a module, the smallest first; none for a required one.
+
+    Raises:
+        PackageNotFoundError: if this package itself is not installed.
+    """
     top = module.partition(".")[0]
     name = canonicalize_name(_DISTRIBUTIONS.get(top, top))
     needed = _requirements_by_extra()

@@ -1,0 +1,148 @@
+"""The index and the episodes as Arrow tables, behind Parquet files and Hugging Face datasets.
+
+A row of the episodes has all that a release stores of one. Every list has a fixed length: `steps` elements, one for
+each step of an episode, and `width` bytes for a state record. Shorter records are padded with zeros, so that the
+episodes of all layouts fit into one table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.format.schema import ACTION_FIELDS, ENTRY_HINTS, FIELDS
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.reading.history import History
+from icrl4aht_data.reading.selection import Selection
+from icrl4aht_data.utils.installation import install_command
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+class EpisodeColumn(NamedTuple):
+    """One column of the table of episodes.
+
+    Args:
+        dtype: name of the elements' NumPy dtype, or "str".
+        shape: lengths of the nested lists of a row, from the outermost; () for a single value.
+    """
+
+    dtype: str
+    shape: tuple[Literal["steps", "width"], ...] = ()
+
+
+EPISODE_COLUMNS: dict[str, EpisodeColumn] = {
+    "history_id": EpisodeColumn("int64"),
+    "episode": EpisodeColumn("int32"),
+    "task_id": EpisodeColumn("str"),
+    "track": EpisodeColumn("str"),
+    "split": EpisodeColumn("str"),
+    "layout": EpisodeColumn("str"),
+    "teammate_family": EpisodeColumn("str"),
+    "teammate_kind": EpisodeColumn("str"),
+    "source": EpisodeColumn("str"),
+    "learner": EpisodeColumn("int32"),
+    "return": EpisodeColumn("float32"),
+    "rewards": EpisodeColumn("float32", ("steps",)),
+    **{name: EpisodeColumn("int8", ("steps",)) for name in ACTION_FIELDS},
+    "state": EpisodeColumn("uint8", ("steps", "width")),
+    "episode_end_state": EpisodeColumn("uint8", ("width",)),
+}
+"""The columns of the table of episodes, in order; those of `Entry` have the values of the episode's history."""
+
+
+def index_schema() -> pa.Schema:
+    """Return the Arrow schema of the index, a column for each field of `Entry`.
+
+    Raises:
+        OptionError: if pyarrow is not installed.
+    """
+    arrow = import_pyarrow()
+    types = {float: arrow.float64(), int: arrow.int64(), int | None: arrow.int64(), str: arrow.string()}
+    types |= {bool: arrow.bool_(), float | None: arrow.float64(), tuple[int, int, int]: arrow.list_(arrow.int64(), 3)}
+    return arrow.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()])
+
+
+def record_width(layouts: Sequence[Layout]) -> int:
+    """Return the number of bytes of the longest state record of some layouts."""
+    return max(map(record_size, layouts))
+
+
+def episode_schema(dataset: Selection) -> pa.Schema:
+    """Return the Arrow schema of the episodes of a release with state records, or of a part of one.
+
+    Raises:
+        OptionError: if pyarrow is not installed.
+    """
+    arrow = import_pyarrow()
+    lengths = {"steps": dataset.info.environment.kept_steps, "width": record_width(dataset.layouts)}
+    fields = []
+    for name, column in EPISODE_COLUMNS.items():
+        kind = arrow.string() if column.dtype == "str" else arrow.from_numpy_dtype(np.dtype(column.dtype))
+        for axis in reversed(column.shape):
+            kind = arrow.list_(kind, lengths[axis])
+        fields.append(arrow.field(name, kind))
+    return arrow.schema(fields)
+
+
+def episode_table(history: History, schema: pa.Schema) -> pa.Table:
+    """Return a history's episodes, one row for each, in order.
+
+    Args:
+        history: a history of a release with state records; all of its arrays are read.
+        schema: the `episode_schema` of a selection with the history.
+
+    Raises:
+        IndexFormatError: if the history does not consist of episodes of the schema's number of steps.
+    """
+    arrow, entry = import_pyarrow(), history.entry
+    count, steps = entry.episodes, schema.field("state").type.list_size
+    width = schema.field("episode_end_state").type.list_size
+    if count * steps != entry.T:
+        raise IndexFormatError(
+            f"{entry.shard}: history {entry.history_id}: expected {count} episodes of {steps} steps, found {entry.T} "
+            f"steps; check the release with `icrl4aht-data verify`"
+        )
+    values: dict[str, Any] = {"episode": np.arange(count), "rewards": history.read("rewards")}
+    values["return"] = values["rewards"].reshape(count, steps).sum(axis=1)
+    for name in ACTION_FIELDS:
+        values[name] = history.read(name) if entry.has(FIELDS[name]) else None
+    for name in ("state", "episode_end_state"):
+        records = history.read(name)
+        values[name] = np.pad(records, ((0, 0), (0, width - records.shape[-1])))
+    columns = []
+    for field in schema:
+        if field.name in ENTRY_HINTS:
+            column = arrow.repeat(arrow.scalar(getattr(entry, field.name), field.type), count)
+        elif values[field.name] is None:
+            column = arrow.nulls(count, field.type)
+        else:
+            column = _nested_lists(values[field.name], field.type)
+        columns.append(column)
+    return arrow.Table.from_arrays(columns, schema=schema)
+
+
+def _nested_lists(array: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """Return an array's elements, in order, as an Arrow array of fixed-size lists or of single values."""
+    arrow = import_pyarrow()
+    if not arrow.types.is_fixed_size_list(kind):
+        return arrow.array(array.reshape(-1).astype(kind.to_pandas_dtype(), copy=False))
+    return arrow.FixedSizeListArray.from_arrays(_nested_lists(array, kind.value_type), kind.list_size)
+
+
+def import_pyarrow() -> Any:
+    """Return the module pyarrow.
+
+    Raises:
+        OptionError: if it is not installed; names the command that installs it.
+    """
+    try:
+        import pyarrow
+    except ImportError as error:
+        raise OptionError(f"Parquet needs pyarrow: {install_command('hf')}") from error
+    return pyarrow

@@ -1,0 +1,101 @@
+"""Objects that other installed packages register by entry points: known by name, imported when they are needed.
+
+A package names its objects in its pyproject.toml, here a layout:
+
+    [project.entry-points."icrl4aht.layouts"]
+    open_kitchen = "my_package.layouts:OPEN_KITCHEN"
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from icrl4aht_data.errors import PluginError
+from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.installation import PACKAGE
+
+METHOD_GROUP = "icrl4aht.methods"
+"""Group of methods, which `baselines` knows and `doctor` lists."""
+
+
+class Plugins:
+    """The objects that installed packages register in one group of entry points.
+
+    The metadata of the packages is read on first use, once per process, and takes milliseconds.
+
+    Args:
+        group: name of the group, such as "icrl4aht.layouts".
+        own: names that this package has itself, which others may not register.
+    """
+
+    def __init__(self, group: str, own: Iterable[str]) -> None:
+        self.group, self._own = group, frozenset(own)
+        self._loaded: dict[str, Any] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The registered names, sorted; nothing is imported.
+
+        Raises:
+            PluginError: for a name that this package has itself, or that two packages register, or that has characters
+                other than letters, digits, "_" and "-"; names the packages.
+        """
+        return tuple(self._found)
+
+    @property
+    def packages(self) -> dict[str, str]:
+        """Registered name -> name and version of its package.
+
+        Raises:
+            PluginError: see `names`.
+        """
+        return {name: _package(point) for name, point in self._found.items()}
+
+    def load(self, name: str, kind: Any) -> Any:
+        """Return a registered object, which is imported on the first call.
+
+        Args:
+            name: one of `names`.
+            kind: the class that it has to have, or `Callable`.
+
+        Raises:
+            PluginError: if it cannot be imported, or is of another kind; names the package and the entry point.
+        """
+        if name not in self._loaded:
+            try:
+                loaded = self._found[name].load()
+            except Exception as error:  # anything may go wrong in another package
+                reason = f"cannot be imported ({type(error).__name__}: {error}): correct the package, or uninstall it"
+                raise self.error(name, reason) from error
+            if not isinstance(loaded, kind):
+                raise self.error(name, f"expected a {kind.__name__}, found {type(loaded).__name__}: {loaded!r:.100}")
+            self._loaded[name] = loaded
+        return self._loaded[name]
+
+    def error(self, name: str, problem: str) -> PluginError:
+        """Return the error for a problem with a registered object; it names the package and the entry point."""
+        point = self._found[name]
+        return PluginError(f"package {_package(point)}, entry point {self.group}: {name} = {point.value}: {problem}")
+
+    @cached_property
+    def _found(self) -> dict[str, EntryPoint]:
+        found: dict[str, EntryPoint] = {}
+        for point in sorted(entry_points(group=self.group), key=lambda one: one.name):
+            where = f"package {_package(point)}, entry point {self.group}: {point.name}"
+            if not re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", point.name):
+                raise PluginError(f"{where}: expected a name of letters, digits, _ and -: rename it")
+            if point.name in self._own:
+                raise PluginError(f"{where}: {PACKAGE} has this name itself: rename it, or uninstall the package")
+            if point.name in found:
+                other = _package(found[point.name])
+                raise PluginError(f"{where}: package {other} registers this name, too: uninstall one of them")
+            found[point.name] = point
+        return found
+
+
+def _package(point: EntryPoint) -> str:
+    """Return name and version of the package that registers an entry point."""
+    return f"{point.dist.name} {point.dist.version}" if point.dist else "of unknown name"

@@ -1,0 +1,56 @@
+"""The page of a report in headless Chromium, as wide as a phone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from baselines.report.episode_gifs import EpisodePair, ShownEpisode
+from baselines.report.page import write_page
+from baselines.report.results import TEST_LAYOUTS
+from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
+from tests.helpers.evaluated import evaluated_run
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
+
+pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
+
+PHONE = 390
+TOO_WIDE = """(width) => [...document.body.querySelectorAll("*")]
+    .filter((element) => !element.closest(".wide, svg") && element.getBoundingClientRect().right > width + 0.5)
+    .map((element) => element.outerHTML.slice(0, 100))"""
+"""Elements that end beyond the page; tables in `.wide` have a scroll bar of their own."""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory) -> Path:
+    """A page with every section: all layouts, long names, sweeps and pictures of episodes."""
+    folder = tmp_path_factory.mktemp("report")
+    Image.fromarray(np.zeros((400, 900), np.uint8)).save(folder / "a.gif")
+    runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
+    runs += [evaluated_run("AD", variant=("K", k), protocol="published") for k in (250, 500)]
+    runs.append(evaluated_run("AD+TA+next_obs-" + "x" * 60, protocol="published"))
+    shown = tuple(ShownEpisode(number, 20.0 * number, folder / "a.gif") for number in (1, 100))
+    pairs = [EpisodePair("H1", "AD with H1/t0 on demo_wide", "Task 0123456789abcdef, protocol published", shown)]
+    write_page(runs, folder / "report.html", pairs, ["left out: runs/" + "y" * 60])
+    return folder / "report.html"
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_phone_does_not_scroll_sideways(file, dark):
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        scheme = "dark" if dark else "light"
+        page = browser.new_page(viewport={"width": PHONE, "height": 844}, color_scheme=scheme)
+        page.set_default_timeout(60_000)
+        page.goto(file.as_uri())
+        page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
+        assert page.locator("section").count() == 7
+        assert page.evaluate(TOO_WIDE, PHONE) == []
+        assert page.evaluate("document.documentElement.scrollWidth") == PHONE
+        shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
+        assert (max(shade) < 60) is dark
+        browser.close()

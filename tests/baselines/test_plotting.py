@@ -1,0 +1,59 @@
+"""Figures of training and evaluation: few panels, one legend, and one axis of returns."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+
+from baselines import plotting
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
+from tests.helpers.evaluated import evaluated_run
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that were drawn, instead of files."""
+    figures = []
+    monkeypatch.setattr(plotting, "save_figure", lambda figure, path: figures.append(figure))
+    return figures
+
+
+def shown(figure):
+    return [axes for axes in figure.axes if axes.axison]
+
+
+@pytest.mark.parametrize(("layouts", "panels"), [(LAYOUT_NAMES[:6], 7), ((*LAYOUT_NAMES, "a", "b", "c"), 2)])
+def test_a_log_of_many_returns_has_few_panels(layouts, panels, tmp_path, drawn):
+    names = [f"return {layout} {kind}" for layout, kind in product(layouts, ("territory", "recipe_aware_button"))]
+    lines = [{"step": step, "part": "train", "loss": 1.0} | dict.fromkeys(names, 40.0) for step in range(60)]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    plotting.plot_training_log(tmp_path / "metrics.jsonl", tmp_path / "curves.png", "rl2")
+    (figure,) = drawn
+    assert len(shown(figure)) == panels
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["train", "territory", "recipe aware button"]
+    limits = {axes.get_ylim() for axes in shown(figure) if axes.get_title().startswith("return")}
+    assert len(limits) == 1
+    assert next(iter(limits))[0] < 0 < 40 < next(iter(limits))[1]
+
+
+def test_curves_of_cells_share_their_axes(tmp_path, drawn):
+    runs = [evaluated_run("AD", value=38.0), evaluated_run("DPT")]
+    cells = list(runs[0].cells)
+    plotting.plot_return_curves([(run.name, run.cells) for run in runs], cells, tmp_path / "curves.png")
+    (figure,) = drawn
+    assert [axes.get_title() for axes in shown(figure)] == [
+        "demo_wide, H1",
+        "demo_wide, H2",
+        "demo_wide, H3",
+        "demo_wide, H4",
+    ]
+    assert len(figure.legends) == 1
+    assert len({axes.get_ylim() for axes in shown(figure)}) == 1
+    low, high = shown(figure)[0].get_ylim()
+    assert low < 0 and high > 40
+    smooth = [line.get_ydata() for line in shown(figure)[0].lines if line.get_linewidth() > 1]
+    assert all(np.ptp(line) == 2.0 for line in smooth), "a curve jumps once, by 2, and is constant before and after"

@@ -1,0 +1,90 @@
+"""Execution of the notebooks of docs/notebooks. `python -m tests.helpers.notebooks [NAME...]` stores their outputs."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from tests.helpers.paths import ROOT
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+def execute(path: Path, folder: Path, timeout: float = 1800) -> Any:
+    """Return a notebook with the outputs of a new kernel that runs in a folder.
+
+    Raises:
+        CellExecutionError: if a cell fails.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.read(path, as_version=4)
+    variables = {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    with mock.patch.dict(os.environ, variables):
+        client = NotebookClient(
+            notebook, timeout=timeout, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+        )
+        return client.execute()
+
+
+def outputs(notebook: Any) -> Iterator[Any]:
+    """Yield the outputs of a notebook's cells."""
+    for cell in notebook.cells:
+        yield from cell.get("outputs", ())
+
+
+def store(path: Path) -> None:
+    """Execute a notebook and write it with its outputs, without times and with general names of folders."""
+    import nbformat
+
+    with tempfile.TemporaryDirectory() as folder:
+        notebook = execute(path, Path(folder))
+    text = nbformat.writes(_without_times(notebook))
+    for found, shown in ((str(ROOT), "/home/you/icrl4aht-data"), (folder, "/home/you/work")):
+        text = text.replace(found, shown)
+    path.write_text(text + "\n", encoding="utf-8")
+    print(f"wrote {path}: {path.stat().st_size // 1000} kB")
+
+
+def _without_times(notebook: Any) -> Any:
+    for number, cell in enumerate(notebook.cells):
+        cell["id"] = f"cell-{number:02}"
+        cell["metadata"] = {}
+        if cell.cell_type == "code":
+            cell["outputs"] = _joined(cell["outputs"])
+    notebook["metadata"] = {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+    }
+    return notebook
+
+
+def _joined(found: list[Any]) -> list[Any]:
+    """Return outputs of which each piece of text is joined to the one before it."""
+    joined: list[Any] = []
+    for output in found:
+        output.get("metadata", {}).clear()
+        if output["output_type"] == "stream":
+            output["text"] = re.sub(r"\x1b\[[0-9;]*m", "", output["text"])  # colours
+        if (
+            joined
+            and output["output_type"] == joined[-1]["output_type"] == "stream"
+            and output["name"] == joined[-1]["name"]
+        ):
+            joined[-1]["text"] += output["text"]
+        else:
+            joined.append(output)
+    return joined
+
+
+if __name__ == "__main__":
+    for each in NOTEBOOKS:
+        if each.stem in sys.argv[1:] or len(sys.argv) == 1:
+            store(each)

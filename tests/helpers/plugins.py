@@ -1,0 +1,49 @@
+"""Packages that register objects by entry points: written as if installed, and put on Python's path."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from unittest import mock
+
+from baselines.methods.registry import METHOD_PLUGINS
+from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
+
+
+def write_package(
+    folder: Path, name: str, modules: Mapping[str, str], entry_points: Mapping[str, Mapping[str, str]]
+) -> Path:
+    """Write a package of version 0.1 and its metadata, as an installer would; returns the folder.
+
+    Args:
+        folder: a folder for Python's path.
+        name: of the distribution; that of the package has underscores instead of hyphens.
+        modules: name -> source.
+        entry_points: group -> name -> "module:object".
+    """
+    package, metadata = (folder / (name.replace("-", "_") + suffix) for suffix in ("", "-0.1.dist-info"))
+    for path in (package, metadata):
+        path.mkdir(parents=True)
+    for module, source in {"__init__": "", **modules}.items():
+        (package / f"{module}.py").write_text(source, encoding="utf-8")
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n", encoding="utf-8")
+    sections = [
+        "\n".join([f"[{group}]", *(f"{key} = {value}" for key, value in points.items())])
+        for group, points in entry_points.items()
+    ]
+    (metadata / "entry_points.txt").write_text("\n\n".join(sections) + "\n", encoding="utf-8")
+    return folder
+
+
+@contextmanager
+def installed(*folders: Path) -> Iterator[None]:
+    """Put folders of `write_package` on this process's path; what is registered is read again, also at the end."""
+    with ExitStack() as stack:
+        stack.enter_context(mock.patch.object(sys, "path", [*map(str, folders), *sys.path]))
+        for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, METHOD_PLUGINS):
+            stack.enter_context(mock.patch.dict(vars(plugins), _loaded={}))
+            vars(plugins).pop("_found", None)
+        yield

@@ -1,0 +1,190 @@
+"""Objects that other packages register by entry points: known by name, imported on demand, with clear errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from baselines.methods.options import ModelOptions
+from baselines.methods.registry import all_methods, get_method, overcooked_world
+from generation.teammates.registry import heuristic_teammate
+from icrl4aht_data import get_layout, load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, layout_number, track_of
+from icrl4aht_data.benchmark.tasks import make_task, manifest_path, read_tasks
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError, PluginError, UnknownNameError
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
+from icrl4aht_data.overcooked.layouts import LAYOUTS
+from icrl4aht_data.utils import plugins
+from tests.helpers.paths import ROOT
+from tests.helpers.plugins import installed, write_package
+from tests.helpers.random_releases import random_release
+
+MAPS = """
+from icrl4aht_data import Layout
+
+ROWS = ("WW0WWWW", "W     W", "W APA B", "W     W", "WW1RXWW")
+PLAIN = Layout("plain_room", "plain_room", ROWS)
+OTHER_ALIAS = Layout("other_alias", "other_alias_v1", ROWS)
+SPICY = Layout("spicy_room", "spicy_room", ("WW0WWWW", "W     W", "W APA B", "W     W", "WW7RXWW"), ((0, 0, 7),))
+NAME = "plain_room"
+"""
+LAYOUT_POINTS = {
+    "plain_room": "rooms.maps:PLAIN",
+    "spicy_room": "rooms.maps:SPICY",
+    "broken_room": "rooms.missing:ROOM",
+    "text_room": "rooms.maps:NAME",
+    "other_alias": "rooms.maps:OTHER_ALIAS",
+}
+METHODS = """
+import dataclasses
+
+from baselines.methods.ad import ad
+from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY as GREEDY
+
+
+def renamed(options, world):
+    return dataclasses.replace(ad(options, world), name="my_ad")
+
+
+def nothing(options, world):
+    return None
+
+
+number = 3
+"""
+POINTS = {
+    "icrl4aht.layouts": LAYOUT_POINTS,
+    "icrl4aht.teammates": {"greedy_too": "rooms.methods:GREEDY"},
+    "icrl4aht.methods": {
+        "my_ad": "rooms.methods:renamed",
+        "their_ad": "rooms.methods:renamed",
+        "no_ad": "rooms.methods:nothing",
+        "three": "rooms.methods:number",
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    """A package with layouts, a teammate and methods, some of which cannot be used."""
+    return write_package(tmp_path_factory.mktemp("site"), "rooms", {"maps": MAPS, "methods": METHODS}, POINTS)
+
+
+def clashing(folder: Path, name: str, layout: str) -> Path:
+    return write_package(folder, name, {}, {"icrl4aht.layouts": {layout: "json:loads"}})
+
+
+def test_a_registered_layout_is_known(rooms, tmp_path):
+    with installed(rooms):
+        layout = get_layout("plain_room")
+        assert layout is get_layout("plain_room")
+        task = make_task("layout", "test", "plain_room", heuristic_teammate("utility_greedy", "default", 0), 0)
+        assert task.layout is layout
+        random_release(tmp_path / "release", layouts=("plain_room",))
+        assert verify_release(tmp_path / "release", level="deep").ok
+        assert load_icrl4aht(tmp_path / "release", layout="plain_room").ad(batch_size=2, length=10)[0].obs.shape[0] == 2
+    with pytest.raises(UnknownNameError, match="unknown layout 'plain_room'"):
+        get_layout("plain_room")
+
+
+def test_processes_know_it(rooms, tmp_path):
+    """Also the command line's choices."""
+    with installed(rooms):
+        random_release(tmp_path / "release", layouts=("plain_room", "demo_wide"))
+    code = "from icrl4aht_data.commands.cli import main; main()"
+    path = os.pathsep.join(map(str, (rooms, ROOT)))
+    command = ["list", str(tmp_path / "release"), "--json", "--layout", "plain_room"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "plain_room" in json.dumps(json.loads(done.stdout))
+
+
+def test_the_published_benchmark_stays_as_it_is(rooms):
+    before = CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES]
+    with installed(rooms):
+        assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES])
+        assert [layout_number(name) for name in LAYOUT_NAMES] == list(range(10))
+        assert 10 <= layout_number("plain_room") == layout_number("plain_room") < 20_000
+
+
+def test_published_names_do_not_read_metadata(monkeypatch):
+    monkeypatch.setattr(plugins, "entry_points", None)
+    with installed():
+        assert get_layout("grounded_coord_ring") is LAYOUTS["coord_ring"]
+        assert len(read_tasks(manifest_path("teammate", "test"))) == 120
+        assert len(load_icrl4aht(split="train", layout="demo_wide")) > 0
+        with pytest.raises(TypeError):
+            get_layout("other")
+
+
+def test_more_ingredients_than_canonical_channels(rooms):
+    with installed(rooms), pytest.raises(OptionError, match=r"layout spicy_room: channels .*ingredient_7"):
+        canonical_positions(get_layout("spicy_room"))
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("broken_room", r"= rooms.missing:ROOM: cannot be imported \(ModuleNotFoundError: No module named"),
+        ("text_room", "= rooms.maps:NAME: expected a Layout, found str: 'plain_room'"),
+        ("other_alias", "expected name and alias 'other_alias', found name 'other_alias' and alias 'other_alias_v1'"),
+    ],
+)
+def test_an_unusable_layout_is_an_error_when_used(rooms, name, problem):
+    with installed(rooms):
+        with pytest.raises(UnknownNameError, match=name):
+            get_layout("missing")
+        with pytest.raises(PluginError, match=f"^package rooms 0.1, entry point icrl4aht.layouts: {name} .*{problem}"):
+            get_layout(name)
+
+
+def test_unusable_teammates_and_methods(rooms):
+    world = overcooked_world([LAYOUTS["demo_wide"]])
+    with installed(rooms):
+        with pytest.raises(PluginError, match=r"rooms 0.1.*expected kind 'greedy_too', found 'utility_greedy'"):
+            heuristic_teammate("greedy_too", "default", 0)
+        assert get_method("my_ad")(ModelOptions(), world).label == get_method("ad")(ModelOptions(), world).label
+        for name, problem in {
+            "three": "expected a Callable, found int: 3",
+            "their_ad": "expected name 'their_ad' and data 'ad' or 'dpt', found name 'my_ad'",
+            "no_ad": "expected a function that returns a Method, it returned None",
+        }.items():
+            with pytest.raises(PluginError, match=f"rooms 0.1, entry point icrl4aht.methods: {name} .*{problem}"):
+                get_method(name)(ModelOptions(), world)
+        with pytest.raises(UnknownNameError, match="no_ad"):
+            get_method("mine")
+        assert all_methods()[:2] == ["ad", "dpt"]
+
+
+@pytest.mark.parametrize(
+    ("registered", "message"),
+    [
+        ({"one": "demo_wide"}, "package one 0.1, .*: demo_wide: icrl4aht-data has this name itself: rename it"),
+        ({"one": "demo_cook_wide"}, "demo_cook_wide: icrl4aht-data has this name itself"),
+        ({"one": "room", "two": "room"}, "room: package (one|two) 0.1 registers this name, too"),
+        ({"one": "a room"}, "a room: expected a name of letters"),
+    ],
+)
+def test_clashes(registered, message, tmp_path):
+    for name, layout in registered.items():
+        clashing(tmp_path, name, layout)
+    with installed(tmp_path):
+        with pytest.raises(PluginError, match=message):
+            get_layout("elsewhere")
+        assert get_layout("demo_wide") is LAYOUTS["demo_wide"]
+        result = CliRunner().invoke(cli, ["doctor", "--json"])
+        found = json.loads(result.output)["problems"]
+        assert any("icrl4aht.layouts" in each["problem"] for each in found)

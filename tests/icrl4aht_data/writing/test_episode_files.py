@@ -1,0 +1,208 @@
+"""Episodes as Parquet files: typed rows that `datasets` streams, from which observations are rendered."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import IndexFormatError, NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.format.schema import ACTION_FIELDS
+from icrl4aht_data.interop import hf_episodes, render_observations
+from icrl4aht_data.publishing.build import build_release
+from icrl4aht_data.publishing.upload import upload_release
+from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, episode_schema
+from icrl4aht_data.reading.episodes import Episode
+from icrl4aht_data.reading.history import History
+from icrl4aht_data.remote.download import chosen_files
+from icrl4aht_data.remote.remote_release import open_root
+from icrl4aht_data.writing import parquet
+from icrl4aht_data.writing.parquet import write_episodes
+from tests.helpers.paths import ROOT
+from tests.servers.common import hub_server, uploads
+
+STEPS, WIDTH = 20, 24
+"""Steps of an episode of `two_sources`, and bytes of the longest state record of its layouts."""
+
+
+@pytest.fixture(scope="module")
+def built(two_sources, tmp_path_factory) -> Path:
+    """`two_sources`, built for publication. Read only."""
+    return build_release(two_sources[0], tmp_path_factory.mktemp("built") / "release")
+
+
+@pytest.fixture
+def dataset(built) -> Dataset:
+    return load_icrl4aht(built)
+
+
+def stream(built: Path, split: str) -> Any:
+    return datasets.load_dataset(str(built), "episodes", split=split, streaming=True)
+
+
+def in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]:
+    """The episodes of a split with their histories; files are in the order of their layouts' names."""
+    layouts = sorted(layout.name for layout in dataset.filter(split=split).layouts)
+    parts = [dataset.filter(split=split, layout=name) for name in layouts]
+    return [(history, episode) for part in parts for history in part for episode in history.episodes]
+
+
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_streamed_rows_are_the_episodes(built, dataset, split):
+    for row, (history, episode) in zip(stream(built, split), in_file_order(dataset, split), strict=True):
+        entry = history.entry
+        names = ("history_id", "task_id", "track", "split", "layout", "teammate_family", "teammate_kind", "source")
+        assert [row[name] for name in (*names, "learner")] == [getattr(entry, name) for name in (*names, "learner")]
+        assert (row["episode"], row["return"]) == (episode.number, episode.total_return)
+        for name in ("rewards", *ACTION_FIELDS):
+            np.testing.assert_array_equal(row[name], episode[name])
+        for name in ("state", "episode_end_state"):
+            records = np.array(row[name], np.uint8)
+            size = episode[name].shape[-1]
+            np.testing.assert_array_equal(records[..., :size], episode[name])
+            assert records.shape[-1] == WIDTH and not records[..., size:].any()
+
+
+def test_every_feature_has_a_type_and_a_length(built):
+    features = stream(built, "train").features
+    assert list(features) == list(EPISODE_COLUMNS)
+    for name, (dtype, shape) in EPISODE_COLUMNS.items():
+        found, lengths = features[name], []
+        while isinstance(found, datasets.List):
+            lengths.append(found.length)
+            found = found.feature
+        assert found == datasets.Value("string" if dtype == "str" else dtype), name
+        assert lengths == [{"steps": STEPS, "width": WIDTH}[axis] for axis in shape], name
+    index: Any = datasets.load_dataset(str(built), split="train", streaming=True)
+    assert index.features["obs_shape"] == datasets.List(datasets.Value("int64"), length=3)
+
+
+class TestObservations:
+    @pytest.mark.parametrize("obs", ["float32", "uint8"])
+    @pytest.mark.parametrize("channels", ["own", "canonical"])
+    def test_they_are_those_of_the_histories(self, built, dataset, channels, obs):
+        """One row at a time, as lists, and in batches of arrays."""
+        opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
+        for layout in opened.layouts:
+            expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]
+            rows = stream(built, "train").filter(lambda row, name=layout.name: row["layout"] == name)
+            for seen, row in zip(expected, rows, strict=True):
+                found = render_observations(row, channels=channels, obs=obs)
+                assert found.dtype == obs
+                np.testing.assert_array_equal(found, seen)
+            (batch,) = rows.with_format("numpy").batch(1000)
+            np.testing.assert_array_equal(render_observations(batch, channels=channels, obs=obs), expected)
+
+    def test_a_map_renders_while_streaming(self, built, dataset):
+        rows = stream(built, "train")
+        rendered = rows.map(
+            lambda rows: {"obs": render_observations(rows, channels="canonical", obs="uint8")}, batched=True
+        )
+        expected = in_file_order(dataset.with_options(channels="canonical"), "train")
+        for row, (_, episode) in zip(rendered, expected, strict=True):
+            np.testing.assert_array_equal(row["obs"], episode.obs)
+
+    def test_rows_of_several_layouts(self, built, dataset):
+        by_layout = {row["layout"]: row for row in stream(built, "train")}
+        assert len(by_layout) > 1
+        rows = list(by_layout.values())
+        assert render_observations(rows, channels="canonical").shape == (len(rows), STEPS, 5, 5, 46)
+        with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* take channels="canonical"'):
+            render_observations(rows)
+
+    def test_rows_that_are_none(self, built):
+        row = next(iter(stream(built, "train")))
+        wrong: list[tuple[type[Exception], str, Any, dict[str, Any]]] = [
+            (UnknownNameError, "unknown channels", row, {"channels": "all"}),
+            (UnknownNameError, "unknown obs", row, {"obs": "state"}),
+            (UnknownNameError, "nowhere", row | {"layout": "nowhere"}, {}),
+            (OptionError, "found none: give at least one row", [], {}),
+            (
+                OptionError,
+                r"state: expected .* S at least \d+, found \(1, 20, 3\)",
+                row | {"state": np.zeros((20, 3))},
+                {},
+            ),
+            (NotStoredError, "without a column 'state'.* take hf_windows", {"layout": "demo_wide"}, {}),
+        ]
+        for kind, message, rows, options in wrong:
+            with pytest.raises(kind, match=message):
+                render_observations(rows, **options)
+
+
+def test_hugging_face_datasets_in_memory_have_the_same_rows(built, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
+    rows: Any = hf_episodes(dataset.filter(split="validation"))
+    streamed = stream(built, "validation")
+    assert rows.features == streamed.features
+    by_episode = {(row["history_id"], row["episode"]): row for row in streamed}
+    assert len(by_episode) == len(rows)
+    assert all(row == by_episode[row["history_id"], row["episode"]] for row in list(rows))
+
+
+def test_histories_are_divided_among_files_and_row_groups(dataset, tmp_path, monkeypatch):
+    """Neither needs more than a row group in memory; both are whole histories, in order."""
+    monkeypatch.setattr(parquet, "ROW_GROUP", 12)
+    part, done = dataset.filter(split="train", layout="demo_wide"), []
+    write_episodes(part, tmp_path, file_episodes=30, advance=lambda *numbers: done.append(numbers))
+    paths = sorted(tmp_path.glob("demo_wide/*"))
+    count = len(paths)
+    assert count > 1
+    assert [path.name for path in paths] == [f"train-{n:05}-of-{count:05}.parquet" for n in range(count)]
+    found = [pq.read_table(path, columns=["history_id", "episode"]).to_pydict() for path in paths]
+    expected = [(int(i), e) for i, n in zip(part.ids, part.column("episodes"), strict=True) for e in range(n)]
+    assert [pair for table in found for pair in zip(*table.values(), strict=True)] == expected
+    metadata = [pq.ParquetFile(path).metadata for path in paths]
+    sizes = [group.row_group(n).num_rows for group in metadata for n in range(group.num_row_groups)]
+    assert max(sizes) < 12 + max(part.column("episodes")) and len(sizes) > count
+    assert done[-1] == (len(part), len(part))
+
+
+def test_a_history_of_other_episodes_is_named(dataset, monkeypatch):
+    history = dataset[0]
+    schema = episode_schema(dataset)
+    monkeypatch.setattr(history, "entry", history.entry.__class__(**history.entry.to_json() | {"T": 3}))
+    with pytest.raises(IndexFormatError, match=r"history 0: expected \d+ episodes of 20 steps, found 3 steps; check"):
+        parquet.episode_table(history, schema)
+
+
+def test_a_part_of_a_release_is_downloaded_without_them(built):
+    origin = open_root(built)
+    names = {name for name in chosen_files(origin) if name.startswith("episodes/")}
+    assert names
+    assert chosen_files(origin) - chosen_files(origin, layout=list(load_icrl4aht(built).info.layouts)) == names
+
+
+HUB = """
+import datasets
+from icrl4aht_data.interop import render_observations
+
+rows = datasets.load_dataset("us/histories", "episodes", split="train", streaming=True)
+print([int(render_observations(row, channels="canonical").sum()) for row in rows])
+"""
+
+
+@pytest.mark.slow
+@uploads
+def test_streaming_from_a_hub(built, dataset, tmp_path):
+    """In a process of its own, because `datasets` reads the Hub's address when it is imported."""
+    with hub_server(tmp_path / "hub") as hub:
+        upload_release(built, "hf://datasets/us/histories")
+        hub.log.clear()
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", HUB], env=hub.environment, cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        files = {request.path.rpartition("/")[2] for request in hub.log if request.path.startswith("/cdn/")}
+    assert files == {"train-00000-of-00001.parquet"}
+    expected = in_file_order(dataset.with_options(channels="canonical"), "train")
+    assert json.loads(done.stdout) == [int(episode.obs.sum()) for _, episode in expected]

@@ -1,0 +1,51 @@
+"""The notebooks of docs/notebooks run without errors, and are stored with outputs that are small."""
+
+from __future__ import annotations
+
+import re
+
+import nbformat
+import pytest
+
+from tests.helpers.notebooks import NOTEBOOKS, execute, outputs
+from tests.helpers.paths import ROOT
+
+EVERY_NOTEBOOK = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+MOST_BYTES = 300_000
+
+
+def test_there_are_notebooks():
+    assert {path.stem for path in NOTEBOOKS} == {"explore", "train_ad_pytorch", "own_agent_and_teammate"}
+
+
+@EVERY_NOTEBOOK
+def test_stored_outputs(path):
+    """Every code cell was executed in order, without errors; pictures are there; nothing names this machine."""
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    found = list(outputs(notebook))
+    assert not [output for output in found if output.output_type == "error"]
+    assert re.search("image/(png|gif)", str([output.get("data") for output in found]))
+    text = path.read_text(encoding="utf-8")
+    assert len(text) < MOST_BYTES
+    assert str(ROOT) not in text
+
+
+@EVERY_NOTEBOOK
+def test_links(path):
+    text = "\n".join(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "markdown")
+    for target in re.findall(r"\]\((.*?)\)", text):
+        assert (path.parent / target).is_file(), target
+
+
+@pytest.mark.slow
+@EVERY_NOTEBOOK
+def test_notebook_runs(path, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
+    executed, stored = execute(path, tmp_path), nbformat.read(path, as_version=4)
+    assert len(executed.cells) == len(stored.cells)
+    assert [bool(cell.get("outputs")) for cell in executed.cells] == [
+        bool(cell.get("outputs")) for cell in stored.cells
+    ]

@@ -1,0 +1,130 @@
+"""The documentation as a whole: links, names and messages exist, and the site builds without a warning or a network."""
+
+from __future__ import annotations
+
+import os
+import pydoc
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from unittest import mock
+
+import gymnasium
+import pytest
+from gymnasium.envs import registration
+from gymnasium.error import NamespaceNotFound
+
+from tests.helpers.paths import ROOT
+from tests.packaging.test_docs import DOCS, PAGES, rows
+
+FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(DOCS / f"{page}.md" for page in PAGES)]
+CARDS = sorted((ROOT / "cards").glob("*.md"))
+TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
+EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
+
+
+def anchors(text: str) -> set[str]:
+    """Return the addresses of a page's headings, as code hosts and the site form them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+
+
+@EVERY_FILE
+def test_links_exist(path):
+    for target in re.findall(r"\]\((?!https?://)(.*?)\)", TEXTS[path]):
+        name, _, anchor = target.partition("#")
+        file = (path.parent / name).resolve() if name else path
+        assert file.is_file(), target
+        if anchor:
+            assert anchor in anchors(TEXTS[file]), target
+
+
+@EVERY_FILE
+def test_make_targets_exist(path):
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(re.findall(r"(?:`|^    )make ([a-z-]+)(?![a-z.-])", TEXTS[path], re.MULTILINE)) <= targets
+
+
+def test_every_page_is_in_the_navigation():
+    listed = re.findall(r"^ +- .*: ([\w/]+)\.md$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(PAGES)
+
+
+def test_the_public_interface_exists():
+    listed = re.findall(r"`([\w.]+)`: ((?:`[\w.]+`(?:, )?)+)", PAGES["api/index"])
+    assert len(listed) >= 5
+    for module, names in listed:
+        for name in re.findall(r"`([\w.]+)`", names):
+            assert pydoc.locate(f"{module}.{name}") is not None, (module, name)
+
+
+def test_extras_are_listed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    listed = {name for cells in rows("start", "extra") for name in cells[0].split(", ")}
+    assert listed == project["optional-dependencies"].keys() - {"browser", "peers"}
+    assert re.search(r"\[.*\bbrowser\b.*\]", project["optional-dependencies"]["dev"][0]), "tests of pages need it"
+
+
+@pytest.mark.parametrize("path", [*FILES, *CARDS], ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_no_command_installs_the_package_from_an_index(path):
+    found = re.findall(r"pip install ['\"]?icrl4aht-data.*", path.read_text(encoding="utf-8"))
+    assert not found, "no index has the package"
+
+
+def test_files_of_the_packages_are_as_short_as_contributing_says():
+    (limit,) = re.findall(r"have at most (\d+) lines", TEXTS[ROOT / "CONTRIBUTING.md"])
+    files = [path for name in ("icrl4aht_data", "generation", "baselines") for path in (ROOT / name).rglob("*.py")]
+    lines = {path.relative_to(ROOT).as_posix(): len(path.read_text(encoding="utf-8").splitlines()) for path in files}
+    assert not {name: count for name, count in lines.items() if count > int(limit)}
+
+
+def message_of_gymnasium() -> str:
+    """Return what Gymnasium says about the id of a task where `icrl4aht_data` is not imported."""
+    with mock.patch.dict(registration.registry, clear=True), pytest.raises(NamespaceNotFound) as caught:
+        gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")
+    return str(caught.value)
+
+
+def test_messages_of_the_faq_are_those_of_the_code():
+    """Every part of a message between "..." is in the source, whose adjacent string literals are joined.
+
+    The message about Gymnasium's ids is Gymnasium's.
+    """
+    packages = ("icrl4aht_data", "generation", "baselines")
+    sources = "".join(path.read_text(encoding="utf-8") for name in packages for path in (ROOT / name).rglob("*.py"))
+    joined = re.sub(r"[\"']\s*f?[\"']", "", sources + message_of_gymnasium()).lower()
+    messages = [title for title in re.findall(r"^### (.*)$", PAGES["faq"], re.MULTILINE) if not title.endswith("?")]
+    assert len(messages) > 20
+    assert "Namespace icrl4aht not found" in messages
+    for error in ("PluginError", "MinariFormatError", "TaskFormatError"):
+        assert f"`{error}`: " in PAGES["faq"]
+    for message in messages:
+        for part in message.lower().split("..."):
+            assert part.strip(" ,;") in joined, message
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """The built site; building fails on warnings."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    assert "WARNING" not in process.stderr
+    return folder
+
+
+def test_the_site_loads_nothing_from_other_hosts(site):
+    pages = {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    assert {"index.html", "loading.html", "api/datasets.html"} <= pages.keys()
+    for page, html in pages.items():
+        assert not re.findall(r"<(?:script|img|link|iframe)[^>]+(?:src|href)=\"(?:https?:)?//[^>]*>", html), page
+
+
+def test_api_pages_have_signatures_and_docstrings(site):
+    html = (site / "api" / "datasets.html").read_text(encoding="utf-8")
+    assert 'id="icrl4aht_data.load_icrl4aht"' in html
+    assert "min_expert_return" in html and "Open a release and return a selection of its histories." in html
