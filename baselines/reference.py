@@ -186,18 +186,22 @@ class ReferenceOutcome(NamedTuple):
     results: dict[str, Path]
 
 
-def write_bundled_card(name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS) -> Path:
+def write_bundled_card(
+    name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS, teacher: str | None = None
+) -> Path:
     """Write the card of a bundled model, with its results on test and validation tasks. Returns its path.
 
     Args:
         name: of the bundled model.
         outcomes: of its tracks, evaluated.
         folder: of the bundled models.
+        teacher: the agent that it was made with, see `make_reference`.
     """
     (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
     path = folder / name / MODEL_CARD
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in VALIDATION_KINDS])
-    command = f"python -m baselines reference --name {outcomes[0].name} --bundle-as {name}"
+    taught = f" --teacher {teacher}" if teacher else ""
+    command = f"python -m baselines reference --name {outcomes[0].name}{taught} --bundle-as {name}"
     path.write_text(model_card(run, name, command, validation), encoding="utf-8")
     return path
 
@@ -215,7 +219,9 @@ Show = Callable[..., None]
 """Called with (description, units done, units, note)."""
 
 
-def make_reference(name: str, track: str, out: Path, show: Show, evaluates: bool = True) -> ReferenceOutcome:
+def make_reference(
+    name: str, track: str, out: Path, show: Show, evaluates: bool = True, teacher: str | None = None
+) -> ReferenceOutcome:
     """Make a reference model of a track, with everything that it needs, or resume it.
 
     Args:
@@ -224,6 +230,8 @@ def make_reference(name: str, track: str, out: Path, show: Show, evaluates: bool
         out: folder, see this module's docstring.
         show: called now and then, for progress.
         evaluates: whether to evaluate it as well.
+        teacher: agent whose histories are recorded and who labels them, such as the bundled `rl2-reference`; without
+            it, RL^2 is trained first. Releases and runs that are there are used as they are, whoever taught them.
 
     Raises:
         UnknownNameError: for an unknown recipe or track.
@@ -234,8 +242,11 @@ def make_reference(name: str, track: str, out: Path, show: Show, evaluates: bool
         raise unknown("reference model", name, RECIPES)
     if track not in TRACKS:
         raise unknown("track", track, TRACKS)
-    made = _Making(out, track, show)
+    made = _Making(out, track, show, teacher)
     recipe = RECIPES[name]
+    if teacher is not None and recipe.data not in RL2_HISTORIES:
+        taught = ", ".join(each for each, other in RECIPES.items() if other.data in RL2_HISTORIES)
+        raise OptionError(f"{name} learns from no histories of a teacher; leave it out, or choose one of {taught}")
     run = made.play(name) if recipe.data == "tasks" else made.train(name, recipe)
     return ReferenceOutcome(name, track, run, made.evaluate(name, run, recipe) if evaluates else {})
 
@@ -252,6 +263,7 @@ class _Making:
     out: Path
     track: str
     show: Show
+    teacher: str | None = None
 
     @contextmanager
     def timed(self, part: str, was_done: bool = False) -> Iterator[None]:
@@ -300,11 +312,15 @@ class _Making:
             train(job.method, job.data, options, folder, job.about, trainer=job.trainer, done=done)
         return folder
 
+    def rl2(self) -> str:
+        """Returns the name or run folder of the RL^2 that teaches; it is trained if there is none."""
+        return self.teacher or str(self.play())
+
     def histories(self, kind: str) -> Path:
         """Returns the release with histories of RL^2 of a kind, one of `RL2_HISTORIES`."""
         folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
-            agent = find_agent(str(self.play()), PlayMode(greedy=False))
+            agent = find_agent(self.rl2(), PlayMode(greedy=False))
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
             teammates = release_teammates(dataset, tasks=self.diverse())
             with self.timed(folder.name):
@@ -339,7 +355,7 @@ class _Making:
         own, mixed = (target.with_name(f"{target.name}-{kind}") for kind in ("own", "mixed"))
         if not mixed.is_dir():
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
-            labeller = find_agent(str(self.play()))
+            labeller = find_agent(self.rl2())
             teammates = release_teammates(dataset, number, self.diverse())
             agent = find_agent(str(before), PlayMode(greedy=False))
             if not own.is_dir():
@@ -385,7 +401,7 @@ class _Making:
                     seeds=range(seeds),
                     out=folder,
                     details=agent.details,
-                    played=counted(self.show, f"{name}, {kind}", len(tasks) * seeds * played.episodes),
+                    played=counted(self.show, f"{name}-{self.track}, {kind}", len(tasks) * seeds * played.episodes),
                 )
             note_results(folder, run, () if kind.startswith("test") else tasks)
             found[kind] = folder

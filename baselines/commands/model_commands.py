@@ -119,19 +119,28 @@ def collect_command(
     epilog=examples(
         "python -m baselines reference --name ad-student",
         "python -m baselines reference --name rl2 --track teammate --out runs/reference",
+        "python -m baselines reference --name ad-rising --teacher rl2-reference",
     ),
 )
 @click.option(
     "--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model, such as ad-student; repeat."
 )
 @click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
+@click.option(
+    "--teacher", metavar="AGENT", help="Learn from histories of this agent, such as rl2-reference, not of a new rl2."
+)
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
     "--bundle-as", "bundle", metavar="NAME", help="Also put it into the package, under this name; see `models`."
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
-    names: tuple[str, ...], track: tuple[str, ...], evaluates: bool, bundle: str | None, out: Path
+    names: tuple[str, ...],
+    track: tuple[str, ...],
+    teacher: str | None,
+    evaluates: bool,
+    bundle: str | None,
+    out: Path,
 ) -> None:
     """Make reference models, with everything that they need.
 
@@ -153,7 +162,7 @@ def reference_command(
     outcomes = []
     with bars(edges=True) as show:
         for name, of_track in product(names, track):
-            outcomes.append(make_reference(name, of_track, out, show, evaluates))
+            outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
     for found in outcomes:
         _console.print(f"{found.name}, {found.track}: {found.run}", highlight=False)
         for kind, folder in found.results.items():
@@ -163,7 +172,7 @@ def reference_command(
             sampled = not RECIPES[found.name].mode.greedy
             target = bundle_run(found.run, bundle, found.track, sampled=sampled)
             _console.print(f"bundled: {target}", highlight=False)
-        _console.print(f"card: {write_bundled_card(bundle, outcomes)}", highlight=False)
+        _console.print(f"card: {write_bundled_card(bundle, outcomes, teacher=teacher)}", highlight=False)
     if times := describe_times(out):
         _console.print(times, highlight=False)
 

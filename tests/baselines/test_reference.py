@@ -23,7 +23,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 
 TINY = {"steps": 2, "batch_size": 2, "context": 20}
 MODEL = {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp", "teammate_actions": True}
@@ -51,6 +51,20 @@ def test_unknown_names(tmp_path):
         make_reference("ad-noise", "x", tmp_path, print)
     result = CliRunner().invoke(cli, ["reference", "--name", "ad-nois"])
     assert result.exit_code == 2 and "ad-noise" in result.output
+
+
+def test_a_teacher_takes_the_place_of_rl2(tmp_path, monkeypatch):
+    with pytest.raises(OptionError, match=r"ad-noise learns from no histories.*ad-student, dpt-student, ad-rising"):
+        make_reference("ad-noise", "teammate", tmp_path, print, teacher="rl2-reference")
+    monkeypatch.setattr(reference._Making, "play", lambda made: tmp_path / "rl2")
+    assert reference._Making(tmp_path, "teammate", print).rl2() == str(tmp_path / "rl2")
+    found = []
+    monkeypatch.setattr(reference, "find_agent", lambda name, mode: found.append(name))
+    for name in ("load_icrl4aht", "release_teammates", "collect_release"):
+        monkeypatch.setattr(reference, name, lambda *given, **options: None)
+    monkeypatch.setattr(reference._Making, "noise_release", lambda made: tmp_path)
+    reference._Making(tmp_path, "teammate", print, "rl2-reference").histories("rising")
+    assert found == ["rl2-reference"]
 
 
 def test_times_of_parts(tmp_path):
