@@ -55,6 +55,7 @@ class Bandit(MultiAgentEnv):
         return self.reset(key)[0], state, earned, done, {"shaped_reward": dict.fromkeys(self.agents, 0.0)}
 
 
+@pytest.mark.slow
 def test_the_learner_learns():
     _, log = jax.jit(train_ippo(Bandit(), config(32)))(jax.random.key(0))
     assert log.reward[0] < 0.4
@@ -62,6 +63,7 @@ def test_the_learner_learns():
     assert (log.episodes == 32 * STEPS).all()
 
 
+@pytest.mark.slow
 def test_ten_updates_on_our_environment():
     env = JaxMARLEnv("cramped_up", max_steps=20)
     params, log = jax.jit(train_ippo(env, config(4)))(jax.random.key(1))

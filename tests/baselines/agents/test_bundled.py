@@ -177,6 +177,7 @@ class TestPlayMode:
             assert PlayMode.from_details(mode.details) == mode
         assert PlayMode().details == {"acting": "cached"}
 
+    @pytest.mark.slow
     def test_a_model_that_forgets_plays_each_episode_as_its_first(self, run):
         """With its memory cleared, what came before an episode changes nothing."""
         agent = find_agent(str(run), PlayMode(greedy=False, forget=True))

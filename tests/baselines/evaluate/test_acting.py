@@ -137,6 +137,7 @@ class TestBadRuns:
             find_agent(str(tmp_path / "early"))
 
 
+@pytest.mark.slow
 def test_the_train_command(lite, tmp_path, monkeypatch):
     """Trains from the address of a release."""
     monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 16, 5, heads=2, encoder="words"))

@@ -255,6 +255,7 @@ def test_bfloat16_computes_nearly_the_same(name):
     np.testing.assert_allclose(one, two, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_remat_changes_no_gradient():
     gradients = []
     for remat in (False, True):

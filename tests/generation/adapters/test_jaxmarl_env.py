@@ -38,6 +38,7 @@ def test_it_has_what_the_base_class_asks_for():
     assert env.name == "icrl4aht_demo_wide"
 
 
+@pytest.mark.slow
 def test_a_learners_loop_steps_it_as_our_environment_plays():
     """The loop of JaxMARL's IPPO: its wrapper, vmapped over environments and scanned over steps, with resets."""
     env, layout = JaxMARLEnv("cramped_up", max_steps=LENGTH), get_layout("cramped_up")

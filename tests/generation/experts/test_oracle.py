@@ -39,8 +39,8 @@ FAMILY_ON = {
     "asymm_right": "H3",
     "cramped_down": "H3",
 }
-CONTRASTING = ("coord_simple", "coord_ring", "asymm_right")
-"""Layouts of the default suite: rooms that share nothing, rooms that share counters, one room for both."""
+CONTRASTING = ("coord_ring", "asymm_right")
+"""Layouts of the default suite: rooms that share counters, one room for both."""
 
 
 def by_layout(*names: str) -> list[Any]:

@@ -78,6 +78,7 @@ def surrogate(lbrdiv):
     return compiled(jax.grad(policy_loss, has_aux=True))
 
 
+@pytest.mark.slow
 def test_the_surrogate_of_weight_minus_1_is_that_of_negated_advantages(surrogate, parts):
     params, played = part(parts.params, 0), part(parts.played, 0)
     rng = np.random.default_rng(1)
@@ -94,6 +95,7 @@ def test_the_surrogate_of_weight_minus_1_is_that_of_negated_advantages(surrogate
     assert not same_bytes(down, up)
 
 
+@pytest.mark.slow
 def test_weights_scale_the_surrogate_slot_by_slot(surrogate, parts):
     """At unchanged parameters the surrogate is linear in the weights."""
     params, played = part(parts.params, 0), part(parts.played, 0)
@@ -131,6 +133,7 @@ def test_policies_that_learn_at_once_learn_as_each_alone(learn, parts, learned):
         assert not same_bytes(expected[0], part(parts.params, number))
 
 
+@pytest.mark.slow
 def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
     """The first of two policies plays the rewarded action more often than before, the second less often."""
     obs = parts.played.seen[0, 0][None]
@@ -313,6 +316,7 @@ def test_the_multipliers_follow_the_returns_of_the_envs(lbrdiv):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi_play):
     """A quarter of the envs starts from states that the third quarter went through in the roll-out before."""
     source = comedi_play.population.assignment.starts_from
@@ -327,6 +331,7 @@ def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi_play):
     assert (started[moved] != fresh[moved]).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_a_visited_state_is_one_of_its_environments_last_roll_out(comedi_play):
     record, visited = np.asarray(comedi_play.rollout.record), np.asarray(comedi_play.after.visited)
     steps = [(record[:, env] == visited[env]).all(axis=1).nonzero()[0].tolist() for env in range(len(visited))]

@@ -118,6 +118,7 @@ def test_identical_policies_have_distance_0_and_others_do_not(actions):
     assert 0 < distances[0, 1] < 1
 
 
+@pytest.mark.slow
 def test_the_result_is_a_pure_function_of_the_seed(actions):
     again = actions_on_common_states(LAYOUT, POLICIES, seed=3, steps=STEPS)
     np.testing.assert_array_equal(again, actions)
@@ -125,6 +126,7 @@ def test_the_result_is_a_pure_function_of_the_seed(actions):
     assert (other != actions).any()
 
 
+@pytest.mark.slow
 def test_policies_observe_as_the_teammate_with_a_memory(records, monkeypatch):
     """Against a loop over the same states: counted from each episode's start, seen as the teammate sees it."""
     monkeypatch.setattr(diversity, "_play", lambda env, numbers, family, key: records)
@@ -137,6 +139,7 @@ def test_policies_observe_as_the_teammate_with_a_memory(records, monkeypatch):
 
 
 @pytest.mark.parametrize("order", [[4, 3, 2, 1, 0], [1, 3, 0, 4, 2]])
+@pytest.mark.slow
 def test_on_the_same_states_the_order_of_policies_does_not_matter(records, monkeypatch, order: Sequence[int]):
     monkeypatch.setattr(diversity, "_play", lambda env, numbers, family, key: records)
     plain = actions_on_common_states(LAYOUT, POLICIES, steps=STEPS)

@@ -229,6 +229,7 @@ def test_only_the_teammate_is_greedy(monkeypatch):
     assert made == [(False, False), (True, False), (False, False), (True, True)]
 
 
+@pytest.mark.slow
 def test_the_play_matrix_pairs_best_responses_with_members(trained):
     folder = population(trained("lbrdiv"), "lbrdiv")
     network, _, _ = load_policy(folder / "m0/c4")
@@ -241,14 +242,11 @@ def test_the_play_matrix_pairs_best_responses_with_members(trained):
     np.testing.assert_array_equal(play_matrix(trained("lbrdiv"), LAYOUT, "lbrdiv"), expected)
 
 
-@pytest.mark.parametrize(
-    ("agents", "algorithms"),
-    [([TEAMMATE], ["lbrdiv"]), pytest.param([EGO, TEAMMATE], ALGORITHMS, marks=pytest.mark.slow)],
-)
-def test_every_checkpoint_acts_as_either_agent(trained, agents, algorithms):
-    env, envs, root = Environment(LAYOUT), 3, trained(*algorithms)
-    for agent in agents:
-        first = learned.build_learned(LAYOUT, population(root, algorithms[0]) / "m0/c0")
+@pytest.mark.slow
+def test_every_checkpoint_acts_as_either_agent(trained):
+    env, envs, root = Environment(LAYOUT), 3, trained(*ALGORITHMS)
+    for agent in (EGO, TEAMMATE):
+        first = learned.build_learned(LAYOUT, population(root, ALGORITHMS[0]) / "m0/c0")
 
         def play(params, agent=agent, policy=first):
             players = [policy_player(env, policy, params, agent, envs), random_player(1 - agent, envs)]
@@ -256,7 +254,7 @@ def test_every_checkpoint_acts_as_either_agent(trained, agents, algorithms):
             return roll_out(env, players, carry, 30, jax.random.key(1))[1].actions[..., agent]
 
         play, seen = jax.jit(play), set()
-        for algorithm in algorithms:
+        for algorithm in ALGORITHMS:
             for point in suite_checkpoints(root, LAYOUT.name, algorithm):
                 policy = learned.build_learned(LAYOUT, root / point.path)
                 assert policy.act is first.act
@@ -306,6 +304,7 @@ def stopped(tmp_path, monkeypatch) -> Path:
     return tmp_path / "lbrdiv"
 
 
+@pytest.mark.slow
 def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(trained, stopped):
     before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
     with pytest.raises(
