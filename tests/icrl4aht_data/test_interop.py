@@ -65,6 +65,9 @@ class TestGrain:
         assert_equal(rest[0], sampler[3])
 
 
+ONE_CORE = "ignore:This DataLoader will create:UserWarning"
+"""PyTorch warns of more workers than cores."""
+
 TORCH = """
 import json
 import sys
@@ -111,7 +114,7 @@ def test_pytorch_workers(lite, tmp_path, combinations):
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
     run = subprocess.run(
-        [sys.executable, "-W", "error", str(script), str(lite[0]), json.dumps(combinations)],
+        [sys.executable, "-W", "error", "-W", ONE_CORE, str(script), str(lite[0]), json.dumps(combinations)],
         capture_output=True,
         text=True,
         timeout=300,
