@@ -59,8 +59,9 @@ function drawShapes(pen, shapes, x, y, unit) {
       pen.beginPath();
       pen.roundRect(across(bx - width / 2), down(by - height / 2), width * unit, height * unit, radius * unit);
       pen.fill();
-    } else if (kind === "disc") {
-      const [dx, dy, radius, fill, part] = values;
+    } else if (kind === "disc" || (kind === "line" && values.length === 4)) {
+      // browsers draw nothing for a line of one point
+      const [dx, dy, radius, fill, part] = kind === "disc" ? values : [values[2], values[3], values[0] / 2, values[1], 1];
       pen.fillStyle = fill;
       pen.beginPath();
       if (part < 1) pen.moveTo(across(dx), down(dy));
