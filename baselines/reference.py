@@ -244,11 +244,21 @@ def make_reference(
         raise unknown("track", track, TRACKS)
     made = _Making(out, track, show, teacher)
     recipe = RECIPES[name]
-    if teacher is not None and recipe.data not in RL2_HISTORIES:
-        taught = ", ".join(each for each, other in RECIPES.items() if other.data in RL2_HISTORIES)
-        raise OptionError(f"{name} learns from no histories of a teacher; leave it out, or choose one of {taught}")
+    if teacher is not None:
+        check_taught(name)
     run = made.play(name) if recipe.data == "tasks" else made.train(name, recipe)
     return ReferenceOutcome(name, track, run, made.evaluate(name, run, recipe) if evaluates else {})
+
+
+def check_taught(name: str) -> None:
+    """Check that a reference model learns from histories of a teacher.
+
+    Raises:
+        OptionError: if it does not.
+    """
+    if RECIPES[name].data not in RL2_HISTORIES:
+        taught = ", ".join(each for each, other in RECIPES.items() if other.data in RL2_HISTORIES)
+        raise OptionError(f"{name} learns from no histories of a teacher; leave it out, or choose one of {taught}")
 
 
 def _is_trained(folder: Path, options: TrainOptions) -> bool:

@@ -32,6 +32,7 @@ from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK
+from icrl4aht_data.utils.nouns import counted_noun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -252,7 +253,7 @@ def plot_learning_curves(dataset: RecordedCurves, path: Path | None = None) -> F
         number = f", {seen[title]}" if equal[title] > 1 else ""
         returns = [history.returns() for history in of_task]
         length = min(map(len, returns))  # streams of one task may differ in length
-        count = f"{len(returns)} streams" if len(returns) > 1 else "1 stream"
+        count = counted_noun(len(returns), "stream")
         panels.append((f"{title}{number} ({count})", {"mean": np.stack([own[:length] for own in returns])}))
     return plot_curves(path, panels)
 

@@ -258,12 +258,13 @@ def report_command(
 def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path, overwrite: bool) -> None:
     """Play an episode and draw it as a GIF."""
     from baselines.evaluate.protocols import get_protocol
-    from baselines.report.episode_gifs import episode_gif
+    from baselines.report.episode_gifs import save_episodes
 
     check_new_file(out, overwrite)
     task = published_task(layout, teammate)
-    earned = episode_gif(out, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
-    _console.print(f"{ego} with {task.teammate_family}/t{task.teammate['theta_id']}: return {earned:g}; wrote {out}")
+    (shown,) = save_episodes({1: out}, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
+    teammate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
+    _console.print(f"{ego} with {teammate}: return {shown.earned:g}; wrote {out}")
 
 
 @cli.command(

@@ -127,7 +127,7 @@ def collect_command(
 )
 @click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
 @click.option(
-    "--teacher", metavar="AGENT", help="Learn from histories of this agent, such as rl2-reference, not of a new rl2."
+    "--teacher", type=EGO_NAME, help="Learn from histories of this agent, such as rl2-reference, not of a new rl2."
 )
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
@@ -150,7 +150,7 @@ def reference_command(
     of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
     """
     from baselines.agents.bundled import bundle_run, check_bundle_name
-    from baselines.reference import RECIPES, describe_times, make_reference, write_bundled_card
+    from baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card
 
     if bundle and (len(names) > 1 or set(track) != set(TRACKS) or not evaluates):
         raise click.UsageError("--bundle-as: expected one --name of all tracks, evaluated: its card states its results")
@@ -159,6 +159,10 @@ def reference_command(
             check_bundle_name(bundle)
     except OptionError as error:
         raise click.UsageError(f"--bundle-as: {error}") from error
+    if teacher:  # before hours of work
+        find_ego("--teacher", teacher)
+        for name in names:
+            check_taught(name)
     outcomes = []
     with bars(edges=True) as show:
         for name, of_track in product(names, track):

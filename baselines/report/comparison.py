@@ -18,7 +18,6 @@ from baselines.report.intervals import MeanInterval, bootstrap_interval, mean_of
 from baselines.report.overlap import OVERLAPS
 from baselines.report.results import (
     cell_order,
-    count_text,
     family_of,
     group_of,
     normalise,
@@ -30,6 +29,7 @@ from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import new_figure, save_figure
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
 RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
@@ -86,7 +86,7 @@ def summary_table(stored: StoredResults, protocol: str) -> str:
                 " or ".join(map(str, seeds)),
             ]
         )
-    scores = [f"{track} ({count_text(len(chosen), 'cell')})" for track, chosen in groups.items()]
+    scores = [f"{track} ({counted_noun(len(chosen), 'cell')})" for track, chosen in groups.items()]
     header = ["agent", *scores, "rising", "first episode to last 20", "layouts above the paper's AD and DPT", "seeds"]
     return markdown_table(header, rows)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +13,6 @@ import numpy as np
 from baselines.agents.egos import AGENTS, PlayMode, find_agent, get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import Protocol
-from baselines.evaluate.rollout import EpisodeBatch
 from baselines.report.overlap import describe_overlap
 from baselines.report.results import EvaluationRun, ResultSource, cell_of, cell_order, group_of, groups_of
 from generation.policy import Policy
@@ -57,8 +56,8 @@ class EpisodePair(NamedTuple):
     episodes: tuple[ShownEpisode, ...] = ()
 
 
-def episode_gif(
-    path: Path,
+def save_episodes(
+    paths: Mapping[int, Path],
     task: Task,
     make_ego: Callable[[Layout], Policy],
     protocol: Protocol,
@@ -66,42 +65,22 @@ def episode_gif(
     seed: int = 0,
     cell: int = 32,
     suite: Path | None = None,
-) -> float:
-    """Write the first episode of a task as a GIF with `cell` pixels per map cell. Returns the team's return."""
-    (played,) = play_tasks(make_ego, [task], dataclasses.replace(protocol, episodes=1), [seed], suite)
-    return _save_played(path, task.layout, played, cell)
-
-
-def first_and_last(
-    prefix: Path,
-    task: Task,
-    make_ego: Callable[[Layout], Policy],
-    protocol: Protocol,
-    *,
-    seed: int = 0,
-    cell: int = 24,
-    suite: Path | None = None,
 ) -> tuple[ShownEpisode, ...]:
-    """Play a task, and write its first and last episode as GIFs. Returns them; they earn what `evaluate` stores.
+    """Play a task, and write some of its episodes as GIFs. Returns them; they earn what `evaluate` stores.
 
     Args:
-        prefix: path of the GIFs without "-1.gif" and the like.
+        paths: number of an episode, from 1 -> path of its GIF. Later episodes than these are not played.
         task, make_ego, protocol, seed, suite: see `evaluator.play_tasks`.
         cell: pixels per map cell.
     """
     shown = []
-    for number, played in enumerate(play_tasks(make_ego, [task], protocol, [seed], suite), start=1):
-        if number in (1, protocol.episodes):
-            path = prefix.with_name(f"{prefix.name}-{number}.gif")
-            shown.append(ShownEpisode(number, _save_played(path, task.layout, played, cell), path))
+    played = play_tasks(make_ego, [task], dataclasses.replace(protocol, episodes=max(paths)), [seed], suite)
+    for number, episode in enumerate(played, start=1):
+        if number in paths:
+            record, reward = np.asarray(episode.record[0]), np.asarray(episode.reward[0])
+            save_episode(paths[number], task.layout, record, reward, cell=cell)
+            shown.append(ShownEpisode(number, float(reward.sum()), paths[number]))
     return tuple(shown)
-
-
-def _save_played(path: Path, layout: Layout, played: EpisodeBatch, cell: int) -> float:
-    """Write the only episode of a batch as a GIF with `cell` pixels per map cell. Returns the team's return."""
-    record, reward = np.asarray(played.record[0]), np.asarray(played.reward[0])
-    save_episode(path, layout, record, reward, cell=cell)
-    return float(reward.sum())
 
 
 def family_gifs(
@@ -165,7 +144,9 @@ def _draw_result(
     try:
         if isinstance(ego, Icrl4ahtError):
             raise ego
-        return EpisodePair(family, title, origin, first_and_last(prefix, task, ego, protocol, seed=seed, suite=suite))
+        paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
+        shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite)
+        return EpisodePair(family, title, origin, shown)
     except Icrl4ahtError as error:
         return EpisodePair(family, title, f"No picture: {error}. {origin}")
 

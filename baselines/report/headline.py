@@ -12,7 +12,6 @@ from baselines.report.overlap import overlap_marks
 from baselines.report.results import (
     GROUP_TEXTS,
     EvaluationRun,
-    count_text,
     end_episodes,
     group_of,
     normalise,
@@ -22,6 +21,7 @@ from baselines.report.results import (
 )
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.reference_returns import Cell, has_headroom, read_headroom
+from icrl4aht_data.utils.nouns import counted_noun
 
 PAPER_METHODS = ("AD", "DPT")
 """The paper's methods that agents are compared with which the paper does not have."""
@@ -66,8 +66,8 @@ class Headline(NamedTuple):
         """The cells of the means in words, such as "12 test cells with headroom, of 16 played"."""
         of_kind = f"{self.kind} cell"
         if self.score is None:
-            return count_text(len(self.cells), of_kind)
-        return f"{count_text(len(self.cells), of_kind)} with headroom, of {self.played} played"
+            return counted_noun(len(self.cells), of_kind)
+        return f"{counted_noun(len(self.cells), of_kind)} with headroom, of {self.played} played"
 
     @property
     def has_interval(self) -> bool:

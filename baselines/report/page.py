@@ -29,7 +29,6 @@ from baselines.report.results import (
     EvaluationRun,
     ResultSource,
     cell_order,
-    count_text,
     group_of,
     group_title,
     instances_range,
@@ -52,6 +51,7 @@ from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, Ce
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import MOST_PANELS
 from icrl4aht_data.utils.files import atomic_write, json_hash
+from icrl4aht_data.utils.nouns import counted_noun
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
@@ -402,7 +402,7 @@ def _settings_table(runs: Sequence[EvaluationRun]) -> _Table:
     found = [_source_settings(source) for _, source in sources]
     names = [name for name in found[0] if any(of_source[name] for of_source in found)]
     rows = [[name, *(of_source[name] for of_source in found)] for name in names]
-    caption = f"{count_text(len(sources), 'source')} of results."
+    caption = f"{counted_noun(len(sources), 'source')} of results."
     return _Table("Evaluation and training", caption, ["setting", *(run.label for run, _ in sources)], rows)
 
 

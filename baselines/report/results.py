@@ -28,6 +28,7 @@ from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_head
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import card_file
 
 TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
@@ -105,8 +106,8 @@ class ResultSource(NamedTuple):
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
         listed, (sampled, forgets) = ", ".join(map(str, seeds)), self.playing
         return (
-            f"protocol {protocol['name']}, {count_text(len(seeds), 'seed')} ({listed}), "
-            f"{count_text(protocol['episodes'], 'episode')} of {count_text(protocol['steps'], 'step')}"
+            f"protocol {protocol['name']}, {counted_noun(len(seeds), 'seed')} ({listed}), "
+            f"{counted_noun(protocol['episodes'], 'episode')} of {counted_noun(protocol['steps'], 'step')}"
             + (f", {self.acting} acting" if self.acting else "")
             + (", sampled actions" if sampled else "")
             + (", memory cleared before each episode" if forgets else "")
@@ -345,21 +346,16 @@ def cell_of(task: Task) -> Cell:
     return task.layout.name, f"{task.teammate_family} ({group})"
 
 
-def count_text(number: int, noun: str) -> str:
-    """Returns a number with its noun, such as "1 seed" or "5 seeds"."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def instances_text(cell: Cell, played: int) -> str:
     """Returns the number of instances, such as "1 of 5 instances", or "1 instance" for tasks that are not published."""
     total = published_instances(cell)
-    return f"{played} of {count_text(total, 'instance')}" if total else count_text(played, "instance")
+    return f"{played} of {counted_noun(total, 'instance')}" if total else counted_noun(played, "instance")
 
 
 def instances_range(numbers: Iterable[int]) -> str:
     """Returns numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
     found = sorted(set(numbers))
-    return count_text(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
+    return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:

@@ -169,7 +169,8 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     @cached_property
     def _family_numbers(self) -> np.ndarray:
         """int32 (H,): the value of `families` for each history of the selection."""
-        return np.array([all_families().index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
+        families = all_families()
+        return np.array([families.index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
 
     @property
     def _targets(self) -> str:

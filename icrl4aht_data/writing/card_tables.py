@@ -21,9 +21,10 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import Entry, are_labels_weak
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import markdown_table
 from icrl4aht_data.writing.card_content import CardContent, share_risen
-from icrl4aht_data.writing.card_texts import count_in_words, sentence
+from icrl4aht_data.writing.card_texts import sentence
 
 LEAST_RISE = 5.0
 """What the end of a history must exceed its start by to count as learning: a quarter of a delivery."""
@@ -209,8 +210,8 @@ def behaviours_in_words(mates: Sequence[CardTeammate]) -> str:
         sentence(
             "behaviours",
             split=split,
-            teammates=count_in_words(counts[split], "teammate"),
-            behaviours=count_in_words(len(own[split]), "different behaviour"),
+            teammates=counted_noun(counts[split], "teammate"),
+            behaviours=counted_noun(len(own[split]), "different behaviour"),
         )
         for split in SPLITS
         if split in own
@@ -271,7 +272,7 @@ def labels_table(release: CardContent) -> str:
         return sentence("unmeasured_labels")
     weak = sum(map(have_weak_labels, tasks))
     explained = sentence("labels", episodes=LABEL_EPISODES, steps=KEPT_STEPS)
-    verdict = sentence("weak_labels", weak=count_in_words(weak, "task")) if weak else sentence("no_weak_labels")
+    verdict = sentence("weak_labels", weak=counted_noun(weak, "task")) if weak else sentence("no_weak_labels")
     table = _long_labels(release, tasks) if len(tasks) <= LONGEST_TABLE else _summarized_labels(tasks)
     return f"{explained} {verdict}\n\n{table}"
 

@@ -30,8 +30,3 @@ def episode_texts() -> dict[str, str]:
 def sentence(name: str, **values: object) -> str:
     """Return a sentence with every $name replaced by its value."""
     return Template(card_texts("sentences")[name].strip("\n")).substitute(values)
-
-
-def count_in_words(number: int, noun: str) -> str:
-    """Return a number and a noun, such as "1 task" or "1,200 tasks"."""
-    return f"{number:,} {noun}" + "s" * (number != 1)

@@ -25,6 +25,7 @@ from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headr
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import FIELDS, KINDS, PARQUET_EPISODES, Entry, are_labels_weak
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.writing.card_content import PARQUET_INDEX, CardContent, mean_rise, read_content
 from icrl4aht_data.writing.card_tables import (
@@ -37,7 +38,7 @@ from icrl4aht_data.writing.card_tables import (
     teammate_name,
     teammates_table,
 )
-from icrl4aht_data.writing.card_texts import card_texts, count_in_words, episode_texts, sentence
+from icrl4aht_data.writing.card_texts import card_texts, episode_texts, sentence
 from icrl4aht_data.writing.statistics import layout_statistics, statistics_rows
 
 RELEASE_CARD = "README.md"
@@ -235,7 +236,7 @@ def _limits(release: CardContent) -> list[str]:
         limits.append(sentence("filtered"))
     limits += _flat_tasks(release)
     if weak := sum(map(have_weak_labels, release.histories.values())):
-        limits.append(sentence("weak_limit", weak=count_in_words(weak, "task")))
+        limits.append(sentence("weak_limit", weak=counted_noun(weak, "task")))
     return limits
 
 
@@ -273,7 +274,7 @@ def _flat_tasks(release: CardContent) -> Iterable[str]:
         if release.headroom.get(members[0].layout) and mean_rise(members) < CLEAR_RISE
     ]
     if flat:
-        yield sentence("flat_tasks", tasks=count_in_words(len(flat), "task"), names=", ".join(flat), rise=CLEAR_RISE)
+        yield sentence("flat_tasks", tasks=counted_noun(len(flat), "task"), names=", ".join(flat), rise=CLEAR_RISE)
 
 
 def _missing_teammates(release: CardContent) -> Iterable[str]:
@@ -341,7 +342,7 @@ def _have_weak_oracle_labels(release: CardContent, histories: list[Entry]) -> bo
 
 def _tasks_by_layout(tasks: Iterable[list[Entry]]) -> str:
     counts = Counter((members[0].layout, members[0].source) for members in tasks)
-    return ", ".join(f"{count_in_words(n, 'task')} of {source} on {layout}" for (layout, source), n in counts.items())
+    return ", ".join(f"{counted_noun(n, 'task')} of {source} on {layout}" for (layout, source), n in counts.items())
 
 
 def _policy_labellers(release: CardContent) -> list[ExpertLabels]:

@@ -68,7 +68,7 @@ def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
 def test_every_step_is_taken(release, tmp_path, monkeypatch):
     """All steps; the model is trained, and not played."""
     monkeypatch.setattr(demo, "evaluate", evaluate_without_playing)
-    monkeypatch.setattr(episode_gifs, "first_and_last", lambda *arguments, **named: ())
+    monkeypatch.setattr(episode_gifs, "save_episodes", lambda *arguments, **named: ())
     text, page = run(tmp_path, replace(SETTINGS, root=release))
     for expected in ("1/6", "target_actions", "context_next_obs", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in text, expected

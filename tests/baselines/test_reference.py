@@ -56,6 +56,13 @@ def test_unknown_names(tmp_path):
 def test_a_teacher_takes_the_place_of_rl2(tmp_path, monkeypatch):
     with pytest.raises(OptionError, match=r"ad-noise learns from no histories.*ad-student, dpt-student, ad-rising"):
         make_reference("ad-noise", "teammate", tmp_path, print, teacher="rl2-reference")
+    command = ["reference", "--name", "ad-student", "--name", "ad-noise", "--out", str(tmp_path / "out"), "--teacher"]
+    for teacher, message in (
+        ("rl2-referenc", "--teacher: unknown agent"),
+        ("rl2-reference", "ad-noise learns from no"),
+    ):
+        result = CliRunner().invoke(cli, [*command, teacher])
+        assert message in f"{result.output} {result.exception}" and not (tmp_path / "out").exists()
     monkeypatch.setattr(reference._Making, "play", lambda made: tmp_path / "rl2")
     assert reference._Making(tmp_path, "teammate", print).rl2() == str(tmp_path / "rl2")
     found = []

@@ -281,7 +281,7 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
     """Tasks with headroom, every agent once before any twice, reference egos last."""
     (tmp_path / "a.gif").write_bytes(GIF)
     shown = (ShownEpisode(1, 7.0, tmp_path / "a.gif"),)
-    monkeypatch.setattr(gifs, "first_and_last", lambda *a, **k: shown)
+    monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: shown)
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
 
     def with_tasks(agent: str, **options) -> EvaluationRun:
