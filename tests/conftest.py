@@ -27,6 +27,7 @@ from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_releases import random_release
 from tests.helpers.tiny import PAIR, TINY
 from tests.helpers.two_sources import two_source_release
+from tests.helpers.xla_flags import add_xla_flag
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
@@ -34,10 +35,21 @@ COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit JAX locks the folder, so that processes can share it
     "jax_persistent_cache_min_compile_time_secs": 0.1,  # with a warm cache a third less CPU time than 0.5
 }
+QUICK_COMPILATION = (
+    "--xla_cpu_use_fusion_emitters=false"  # XLA's older code generator takes less time without optimizations
+)
 
 
 def pytest_configure() -> None:
-    """Keep compiled programs of this process and its subprocesses in a folder, for other workers and later runs."""
+    """Compile quickly, and keep compiled programs in a folder for other workers and later runs; also in subprocesses.
+
+    Most tests compile small programs to run them a few times. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 make test` tests
+    optimized programs.
+    """
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0":
+        jax.config.update("jax_disable_most_optimizations", True)
+        os.environ["XLA_FLAGS"] = add_xla_flag(QUICK_COMPILATION)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # bits and tolerances are a CPU's, and workers share no GPU
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
     os.environ.setdefault("PJRT_NPROC", "1")  # what the profiles of the tests choose, before JAX is first used
@@ -83,14 +95,6 @@ def free_compiled_programs() -> Iterator[None]:
     jax.clear_caches()
     gc.collect()
     getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # glibc keeps freed memory otherwise
-
-
-@pytest.fixture(scope="module")
-def compiled_quickly() -> Iterator[None]:
-    """For small models: halve the time of compilation, at the cost of slower programs."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -92,7 +92,10 @@ def _randint(key: jax.Array, n: int) -> int:
 
 
 def _uniform(key: jax.Array, low: float, high: float) -> float:
-    return float(jax.random.uniform(key, (), minval=low, maxval=high))
+    """Draws a float32 that is rounded once, whatever XLA does: with other options it rounds product and sum."""
+    least, width = np.float32(low), np.float32(high) - np.float32(low)
+    drawn = np.float64(jax.random.uniform(key, ())) * np.float64(width) + np.float64(least)
+    return float(max(np.float32(drawn), least))
 
 
 def build_teammate(

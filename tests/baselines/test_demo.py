@@ -20,8 +20,6 @@ from generation.teammates.registry import sample_teammate
 from icrl4aht_data.benchmark.tasks import make_task
 from tests.helpers.random_releases import random_release
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 TASKS = tuple(
     make_task("teammate", "validation", "demo_wide", sample_teammate(family, 0, "train", 1), seed)
     for seed, family in enumerate(("utility_greedy", "territory"))

@@ -43,8 +43,6 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.random_releases import random_release
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 MODEL: dict[str, Any] = {"layers": 1, "width": 8, "heads": 2}
 TRAIN: dict[str, Any] = {"steps": 2, "batch_size": 2, "validation_batches": 1}
 SMALL = ExperimentPlan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4",), tasks=1, episodes=2, gifs=False)

@@ -127,7 +127,6 @@ def small(monkeypatch, tmp_path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("compiled_quickly")
 def test_a_model_of_histories_of_rl2_and_of_its_own(small):
     found = make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
     assert found.run == small / "ad-student-layout" and found.results == {}

@@ -41,8 +41,6 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from tests.helpers.paths import ROOT
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 MEASURED = {
     "device": {"device", "jax", "commit", "date", "xla_threads"},
     "product": {"tflops_float32", "tflops_float32_highest", "tflops_bfloat16"},

@@ -16,8 +16,6 @@ from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.published import to_published
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 
 def test_the_peer_gets_the_same_batches(lite, tmp_path):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")

@@ -21,8 +21,6 @@ from benchmarks.peers import jaxmarl_training
 from generation.adapters.jaxmarl_env import JaxMARLEnv
 from generation.learners.config import PPOConfig
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 UPDATES, STEPS = 10, 8
 PEER = os.environ.get("PEER", "")
 """Path of a copy of JaxMARL's `ippo_rnn_overcooked_v2.py`, which its package does not contain."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -24,8 +23,6 @@ PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece o
 FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.uint8)
 
 N, MAX_STEPS, STEPS = 2000, 5, 13  # every test steps the same two batches: 2,000 environments and one
-
-quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles in half the time
 
 DEFAULT_LAYOUTS = ("coord_ring", "demo_wide", "asymm_right")
 """Three contrasting layouts; tests of the others are slow."""
@@ -52,7 +49,7 @@ class Compiled(NamedTuple):
 
     @classmethod
     def of(cls, env: Environment) -> Compiled:
-        return cls(env, quick_jit(env.init), quick_jit(env.step))
+        return cls(env, jax.jit(env.init), jax.jit(env.step))
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +127,7 @@ def assert_uniform(values: Sequence | np.ndarray, possible: int) -> None:
 @pytest.mark.parametrize("name", FLOOR)
 def test_starts_are_uniform_over_the_rooms_and_facings_and_recipes(name):
     layout = LAYOUTS[name]
-    init = quick_jit(Environment(layout).init)
+    init = jax.jit(Environment(layout).init)
     states = [init(some_keys(number)) for number in range(3)]
     assert all(not np.asarray(state.clock).any() and not np.asarray(state.episode).any() for state in states)
     records = np.concatenate([np.asarray(state.record) for state in states])
@@ -315,7 +312,7 @@ def test_shaped_rewards_are_each_agents_own_and_apart_from_the_teams(cramped, ke
 
 def test_vmap_over_a_leading_axis_equals_the_flat_batch(cramped, keys, life):
     folded = (4, N // 4)
-    step = quick_jit(jax.vmap(cramped.env.step))
+    step = jax.jit(jax.vmap(cramped.env.step))
     state = jax.vmap(cramped.init)(keys.reshape(folded))
     np.testing.assert_array_equal(state.record.reshape(N, -1), life.before[0].record)
     for number in range(MAX_STEPS + 1):  # into the second episode
@@ -333,7 +330,7 @@ def test_the_environments_observations_are_those_of_its_records(cramped, life):
     state = life.steps[6].state
     records = np.asarray(state.record)
     env = cramped.env
-    jitted = quick_jit(lambda state: (env.observe(state), env.observe_one(state, 0), env.observe_one(state, 1)))
+    jitted = jax.jit(lambda state: (env.observe(state), env.observe_one(state, 0), env.observe_one(state, 1)))
     both, *each = map(np.asarray, jitted(state))
     assert (both.shape, both.dtype) == ((N, 2, 5, 5, 35), np.uint8)
     np.testing.assert_array_equal(both, observe_both(CRAMPED, records))
@@ -354,7 +351,7 @@ def test_the_environments_observations_are_those_of_its_records(cramped, life):
 def in_jax(request: pytest.FixtureRequest):
     """A layout, and one jitted step with the observations of the state before it."""
     layout = request.param
-    return layout, quick_jit(lambda *inputs: (*rules.step(layout, *inputs), observe_both(layout, inputs[0])))
+    return layout, jax.jit(lambda *inputs: (*rules.step(layout, *inputs), observe_both(layout, inputs[0])))
 
 
 def random_inputs(layout: Layout, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

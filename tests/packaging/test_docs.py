@@ -52,8 +52,6 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES)
 COMPILING = ("adapters", "evaluating", "protocol")
 """Pages whose snippets compile environments and models."""
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 
 def run_snippets(page: str, folder: Path) -> dict[str, Any]:
     """Run a page's snippets in order, in a folder with the package's data, and return the names they define.
@@ -338,7 +336,7 @@ class TestExtending:
         done = subprocess.run(
             [sys.executable, *line.split()[1:]],
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": path, "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"},
+            env=os.environ | {"PYTHONPATH": path},
             capture_output=True,
             text=True,
             check=False,

@@ -42,8 +42,7 @@ def test_links(path):
 
 @pytest.mark.slow
 @EVERY_NOTEBOOK
-def test_notebook_runs(path, tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
+def test_notebook_runs(path, tmp_path):
     executed, stored = execute(path, tmp_path), nbformat.read(path, as_version=4)
     assert len(executed.cells) == len(stored.cells)
     assert [bool(cell.get("outputs")) for cell in executed.cells] == [

@@ -29,8 +29,6 @@ from generation.teammates.instances import published_task
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
 OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
 

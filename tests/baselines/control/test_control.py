@@ -11,8 +11,6 @@ from baselines.commands.cli import cli
 from baselines.control import control, worlds
 from generation.policy import Policy
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 
 

@@ -35,9 +35,6 @@ MODEL = ModelOptions(layers=1, width=16, heads=2, teammate_actions=True)
 OPTIONS = TrainOptions(steps=2, batch_size=2, context=30)
 
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
-
 @pytest.fixture(scope="module")
 def runs(lite, tmp_path_factory) -> Path:
     """Run folders `ad` and `dpt` of untrained models, as training would write them."""

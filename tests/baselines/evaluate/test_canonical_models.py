@@ -35,8 +35,6 @@ from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.random_releases import random_release
 from tests.helpers.states import random_records
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=1, steps=5)
 MODEL = ModelOptions(layers=1, width=8, heads=2)
 OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)

@@ -34,8 +34,6 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.rules import step
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 PUBLISHED = dataclasses.replace(PROTOCOLS["published"], episodes=4)
 ALL = [task for track in TRACKS for task in published_tasks(track)]
 H4 = [task for task in ALL if task.teammate_family == "H4"]

@@ -23,8 +23,6 @@ from icrl4aht_data import get_layout, load_icrl4aht
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import TINY, random_parameters
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 OPTIONS = dataclasses.replace(TINY, layers=1, dropout=0.0)
 
 

@@ -31,8 +31,6 @@ from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.sampling.ad import ADBatch
 from tests.helpers.small_models import FLAT, TINY, ad_batch, dpt_batch, random_parameters
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 STEPS = ("ad", "hybrid_ad", pytest.param("amago_offline", marks=pytest.mark.slow))
 
 

@@ -44,8 +44,6 @@ from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import start
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
 OPTIONS = TrainOptions(steps=12, batch_size=8, learning_rate=3e-3, warmup=0.0, log_every=1, save_every=6)

@@ -26,8 +26,6 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from tests.helpers.evaluated import TEST_TASKS
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
 
 

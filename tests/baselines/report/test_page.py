@@ -316,7 +316,6 @@ def test_egos_that_cannot_be_made_again_say_why(tmp_path):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 
-@pytest.mark.usefixtures("compiled_quickly")
 def test_commands_with_tasks_of_ones_own(tmp_path, monkeypatch):
     """Evaluates, prints the summary, and draws the first and the last episode, which earn what the results say."""
     theta = next(task for task in TEST_TASKS if task.teammate_family == "H4").teammate

@@ -45,8 +45,7 @@ from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start
 from tests.helpers.two_sources import two_source_release
-
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
+from tests.helpers.xla_flags import add_xla_flag
 
 OPTIONS = TrainOptions(
     steps=7, batch_size=4, context=7, log_every=2, validate_every=3, validation_batches=1, save_every=3, warmup=0.3
@@ -488,10 +487,8 @@ def across(
     root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str, code: int = 0
 ) -> list[dict[str, Any]]:
     """Train in one process per environment, which all exit with `code`; the log."""
-    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
     processes = [
-        start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **quick, **environment)
-        for environment in environments
+        start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **environment) for environment in environments
     ]
     outputs = [process.communicate(timeout=240) for process in processes]
     for process, (out, error) in zip(processes, outputs, strict=True):
@@ -511,7 +508,7 @@ def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
 @pytest.mark.slow
 def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
     """Also with dropout, accumulation and validation."""
-    two = across(lite[0], tmp_path, [{"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}])
+    two = across(lite[0], tmp_path, [{"XLA_FLAGS": add_xla_flag("--xla_force_host_platform_device_count=2")}])
     assert_close(two, on_one_device)
 
 
@@ -535,7 +532,7 @@ def test_the_command_that_is_told_to_stop(lite, tmp_path):
     run = tmp_path / "run"
     small = ["--batch-size", "2", "--context", "4", "--layers", "1", "--width", "8", "--heads", "2", "--log-every", "1"]
     command = ["-m", "baselines", "train", "ad", "--layout", "demo_wide", "--root", str(lite[0]), "--out", str(run)]
-    process = start(*command, *small, JAX_DISABLE_MOST_OPTIMIZATIONS="true")
+    process = start(*command, *small)
     end = time.monotonic() + 120
     while not ((run / "metrics.jsonl").exists() and metrics(run)) and time.monotonic() < end:
         time.sleep(0.1)

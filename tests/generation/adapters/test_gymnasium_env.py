@@ -25,8 +25,6 @@ from tests.helpers.paths import ROOT
 
 NAME = "icrl4aht/demo_wide-H4-t0-v0"
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 
 @pytest.fixture(scope="module")
 def env():

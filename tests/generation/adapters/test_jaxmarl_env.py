@@ -18,8 +18,6 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe_both
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 N, STEPS, LENGTH = 4, 30, 12
 
 

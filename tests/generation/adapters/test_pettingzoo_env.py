@@ -13,8 +13,6 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe_both
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 
 @pytest.mark.parametrize("channels", ["own", "canonical"])
 def test_parallel_api(channels):

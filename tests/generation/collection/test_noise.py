@@ -54,7 +54,7 @@ noise.EPISODES_AT_ONCE = PIECE
 noise.run_noise(WORK, load_profile(sys.argv[1]), Path(sys.argv[2]), report, save_seconds=0)
 """
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly", "short_pieces")
+pytestmark = pytest.mark.usefixtures("short_pieces")
 
 
 @pytest.fixture(scope="module")

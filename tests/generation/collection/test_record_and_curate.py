@@ -221,7 +221,7 @@ def labelled():
 
     params = jax.tree.map(random, tree)
     params["params"]["encoder"]["LayerNorm_0"]["scale"] += 1
-    step = jax.jit(network.apply, compiler_options={"xla_backend_optimization_level": 0})
+    step = jax.jit(network.apply)
 
     def logits_with_memory_from(starts) -> np.ndarray:
         hidden, rows = network.initial_hidden(2), []

@@ -23,8 +23,6 @@ from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import CORRECT, PRESSED, WRONG, step
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2)
 TASKS = [task for track in TRACKS for task in published_tasks(track)]
 

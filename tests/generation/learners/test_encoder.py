@@ -16,7 +16,6 @@ from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns
-from tests.helpers.jit import compiled
 from tests.helpers.states import random_records
 
 LAYOUT = get_layout("demo_wide")
@@ -37,7 +36,7 @@ def with_gradient(module: WindowEncoder) -> Any:
         features: Any = module.apply(params, seen)
         return jnp.vdot(features, jnp.arange(features.size, dtype=jnp.float32).reshape(features.shape)), features
 
-    return compiled(jax.grad(total, has_aux=True))
+    return jax.jit(jax.grad(total, has_aux=True))
 
 
 @pytest.mark.parametrize("kind", ["words", "mlp"])

@@ -12,7 +12,6 @@ import pytest
 
 from generation.learners.config import Widths
 from generation.learners.network import ActorCritic
-from tests.helpers.jit import compiled
 
 STEPS, ENVS, CHANNELS = 4, 3, 40
 
@@ -109,7 +108,7 @@ def small() -> Case:
 
 @pytest.fixture(scope="module")
 def apply(small):
-    return compiled(small.network.apply)
+    return jax.jit(small.network.apply)
 
 
 def assert_close(found: Any, expected: Any, what: str = "") -> None:
@@ -139,7 +138,7 @@ def test_outputs_and_gradients_equal_the_plain_form(which, request):
             last, logits, values = outputs
             return jnp.sum(weights[..., :6] * logits) + jnp.sum(weights[..., 6] * values) + jnp.sum(last), outputs
 
-        return compiled(jax.grad(total, argnums=(0, 1), has_aux=True))
+        return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))
 
     (gradient, to_hidden), outputs = both(case.network)(case.params, case.hidden)
     (plain_gradient, plain_to_hidden), plain_outputs = both(plain)(names, case.hidden)
@@ -185,7 +184,7 @@ def test_a_reset_at_the_first_step_drops_the_given_hidden_state(small, apply):
 
 def test_initial_weights(small):
     """Orthogonal, of the published code's scales; every bias zero."""
-    init = compiled(small.network.init)
+    init = jax.jit(small.network.init)
     params = init(jax.random.key(0), small.hidden, small.obs, small.reset)
     tree = plain_names(params, small.network.widths)["params"]
     scales = {"pointwise_0": 2**0.5, "spatial_0": 2**0.5, "spatial_1": 2**0.5}

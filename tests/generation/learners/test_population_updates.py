@@ -18,8 +18,8 @@ from generation.learners.ppo import Batch, Sequences, sequences, shaping_weight
 from generation.learners.rollout import Rollout, RolloutCarry, roll_out
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.observe import observe
-from tests.helpers.jit import compiled, same_bytes
 from tests.helpers.populations import CONFIG, EPISODE, LAYOUT, plain_adapt, population
+from tests.helpers.trees import same_bytes
 
 # Negative weights.
 
@@ -75,7 +75,7 @@ def surrogate(lbrdiv):
         losses = dict(lbrdiv.population.ppo.loss(params, batch)[1])
         return losses.pop("policy_loss"), losses
 
-    return compiled(jax.grad(policy_loss, has_aux=True))
+    return jax.jit(jax.grad(policy_loss, has_aux=True))
 
 
 @pytest.mark.slow
@@ -114,13 +114,13 @@ def test_weights_scale_the_surrogate_slot_by_slot(surrogate, parts):
 @pytest.fixture(scope="module")
 def learn(lbrdiv):
     """The compiled update of one policy."""
-    return compiled(lbrdiv.population.ppo.learn)
+    return jax.jit(lbrdiv.population.ppo.learn)
 
 
 @pytest.fixture(scope="module")
 def learned(lbrdiv, parts) -> tuple[Any, Any, dict[str, Any]]:
     """The updates of both policies, vmapped."""
-    return compiled(jax.vmap(lbrdiv.population.ppo.learn))(*parts, jax.random.split(jax.random.key(8), 2))
+    return jax.jit(jax.vmap(lbrdiv.population.ppo.learn))(*parts, jax.random.split(jax.random.key(8), 2))
 
 
 @pytest.mark.slow
@@ -143,7 +143,7 @@ def test_a_negative_weight_lowers_the_return(lbrdiv, parts, learned):
         outputs: Any = lbrdiv.population.network.apply(params, hidden, obs, reset)
         return jax.nn.softmax(outputs[1])[..., REWARDED].mean()
 
-    probability = compiled(jax.vmap(probability))
+    probability = jax.jit(jax.vmap(probability))
     change = np.asarray(probability(learned[0]) - probability(parts.params))
     assert change[0] > 0.005
     assert change[1] < -0.005
@@ -181,7 +181,7 @@ def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
     """
     trained = population(algorithm)
 
-    @compiled
+    @jax.jit
     def update(state: PopulationState):
         rollouts = []
 
@@ -195,7 +195,7 @@ def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
                 patch.setattr(Population, "_learn", lambda self, state, *rest: (state.params, state.optimizer, {}))
             return *trained.update(state), *rollouts[0]
 
-    before = update(compiled(trained.init)(jax.random.key(5)))[0]
+    before = update(jax.jit(trained.init)(jax.random.key(5)))[0]
     after, metrics, carry, rollout = update(before)
     return Updated(trained, update, before, after, {n: float(v) for n, v in metrics.items()}, carry, rollout)
 
@@ -274,7 +274,7 @@ def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(l
         shaping = shaping_weight(CONFIG, state.update)
         return sequences(trained.view, rollout, 0, group.agent_slots.ravel(), state.carry.memories[0], last, shaping)
 
-    everyone = jax.tree.map(np.asarray, compiled(sequences_of_all)(before, lbrdiv.carry, lbrdiv.rollout))
+    everyone = jax.tree.map(np.asarray, jax.jit(sequences_of_all)(before, lbrdiv.carry, lbrdiv.rollout))
     for number in range(4):
         slots = assignment.agent_slots(number)[0]
         chosen = np.array([group.agent_slots.ravel().tolist().index(slot) for slot in slots])
@@ -294,7 +294,7 @@ def test_shaped_rewards_count_only_where_a_return_is_raised(lbrdiv):
     assert 0 < lowered.sum() < lowered.size
     shaped = np.random.default_rng(8).uniform(size=lbrdiv.rollout.shaped.shape).astype(np.float32)
 
-    @compiled
+    @jax.jit
     def learned(shaped):
         rollout = lbrdiv.rollout._replace(shaped=shaped)
         return trained._learn(before, trained._players(before.params), lbrdiv.carry, rollout, jax.random.key(1))[0]
@@ -326,7 +326,7 @@ def test_episodes_from_mixed_play_start_where_mixed_play_had_been(comedi_play):
     assert moved.sum() == 4
     np.testing.assert_array_equal(started[moved], visited[source[moved]])
     env = comedi_play.after.carry.env
-    fresh = np.asarray(compiled(comedi_play.population.env.first_record)(env.key, env.episode))
+    fresh = np.asarray(jax.jit(comedi_play.population.env.first_record)(env.key, env.episode))
     np.testing.assert_array_equal(started[~moved], fresh[~moved])
     assert (started[moved] != fresh[moved]).any(axis=1).all()
 

@@ -17,8 +17,8 @@ from generation.learners.population.comedi import CoMeDi
 from generation.learners.population.fcp import FCP
 from generation.learners.population.lbrdiv import LBRDiv, Multipliers
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from tests.helpers.jit import same_bytes
 from tests.helpers.populations import plain_adapt, population
+from tests.helpers.trees import same_bytes
 
 # Assignments.
 

@@ -33,7 +33,7 @@ from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
-from tests.helpers.jit import compiled, same_bytes
+from tests.helpers.trees import same_bytes
 
 CLOSET = Layout("closet", "test_closet", ("WLWW01BW", "LA0WA  W", "WPWWPXWW"))
 EPISODE = 12
@@ -79,12 +79,12 @@ def learner() -> Learner:
 
 @pytest.fixture(scope="module")
 def update(learner) -> UpdateFunction:
-    return compiled(learner.update)
+    return jax.jit(learner.update)
 
 
 @pytest.fixture(scope="module")
 def untrained(learner) -> LearnerState:
-    return compiled(learner.init)(jax.random.key(3))
+    return jax.jit(learner.init)(jax.random.key(3))
 
 
 @pytest.fixture(scope="module")
@@ -203,8 +203,8 @@ def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.nd
         batch = Batch(own._replace(log_prob=log_prob), jnp.asarray(advantage), target)
         return learner.ppo.loss(state.params, jax.tree.map(jnp.asarray, batch))[1]
 
-    by_log_prob = compiled(jax.grad(lambda p, t: losses(p, t)["policy_loss"]))
-    by_target = compiled(jax.grad(lambda t, p: losses(p, t)["value_loss"]))
+    by_log_prob = jax.jit(jax.grad(lambda p, t: losses(p, t)["policy_loss"]))
+    by_target = jax.jit(jax.grad(lambda t, p: losses(p, t)["value_loss"]))
     log_prob = egos(rollout).log_prob
     ratio = np.asarray(by_log_prob(log_prob, target)) * target.size / normalised
     value = target - np.asarray(by_target(target, log_prob)) * target.size
@@ -234,10 +234,10 @@ def test_loss_against_plain_numpy(learner, played):
     hidden = played.before[1].carry.memories[EGO]
     advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
     batch = jax.tree.map(jnp.asarray, Batch(egos_sequences(played.before[1], rollout), advantage, target))
-    total, parts = compiled(learner.ppo.loss)(params, batch)
+    total, parts = jax.jit(learner.ppo.loss)(params, batch)
 
     obs = observe(CLOSET, rollout.record, EGO)
-    output: Any = compiled(learner.network.apply)(params, hidden, obs, rollout.reset)
+    output: Any = jax.jit(learner.network.apply)(params, hidden, obs, rollout.reset)
     logits, value = np.asarray(output[1], np.float64), np.asarray(output[2], np.float64)
     log_probs = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
     chosen = np.take_along_axis(log_probs, rollout.actions[..., EGO, None], axis=-1)[..., 0]
@@ -310,7 +310,7 @@ def test_minibatches_are_shuffled_by_the_key(update, learning):
 def test_an_epoch_leaves_out_the_sequence_that_fills_no_minibatch(learner, learning, played):
     """Four sequences for three minibatches: the key decides which one is left out."""
     ppo = PPO(learner.network, replace(CONFIG, environments=3, minibatches=3, epochs=1))
-    learn = compiled(ppo.learn)
+    learn = jax.jit(ppo.learn)
     given = egos_sequences(played.before[1], played.rollouts[1])
 
     def learned_from(sequence: int, seed: int) -> bool:
@@ -385,7 +385,7 @@ def test_a_teammate_that_sees_the_state_is_given_the_record(learner, played):
     state, rollout = played.before[2], played.rollouts[2]
     mate = policy_player(learner.env, Policy({}, begin, reads, "state"), {}, TEAMMATE, CONFIG.environments)
     players = learner.players(state.params, {})[EGO], mate
-    turn = compiled(lambda carry, key: roll_out(learner.env, players, carry, 1, key))
+    turn = jax.jit(lambda carry, key: roll_out(learner.env, players, carry, 1, key))
     _, turned = turn(state.carry, jax.random.key(0))
     np.testing.assert_array_equal(turned.record[0], rollout.record[0])
     np.testing.assert_array_equal(turned.actions[0, :, TEAMMATE], rollout.record[0].sum(axis=-1, dtype=np.int32) % 4)

@@ -32,7 +32,6 @@ from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
-from tests.helpers.jit import compiled
 from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
@@ -88,7 +87,7 @@ class Played(NamedTuple):
 def play(players: list[Player], restart: Any = None) -> Played:
     """Two roll-outs, one after the other, as one; NumPy."""
     more = () if restart is None else (restart,)
-    run = compiled(lambda carry, key: roll_out(ENV, players, carry, STEPS, key, *more))
+    run = jax.jit(lambda carry, key: roll_out(ENV, players, carry, STEPS, key, *more))
     start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
     middle, one = run(start, jax.random.key(1))
     carry, other = run(middle, jax.random.key(2))
@@ -124,7 +123,7 @@ def apply():
         outputs: Any = NETWORK.apply(params, hidden, obs[None], jnp.zeros((1, obs.shape[0]), bool), partner)
         return outputs[0], outputs[1][0], outputs[2][0]
 
-    return compiled(apply)
+    return jax.jit(apply)
 
 
 def in_state(record: np.ndarray) -> EnvState:
@@ -149,7 +148,7 @@ def test_actions_reach_their_agents(played):
 
 def test_the_game_is_played_with_these_actions(played):
     """Step by step through the environment itself."""
-    step = compiled(ENV.step)
+    step = jax.jit(ENV.step)
     state = played.start.env
     for t, actions in enumerate(played.rollout.actions):
         np.testing.assert_array_equal(played.rollout.record[t], state.record)
@@ -201,7 +200,7 @@ def test_only_players_of_an_ended_episode_restart():
     players = [scripted(slots) for slots in SLOTS]
     start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
     start = start._replace(env=start.env._replace(clock=jnp.array([0, 0, 2, 0])))
-    run = compiled(lambda carry: roll_out(ENV, players, carry, 4, jax.random.key(1)))
+    run = jax.jit(lambda carry: roll_out(ENV, players, carry, 4, jax.random.key(1)))
     carry, rollout = run(start)
     np.testing.assert_array_equal(rollout.done, np.array([[0, 0, n == 2, 0] for n in range(4)], bool))
     for notes, slots in zip(carry.memories, SLOTS, strict=True):
@@ -223,7 +222,7 @@ def test_returns_are_sums_over_the_episode_across_roll_outs(played):
             return super().step(state, actions)._replace(reward=(actions.sum(axis=1) + state.clock).astype(jnp.float32))
 
     env, players = Paying(LAYOUT, EPISODE), [scripted(slots) for slots in SLOTS]
-    run = compiled(lambda carry, key: roll_out(env, players, carry, STEPS, key))
+    run = jax.jit(lambda carry, key: roll_out(env, players, carry, STEPS, key))
     middle, first = run(played.start, jax.random.key(1))
     after, second = run(middle, jax.random.key(2))
     reward, returns = (
@@ -263,7 +262,7 @@ def test_a_network_player_does_what_its_network_says(params, apply, greedy):
     state = in_state(record)
     hidden = jnp.asarray(np.random.default_rng(5).normal(size=(4, 8)), jnp.float32)
     np.testing.assert_array_equal(player.init(state), np.zeros((4, 8)))
-    choice, after = compiled(player.act)(hidden, state, jax.random.key(6))
+    choice, after = jax.jit(player.act)(hidden, state, jax.random.key(6))
 
     both = np.stack([observe(LAYOUT, record, agent) for agent in (EGO, TEAMMATE)])
     expected, logits, value = apply(own, hidden, both[slots // ENVS, slots % ENVS], partner)
@@ -282,7 +281,7 @@ def test_sampled_actions_follow_the_networks_distribution(params):
     record = random_records(LAYOUT, 1, np.random.default_rng(3))
     state = in_state(np.repeat(record, envs, axis=0))
     player = network_player(ENV, NETWORK, own, np.arange(envs), jnp.zeros(envs, int))
-    choice, _ = compiled(player.act)(player.init(state), state, jax.random.key(3))
+    choice, _ = jax.jit(player.act)(player.init(state), state, jax.random.key(3))
     action, log_prob = np.asarray(choice.action), np.asarray(choice.log_prob)
     shares = np.bincount(action, minlength=6) / envs
     seen = shares > 0
@@ -301,11 +300,11 @@ def test_several_policies_in_one_player_act_as_each_alone(params):
     hidden = jnp.asarray(np.random.default_rng(5).normal(size=(6, 8)), jnp.float32)
     together = network_player(ENV, NETWORK, params, slots, partner, greedy=True)
     np.testing.assert_array_equal(together.agent_slots, slots.ravel())
-    choice, after = compiled(together.act)(hidden, state, jax.random.key(0))
+    choice, after = jax.jit(together.act)(hidden, state, jax.random.key(0))
     for policy in range(3):
         alone = network_player(ENV, NETWORK, one(params, policy), slots[policy], partner[policy], greedy=True)
         part = slice(2 * policy, 2 * policy + 2)
-        own, own_after = compiled(alone.act)(hidden[part], state, jax.random.key(0))
+        own, own_after = jax.jit(alone.act)(hidden[part], state, jax.random.key(0))
         np.testing.assert_array_equal(choice.action[part], own.action)
         np.testing.assert_allclose(choice.log_prob[part], own.log_prob, rtol=0, atol=1e-5)
         np.testing.assert_allclose(choice.value[part], own.value, rtol=0, atol=1e-5)
@@ -343,7 +342,7 @@ def test_a_policy_sees_its_own_agents_observation():
     sums = []
     for agent in (EGO, TEAMMATE):
         player = policy_player(ENV, policy, {}, agent, ENVS)
-        sums.append(np.asarray(compiled(player.act)((), state, jax.random.key(0))[0].action))
+        sums.append(np.asarray(jax.jit(player.act)((), state, jax.random.key(0))[0].action))
         np.testing.assert_array_equal(sums[-1], observe(LAYOUT, record, agent).sum(axis=(1, 2, 3)))
     assert (sums[0] != sums[1]).any()
 
@@ -353,7 +352,7 @@ def test_the_random_player_draws_every_action_equally_often():
     player = random_player(TEAMMATE, envs)
     np.testing.assert_array_equal(player.agent_slots, np.arange(envs, 2 * envs))
     state = in_state(random_records(LAYOUT, envs, np.random.default_rng(3)))
-    choice, _ = compiled(player.act)((), state, jax.random.key(2))
+    choice, _ = jax.jit(player.act)((), state, jax.random.key(2))
     shares = np.bincount(choice.action, minlength=6) / envs
     assert len(shares) == 6
     np.testing.assert_allclose(shares, 1 / 6, rtol=0, atol=5 * (1 / 6 * 5 / 6 / envs) ** 0.5)

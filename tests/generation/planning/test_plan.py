@@ -133,7 +133,6 @@ def test_measuring():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize("make", [plan.task_learner, plan.calibration_population])
 def test_measuring_the_learners_of_a_profile(tmp_path, make):
     path = tmp_path / "learned.toml"

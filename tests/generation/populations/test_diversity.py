@@ -48,23 +48,21 @@ POLICIES = [policy(0), policy(1, by_state), policy(0), policy(1), policy(0, turn
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_fast() -> Iterator[None]:
+def every_program_is_kept() -> Iterator[None]:
     """Every call compiles small programs, so compiling is their cost."""
     least = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
-    jax.config.update("jax_disable_most_optimizations", True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
 
 
 @pytest.fixture(scope="module")
-def actions(compiled_fast) -> np.ndarray:
+def actions(every_program_is_kept) -> np.ndarray:
     return actions_on_common_states(LAYOUT, POLICIES, seed=3, steps=STEPS)
 
 
 @pytest.fixture(scope="module")
-def records(compiled_fast) -> jax.Array:
+def records(every_program_is_kept) -> jax.Array:
     """(T, episodes, S) of random agents."""
     env = diversity.Environment(LAYOUT, STEPS)
     players = [diversity.random_player(agent, 3) for agent in (0, 1)]

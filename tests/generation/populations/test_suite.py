@@ -54,8 +54,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.paths import ROOT
-
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
+from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
 SEED = 7
@@ -105,7 +104,7 @@ def run_of(algorithm: str) -> PopulationRun:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, compiled_quickly) -> Callable[..., Path]:
+def trained(tmp_path_factory) -> Callable[..., Path]:
     """Return `trained(*algorithms)`: a suite with at least these populations on cramped_up. Read only."""
     root = tmp_path_factory.mktemp("trained")
 
@@ -127,14 +126,9 @@ def weights(folder: Path) -> dict[str, str]:
 
 
 def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[str]:
-    settings = {
-        "PYTHONPATH": str(ROOT),
-        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),  # type: ignore[attr-defined]
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-    }
+    settings = {"PYTHONPATH": str(ROOT)}
     if devices > 1:
-        settings["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+        settings["XLA_FLAGS"] = add_xla_flag(f"--xla_force_host_platform_device_count={devices}")
     command = [sys.executable, "-c", script, *arguments]
     return subprocess.Popen(command, env=os.environ | settings, stdout=subprocess.PIPE, text=True)
 

@@ -32,9 +32,6 @@ from icrl4aht_data.overcooked.state import faults
 from tests.helpers.states import random_records, state_record
 
 H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
-# These programs are compiled to run a few times: neither optimise them nor use the newer, slower code generator.
-FAST = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-
 PUBLISHED_PLAY = """
 test_simple (5,2) 000 recipe_aware_button 0 325041120202020202020202020240442402020202020202042402020240
 test_simple (5,2) 000 recipe_aware_button 1 444044414444440341314344444444444444444444144444344444444444
@@ -110,7 +107,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
         return jax.lax.scan(step, (record, policy.init(params, jax.random.key(99))), recipes)[1]
 
     batch = jax.vmap(jax.vmap(one, (None, 0, 1), 1), (0, None, None), 1)
-    run = jax.jit(batch, compiler_options=FAST)
+    run = jax.jit(batch)
     actions, rewards = run(stacked(family, thetas), np.concatenate([records, pinned]), recipes)
     return np.asarray(actions), np.asarray(rewards.sum(axis=0))
 
@@ -169,7 +166,7 @@ def compiled_teammates(layout: Layout, slots: tuple[tuple[str, int], ...] = ALL_
         key = jax.random.key(0)
         return [policies[s].act(p, m, record, key) for s, p, m in zip(slots, params, memories, strict=True)]
 
-    return policies, jax.jit(jax.vmap(act), compiler_options=FAST)
+    return policies, jax.jit(jax.vmap(act))
 
 
 def act_all(layout: Layout, slots, params: dict, memories: dict, records: np.ndarray) -> dict:

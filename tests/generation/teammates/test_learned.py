@@ -22,7 +22,6 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.hashes import file_hash
-from tests.helpers.jit import compiled
 from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")
@@ -68,7 +67,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
     obs = observe(LAYOUT, record, slot)
     network = ActorCritic(WIDTHS, partners)
     reset = np.arange(len(record))[:, None] == np.zeros(ENVS)
-    apply = compiled(network.apply)
+    apply = jax.jit(network.apply)
     outputs: Any = apply(params, network.initial_hidden(ENVS), obs, jnp.asarray(reset))
     return np.asarray(outputs[1], np.float64)
 
@@ -76,7 +75,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
 def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
     """Actions (T, N) of a policy in N environments with these states, step by step."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, slot, ENVS)
-    act = compiled(player.act)
+    act = jax.jit(player.act)
     zero = jnp.zeros(ENVS, jnp.int32)
     state = EnvState(jax.random.split(jax.random.key(0), ENVS), zero, zero, jnp.asarray(record[0]))
     memory, actions = player.init(state), []
@@ -102,7 +101,7 @@ def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_p
 def test_the_memory_is_carried_and_matters(suite):
     """The hidden state after other states gives other logits in the same last state, and it starts from zero."""
     policy = learned.build_learned(LAYOUT, suite / "b")
-    act = compiled(policy.act)
+    act = jax.jit(policy.act)
     obs = observe(LAYOUT, states(STEPS, 5)[:, 0], TEAMMATE)
     start = policy.init(policy.params, jax.random.key(0))
     np.testing.assert_array_equal(start, np.zeros(8))
@@ -126,7 +125,7 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
     def draws(policy):
         many = jax.vmap(policy.act, in_axes=(None, None, None, 0))
         hidden = policy.init(policy.params, jax.random.key(0))
-        return np.asarray(compiled(many)(policy.params, hidden, obs, keys)[0])
+        return np.asarray(jax.jit(many)(policy.params, hidden, obs, keys)[0])
 
     shares = np.bincount(draws(sampled), minlength=len(ACTIONS)) / 3000
     bound = 5 * (probability * (1 - probability) / 3000) ** 0.5 + 1e-3

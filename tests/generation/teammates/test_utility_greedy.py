@@ -21,7 +21,6 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, PUBLISHED_ACTIONS, RIGHT, STAY, TEAMMATE, UP
 from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL, Layout
 from icrl4aht_data.overcooked.state import ingredient_count, start, unpack
-from tests.helpers.jit import compiled
 from tests.helpers.states import random_records, state_record
 
 PUBLISHED_PLAY = "030512503051250305125325124444444444444450530512503051250305"
@@ -87,7 +86,7 @@ def _scan(layout: Layout, slot: int, noise: Noise, steps: int):
         return jax.lax.scan(step, (record, policy.init(params, key)), recipes)[1]
 
     batch = jax.vmap(jax.vmap(one, (None, 0, 1, 0), 1), (0, None, None, None), 1)
-    return compiled(batch)
+    return jax.jit(batch)
 
 
 def play(
@@ -330,7 +329,7 @@ def test_equals_plain_rules_on_random_states(layout, slot):
     keys = jax.random.wrap_key_data(jnp.stack([jnp.asarray(rolls, jnp.uint32), jnp.zeros(n, jnp.uint32)], axis=1))
     policy = build_teammate(layout, {"family": "utility_greedy", "theta": UTILITY_GREEDY.defaults}, slot)
     memory = GreedyMemory(keys, jnp.asarray(last, jnp.int32), jnp.zeros(n, jnp.int32))
-    act = compiled(jax.vmap(policy.act))
+    act = jax.jit(jax.vmap(policy.act))
     actions, after = act(params, memory, records, keys)
     found = [Plain(*row) for row in np.stack([after.intent, actions, after.wait], axis=1).tolist()]
     expected = [plain_rules(layout, thetas[of[i]], records[i], slot, int(last[i]), int(rolls[i])) for i in range(n)]
@@ -350,7 +349,7 @@ def _act(slot: int):
     """H4 in cramped_up, eight at once: memory, records (8, S) -> actions (8,), memory."""
     policy = build_teammate(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot)
     keys = jax.random.split(jax.random.key(0), 8)
-    act = compiled(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)))
+    act = jax.jit(jax.vmap(policy.act, in_axes=(None, 0, 0, 0)))
     return lambda memory, records: act(policy.params, memory, records, keys)
 
 

@@ -1,20 +1,12 @@
-"""Compilation and comparison of small JAX programs."""
+"""Comparison of trees of arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-FAST = {"xla_backend_optimization_level": 0}
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """Return `jax.jit(function)` without optimizations, which compiles faster and runs slower."""
-    return jax.jit(function, compiler_options=FAST)
 
 
 def same_bytes(one: Any, other: Any) -> bool:
