@@ -1,4 +1,4 @@
-"""Collecting on a full disk: a clear error, no signal, nothing left behind, the other tasks finished."""
+"""Collecting on a full disk: a clear error, no signal, nothing left behind."""
 
 from __future__ import annotations
 
@@ -6,20 +6,16 @@ import errno
 import json
 import os
 import shutil
-from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from generation.collection import failures
 from generation.collection.failures import FailureLog
-from generation.collection.job import CollectionError, TaskOutcome
-from generation.collection.options import CollectOptions
+from generation.collection.job import TaskOutcome
 from generation.collection.record import array_shapes
-from generation.collection.run import collect_tasks
 from generation.collection.task import run_task
 from generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
 from generation.learners.resume import RunLog, StateFile
@@ -108,23 +104,6 @@ def test_failures_wait_for_room(task, tmp_path, monkeypatch):
     log.forget(["another"])
     assert log.is_written
     assert json.loads((tmp_path / "failed.jsonl").read_text())["error"] == "DiskFullError: no room"
-
-
-def test_the_other_tasks_are_finished(built, pair, tmp_path, monkeypatch):
-    """The first of two tasks meets a full disk; the second is finished, and the list of failures says so."""
-    profile = load_profile(str(built / "pair.toml"))
-    tasks = profile.works()
-    second = tmp_path / "artefacts" / tasks[1].name
-    shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
-    output = StringIO()
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 5_000))
-    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {tasks[0].name}; "):
-        collect_tasks(tasks, profile, tmp_path, Console(file=output, width=500), CollectOptions())
-    assert second.is_dir()
-    (line,) = (tmp_path / "failed.jsonl").read_text().splitlines()
-    assert json.loads(line)["error"].startswith("DiskFullError: ")
-    assert "failed once: DiskFullError: " in output.getvalue()
-    assert "Traceback" not in output.getvalue()
 
 
 COLLECT_ON_SMALL_DISKS = """

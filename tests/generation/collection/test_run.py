@@ -9,6 +9,7 @@ import sys
 import time
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -119,6 +120,23 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     before = (folder / "metadata.json").stat().st_mtime_ns
     assert job.CollectionJob(profile, folder.parent, None, wait=True)(work) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
+
+
+def test_a_full_disk_ends_one_task(built, pair, tmp_path, monkeypatch):
+    """The first of two tasks meets it; the second is finished, and the list of failures says so."""
+    profile = load_profile(str(built / "pair.toml"))
+    tasks = profile.works()
+    second = tmp_path / "artefacts" / tasks[1].name
+    shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, used=10**9, free=5_000))
+    output = StringIO()
+    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {tasks[0].name}; "):
+        collect_tasks(tasks, profile, tmp_path, Console(file=output, width=500), CollectOptions())
+    assert second.is_dir()
+    (failure,) = failures(tmp_path)
+    assert failure["error"].startswith("DiskFullError: ")
+    assert "failed once: DiskFullError: " in output.getvalue()
+    assert "Traceback" not in output.getvalue()
 
 
 def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(built, pair, tmp_path, monkeypatch, capsys):
