@@ -27,7 +27,7 @@ from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_releases import random_release
 from tests.helpers.tiny import PAIR, TINY
 from tests.helpers.two_sources import two_source_release
-from tests.helpers.xla_flags import add_xla_flag
+from tests.helpers.xla_flags import add_xla_flag, is_xla_flag
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
@@ -49,7 +49,8 @@ def pytest_configure() -> None:
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0":
         jax.config.update("jax_disable_most_optimizations", True)
-        os.environ["XLA_FLAGS"] = add_xla_flag(QUICK_COMPILATION)
+        if QUICK_COMPILATION in os.environ.get("XLA_FLAGS", "").split() or is_xla_flag(QUICK_COMPILATION):
+            os.environ["XLA_FLAGS"] = add_xla_flag(QUICK_COMPILATION)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # bits and tolerances are a CPU's, and workers share no GPU
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
     os.environ.setdefault("PJRT_NPROC", "1")  # what the profiles of the tests choose, before JAX is first used

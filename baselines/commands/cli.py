@@ -74,7 +74,7 @@ _SECTIONS = {
     "Train and evaluate": ("demo", "train", "evaluate", "report", "watch", "collect"),
     "Reference models": ("models", "reference", "results"),
     "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
-    "Check": ("control", "drift", "headroom"),
+    "Check": ("control", "drift", "headroom", "unseen"),
 }
 
 
@@ -263,8 +263,8 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     check_new_file(out, overwrite)
     task = published_task(layout, teammate)
     (shown,) = save_episodes({1: out}, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
-    teammate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
-    _console.print(f"{ego} with {teammate}: return {shown.earned:g}; wrote {out}")
+    mate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
+    _console.print(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
 
 
 @cli.command(

@@ -1,4 +1,4 @@
-"""Commands of the paper's experiments and of checks: the positive control, drift and headroom."""
+"""Commands of the paper's experiments and of checks: the positive control, drift, headroom and unseen layouts."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import click
 from rich.console import Console
 
 from baselines.commands.options import (
+    EGO_NAME,
     PROTOCOL_NAME,
     default_batch_size,
     experiment_options,
+    find_ego,
+    greedy_option,
     protocol_option,
     variant_names,
 )
 from generation.teammates.instances import INSTANCES, published_task
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, bars, examples
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_files
@@ -192,6 +195,60 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
         click.echo(f"{number:>7}  {same.mean():>11.1%}  {distance.mean():>21.6f}  {distance.max():>10.6f}")
 
 
+@click.command(
+    "unseen",
+    epilog=examples("python -m baselines unseen --agent rl2-reference", "python -m baselines unseen --agent runs/rl2"),
+)
+@click.option("--agent", "agents", type=EGO_NAME, multiple=True, help="Model, besides stay and oracle; repeat.")
+@greedy_option
+@click.option(
+    "--layout", "layouts", type=LAYOUT, multiple=True, default=TRACKS["layout"]["train"], help="Layout to rearrange."
+)
+@click.option("--versions", type=COUNT, default=16, help="Number of rearranged versions of each layout.")
+@click.option("--episodes", type=COUNT, default=40, help="Episodes on each version with each family of teammates.")
+@click.option("--store", is_flag=True, help="Also add the results to the package's stored results.")
+def unseen_command(
+    agents: tuple[str, ...], greedy: bool | None, layouts: tuple[str, ...], versions: int, episodes: int, store: bool
+) -> None:
+    """Evaluate on rearranged layouts that no model was trained on.
+
+    They show whether a model knows the game or its training layouts, without a test task. Plays versions of training
+    layouts that have pots, piles and counters in other places, with the diverse validation teammates. Prints mean
+    returns.
+    """
+    from baselines.evaluate.protocols import bundled_tasks
+    from baselines.online.unseen import unseen_returns
+    from baselines.report.comparison import unseen_table
+    from baselines.report.stored_results import ENDS, StoredResults, add_unseen, read_stored, results_file, write_stored
+
+    if store and episodes < 2 * ENDS:
+        raise click.UsageError(f"--episodes {episodes}: expected at least {2 * ENDS} with --store")
+    names = {get_layout(name).name for name in layouts}
+    tasks = [
+        task
+        for track in TRACKS
+        for task in bundled_tasks(track, "diverse")
+        if task.layout.name in names and track == track_of(task.layout.name)
+    ]
+    if missing := names - {task.layout.name for task in tasks}:
+        raise click.UsageError(
+            f"--layout {' '.join(sorted(missing))}: no validation tasks; choose layouts that models are trained on"
+        )
+    egos = [find_ego("--agent", name, greedy=greedy) for name in dict.fromkeys(("stay", "oracle", *agents))]
+    for ego in egos:
+        for task in {task.layout.name: task for task in tasks}.values():
+            ego.make(task.layout)  # a model that does not fit fails before any work
+    with bars(edges=True, unit="episodes") as show:
+
+        def played(what: str, done: int, total: int) -> None:
+            show("unseen layouts", done, total, f": {what}")
+
+        found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
+    click.echo(unseen_table(add_unseen(StoredResults({}, {}), found)))
+    if store:
+        write_stored(results_file(), add_unseen(read_stored(results_file()), found))
+
+
 EXPERIMENT_COMMANDS = (
     sweep_command,
     ablate_command,
@@ -200,5 +257,6 @@ EXPERIMENT_COMMANDS = (
     control_command,
     headroom_command,
     drift_command,
+    unseen_command,
 )
 """Commands of this module."""

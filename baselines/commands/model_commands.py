@@ -12,7 +12,9 @@ from rich.console import Console
 from baselines.commands.options import (
     ABLATION_NAME,
     EGO_NAME,
+    HISTORIES_NAME,
     REFERENCE_NAME,
+    check_alone,
     find_ego,
     greedy_option,
     history_filters,
@@ -68,6 +70,11 @@ _console = Console(soft_wrap=True)
     help="Chance of a random action in a history's first and in its last episode.",
 )
 @click.option(
+    "--like",
+    type=HISTORIES_NAME,
+    help="In place of these three: those of the histories of RL^2 for reference models, student or rising.",
+)
+@click.option(
     "--labeller",
     type=EGO_NAME,
     help="Another agent, such as rl2-reference, whose most probable actions become the expert actions.",
@@ -85,6 +92,7 @@ def collect_command(
     histories: int,
     episodes: int,
     noise: tuple[float, float],
+    like: str | None,
     labeller: str | None,
     manifests: tuple[Path, ...],
     number: int,
@@ -97,11 +105,15 @@ def collect_command(
     and what the scripted oracle would have done (oracle actions). Validation teammates are played, too.
     """
     from baselines.online.student import collect_release, release_teammates
+    from baselines.reference import RL2_HISTORIES
     from baselines.training.histories import filter_histories
     from generation.profiles.noise_config import NoiseConfig
 
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
+    if like is not None:
+        check_alone("--like", "histories", "episodes", "noise")
+        config = RL2_HISTORIES[like]
     ego = find_ego("--agent", agent, greedy=greedy)
     other = find_ego("--labeller", labeller, greedy=True) if labeller else None
     names = [get_layout(name).name for name in layouts] or None

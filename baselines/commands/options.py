@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
 from baselines.training.ablations import ABLATIONS
@@ -84,6 +85,7 @@ _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() 
 _playing = lazy_attribute("baselines.methods.registry", "PLAYING")
 ABLATION_NAME = Names("ablation", lambda: [name.removeprefix("ablate ") for name in ABLATIONS])
 REFERENCE_NAME = Names("reference model", lazy_attribute("baselines.reference", "RECIPES"))
+HISTORIES_NAME = Names("kind of histories", lazy_attribute("baselines.reference", "RL2_HISTORIES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("baselines.evaluate.protocols", "PROTOCOLS"))
 
 protocol_option = click.option(
@@ -320,6 +322,18 @@ def prepare_rl2(
         f"with the teammates of {len(played['groups'])} families and layouts"
     )
     return job, options, text
+
+
+def check_alone(option: str, *others: str) -> None:
+    """Check that parameters which an option replaces were not given beside it.
+
+    Raises:
+        click.UsageError: if one was; names all of these.
+    """
+    context = click.get_current_context()
+    given = [name for name in others if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
+    if given:
+        raise click.UsageError(f"{option}: not with {_flags(given)}, which it sets; leave one of them out")
 
 
 def _flags(names: Iterable[str]) -> str:

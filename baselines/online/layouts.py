@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from baselines.evaluate.protocols import FOUR_RECIPES
+from baselines.training.options import MOST_REARRANGED
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import EMPTY, STEP, Layout, get_layout
@@ -25,23 +26,35 @@ def with_four_recipes(layout: Layout) -> Layout:
     return replace(layout, name=f"{layout.name} four recipes", recipes=FOUR_RECIPES)
 
 
-def rearranged_layouts(layout: Layout, count: int, seed: int = 0) -> list[Layout]:
+def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
+    """Returns rearranged versions of a layout that no model is trained on, with the layout's own recipes.
+
+    They have the layout's name: what a model was told of the layout, such as hidden recipe indicators, holds for them.
+
+    Raises:
+        OptionError: as `rearranged_layouts`.
+    """
+    found = rearranged_layouts(layout, MOST_REARRANGED + count)[MOST_REARRANGED:]
+    return [replace(layout, rows=one.rows) for one in found]
+
+
+def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
     """Returns layouts with the same rooms, and with counters, piles, pots and other fixtures in other places.
 
     A fixture moves only to cells that the same agents reach, so that the same work is possible. None of the layouts is
-    one of the benchmark, mirrored ones included. Every second one has the four recipes of `with_four_recipes`.
+    one of the benchmark, mirrored ones included. Every second one has the four recipes of `with_four_recipes`. Fewer
+    are the first ones of more.
 
     Args:
         layout: the layout.
         count: number of different layouts.
-        seed: seed of the arrangements.
 
     Raises:
         OptionError: if there are not so many different ones, or if the layout has no pile of one of the ingredients of
             the four recipes.
     """
     recipes = with_four_recipes(layout).recipes
-    rng = np.random.default_rng([seed, *map(ord, layout.name)])
+    rng = np.random.default_rng([0, *map(ord, layout.name)])
     known = {mirrored for name in LAYOUT_NAMES for mirrored in _mirrored(get_layout(name).rows)}
     found: list[Layout] = []
     for _ in range(100 * count):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,7 @@ from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.online.layouts import rearranged_layouts, with_four_recipes
 from baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_groups
-from baselines.online.teammates import check_heuristics
+from baselines.online.teammates import check_heuristics, mixed_chances, with_manners
 from baselines.training.histories import filter_histories, history_settings, training_cells
 from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.seen import TASKS_SOURCE
@@ -37,8 +36,11 @@ from icrl4aht_data.utils.files import json_hash
 FLAT_SHARE = 0.3
 """Number of tasks on a layout where the ego matters with no teammate, as a share of that on other layouts."""
 
-OTHER_SHARE = 0.2
-"""Number of tasks on a layout that is none of the benchmark's, as a share of that on others."""
+FOUR_RECIPES_SHARE = 0.2
+"""Number of tasks on a layout with four recipes, as a share of that on others."""
+
+REARRANGED_SHARE = 1.5
+"""Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
 
 
 class PlayJob(NamedTuple):
@@ -103,13 +105,8 @@ def prepare_play(
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     teammates = _teammates(dataset, tasks)
     _check_layouts(layouts, teammates)
-    others = _other_layouts(teammates, play)
-    everywhere = teammates | {(other, family): _rebuilt(mates, other) for other, _, family, mates in others}
-    policies = {key: [mate.policy for mate in found.values()] for key, found in everywhere.items()}
-    shares = _shares(dataset, tasks) | {other.name: OTHER_SHARE for other, *_ in others}
-    hides = {*hidden, *(other.name for other, layout, *_ in others if layout.name in hidden)}
-    groups = make_groups(policies, options.batch_size, shares, hides)
-    played = _played(everywhere, groups)
+    shares = _shares(dataset, tasks)
+    groups, played = _groups(teammates, shares, hidden, play, options.batch_size)
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -193,46 +190,85 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
         )
 
 
-def _other_layouts(teammates: _Teammates, play: PlayOptions) -> list[tuple[Layout, Layout, str, dict[str, _Teammate]]]:
-    """Returns layouts that are none of the benchmark's, with what they were made of, and a family and its heuristics.
-
-    Each layout with four recipes has the first family of the layout, the rearranged layouts have its families in turn.
+def _groups(
+    teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
+) -> tuple[list[TaskGroup], set[str]]:
+    """Returns the groups of tasks, and the ids of the tasks whose teammates they play with; with few tasks not all are.
 
     Raises:
-        OptionError: if a layout has learned teammates alone, which play on their own layout only.
+        OptionError: if other layouts are wanted and a layout has learned teammates alone, which play on it only.
     """
-    wanted = play.four_recipes or play.rearranged
-    found = []
-    for layout in dict.fromkeys(layout for layout, _ in teammates) if wanted else ():
-        families = {
-            family: mates
-            for (one, family), mates in teammates.items()
-            if one is layout and all(mate.entry["kind"] == "heuristic" for mate in mates.values())
-        }
+    heuristics = _heuristic_families(teammates) if play.four_recipes or play.rearranged else {}
+    everywhere = dict(teammates)
+    for layout, families in heuristics.items() if play.four_recipes else ():
+        other, family = with_four_recipes(layout), next(iter(families))
+        everywhere[other, family] = _rebuilt(families[family], other)
+        shares = {**shares, other.name: FOUR_RECIPES_SHARE}
+        hidden = [*hidden, *[other.name] * (layout.name in hidden)]
+    total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
+    rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
+    fixed = round(tasks * total / (total + sum(rearranged.values())))
+    policies = {key: [mate.policy for mate in found.values()] for key, found in everywhere.items()}
+    groups = make_groups(policies, fixed, shares, hidden)
+    played: set[str] = set()
+    for group in groups:
+        names = list(everywhere[group.layouts[0], group.family])
+        played |= {names[number] for number in chosen_teammates(len(names), len(group.teammates))}
+    for layout, share in rearranged.items():
+        count = round((tasks - fixed) * share / sum(rearranged.values()))
+        for group, names in _rearranged_groups(
+            layout, heuristics[layout], count, play.rearranged, layout.name in hidden
+        ):
+            groups.append(group)
+            played |= names
+    return groups, played
+
+
+def _heuristic_families(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
+    """Returns the families of each layout that are heuristics, which can play on other layouts as well."""
+    found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
+    for (layout, family), mates in teammates.items():
+        if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):
+            found[layout][family] = mates
+    for layout, families in found.items():
         if not families:
             raise OptionError(
                 f"{layout.name}: rearranged layouts and four recipes need heuristic teammates, this layout has learned "
                 f"ones alone; leave out --rearranged and --four-recipes, or give a manifest with heuristics"
             )
-        made = [with_four_recipes(layout)] * play.four_recipes
-        made += rearranged_layouts(layout, play.rearranged) if play.rearranged else []
-        turns = zip(made, itertools.cycle(families.items()), strict=False)
-        found += [(other, layout, family, mates) for other, (family, mates) in turns]
+    return found
+
+
+def _rearranged_groups(
+    layout: Layout, families: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
+) -> list[tuple[TaskGroup, set[str]]]:
+    """Returns a group of each family on rearranged versions of a layout, and the tasks that its teammates are of.
+
+    The versions are divided equally among the families, and the tasks of a family among its versions, at
+    least one each.
+    """
+    layouts = rearranged_layouts(layout, versions)
+    ends = [round(versions * k / len(families)) for k in range(len(families) + 1)]
+    found = []
+    for (family, mates), first, end in zip(families.items(), ends, ends[1:], strict=False):
+        own = layouts[first:end]
+        if not own:
+            continue
+        count = max(len(own), round(tasks * len(own) / versions))
+        where = [own[task % len(own)] for task in range(count)]
+        chosen = [list(mates)[k] for k in chosen_teammates(len(mates), count)]
+        policies = [build_teammate(one, mates[name].entry) for one, name in zip(where, chosen, strict=True)]
+        manners = [
+            with_manners([policy], chances[None])[0]
+            for policy, chances in zip(policies, mixed_chances(count), strict=True)
+        ]
+        found.append((TaskGroup(where, family, manners, hidden, f"{layout.name} rearranged"), set(chosen)))
     return found
 
 
 def _rebuilt(mates: Mapping[str, _Teammate], layout: Layout) -> dict[str, _Teammate]:
     """Returns heuristics on another layout."""
     return {task_id: mate._replace(policy=build_teammate(layout, mate.entry)) for task_id, mate in mates.items()}
-
-
-def _played(teammates: _Teammates, groups: Sequence[TaskGroup]) -> set[str]:
-    """Returns the tasks whose teammates are played with; with few tasks not all are."""
-    played: set[str] = set()
-    for group in groups:
-        names = list(teammates[group.layout, group.family])
-        played |= {names[number] for number in chosen_teammates(len(names), len(group.teammates))}
-    return played
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -30,12 +30,13 @@ from baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutS
 from baselines.methods.method import Method
 from baselines.methods.tokens import StepInput, percept_step
 from baselines.methods.view_change import ViewChange, no_change
+from baselines.online.programs import SharedProgram, run_all, shared_programs
 from baselines.online.teammates import mixed_chances, with_manners
 from baselines.training.options import PlayOptions, TrainOptions
 from generation.collection.curate import follow_oracle
 from generation.learners.config import PPOConfig
 from generation.learners.ppo import PPO, Sequences, ppo_optimizer
-from generation.policy import Policy
+from generation.policy import Policy, stacked
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -79,24 +80,26 @@ class PlayState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TaskGroup:
-    """Tasks of one layout and one family of teammates, which are played side by side.
+    """Tasks of one family of teammates, on one layout or on as many as there are tasks, which are played side by side.
 
     Attributes:
-        layout: the layout.
+        layouts: the layout of all tasks alone, or one for each task.
         family: kind of the teammates, such as "assembly_line".
-        teammates: policies that share their functions, one for each task.
+        teammates: policies, one for each task; those on one layout share their functions.
         hidden: whether the model does not see recipe indicators.
+        label: the layouts' name in the log.
     """
 
-    layout: Layout
+    layouts: Sequence[Layout]
     family: str
     teammates: Sequence[Policy]
-    hidden: bool = False
+    hidden: bool
+    label: str
 
     @property
     def name(self) -> str:
         """Name in the log."""
-        return f"{self.layout.name} {self.family}"
+        return f"{self.label} {self.family}"
 
 
 def make_groups(
@@ -121,7 +124,8 @@ def make_groups(
     for (layout, family), policies in teammates.items():
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
         chosen = [policies[number] for number in chosen_teammates(len(policies), count)]
-        groups.append(TaskGroup(layout, family, with_manners(chosen, mixed_chances(count)), layout.name in hidden))
+        mates = with_manners(chosen, mixed_chances(count))
+        groups.append(TaskGroup([layout], family, mates, layout.name in hidden, layout.name))
     return groups
 
 
@@ -146,16 +150,17 @@ class _Network(NamedTuple):
         return state, output.logits, output.value
 
 
-class _GroupPlayer:
-    """Plays one episode after another of a group's tasks."""
+class _Player:
+    """Plays one episode after another of tasks on one layout."""
 
-    def __init__(self, group: TaskGroup, method: Method, play: PlayOptions, mirror: bool) -> None:
-        self.group, self._method, self._play, self._mirror = group, method, play, mirror
-        self._changes = mirror or group.hidden
-        ego = _model_policy(method, group.layout, self._changes)
-        self.rollout = EvaluationRollout(group.layout, ego, group.teammates, get_protocol("seeded"))
-        self.tasks = len(group.teammates)
-        self.episode = jax.jit(self._episode)
+    def __init__(
+        self, layout: Layout, teammates: Sequence[Policy], hidden: bool, method: Method, play: PlayOptions, mirror: bool
+    ) -> None:
+        self.layout, self.hidden, self._method, self._play, self._mirror = layout, hidden, method, play, mirror
+        self._changes = mirror or hidden
+        ego = _model_policy(method, layout, self._changes)
+        self.rollout = EvaluationRollout(layout, ego, teammates, get_protocol("seeded"))
+        self.tasks = len(teammates)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Returns the state before the first episode of all tasks."""
@@ -164,13 +169,13 @@ class _GroupPlayer:
         return state._replace(ego=state.ego._replace(change=self._draw_change(change_key)))
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
-        change = no_change(self.tasks)._replace(hidden=jnp.full(self.tasks, self.group.hidden))
+        change = no_change(self.tasks)._replace(hidden=jnp.full(self.tasks, self.hidden))
         if not self._mirror:
             return change
         upside_down, sideways = jax.random.bernoulli(key, 0.5, (2, self.tasks))
         return change._replace(upside_down=upside_down, sideways=sideways)
 
-    def _episode(
+    def episode(
         self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
     ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
         """Returns the state after one episode of every task, the episode for learning, and its returns."""
@@ -186,7 +191,7 @@ class _GroupPlayer:
     def _sequences(
         self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
     ) -> Sequences:
-        layout, change = self.group.layout, state.ego.change
+        layout, change = self.layout, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
         # One step more than was played: the value there is what the last step leads to.
@@ -219,6 +224,74 @@ class _GroupPlayer:
             last_value=value[-1][None],
             expert=own.actions(follow_oracle(layout, record, taken)),
         )
+
+
+class _GroupPlayer:
+    """Plays one episode after another of a group's tasks, all in one compiled program."""
+
+    def __init__(self, group: TaskGroup, method: Method, play: PlayOptions, mirror: bool) -> None:
+        self.group, self.tasks = group, len(group.teammates)
+        player = _Player(group.layouts[0], group.teammates, group.hidden, method, play, mirror)
+        self.mates = player.rollout.teammate_params
+        self.start: Callable[..., RolloutState] = player.start
+        self.episode: Any = jax.jit(player.episode)
+
+
+class _LayoutsPlayer:
+    """Plays one episode after another of tasks that are each on a layout of its own, all in one compiled program.
+
+    `start` and `episode` are programs of `_Player` for one task, with the tables of every task's layout.
+    """
+
+    def __init__(self, group: TaskGroup, start: SharedProgram, episode: SharedProgram) -> None:
+        self.group, self.tasks = group, len(group.teammates)
+        self.mates = jax.tree.map(lambda leaf: leaf[:, None], stacked(mate.params for mate in group.teammates))
+        self._start, self._episode = start, episode
+        self.episode: Any = jax.jit(self._play)
+
+    def start(self, key: Key[Array, ""]) -> RolloutState:
+        """Returns the state before the first episode of all tasks."""
+        state = run_all(self._start, 0, jax.random.split(key, self.tasks))
+        return jax.tree.map(lambda leaf: leaf[:, 0], state)
+
+    def _play(
+        self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
+    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
+        state = jax.tree.map(lambda leaf: leaf[:, None], state)
+        keys = jax.random.split(key, self.tasks)
+        after, sequences, returns = run_all(self._episode, 1, params, mates, state, keys)
+        after = jax.tree.map(lambda leaf: leaf[:, 0], after)
+        return after, jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, :, 0], 0, 1), sequences), returns[:, 0]
+
+
+def _group_players(
+    group: TaskGroup, method: Method, play: PlayOptions, mirror: bool
+) -> Sequence[_GroupPlayer | _LayoutsPlayer]:
+    """Returns the players of a group; more than one if its layouts differ in more than their tables."""
+    if len(group.layouts) == 1:
+        return [_GroupPlayer(group, method, play, mirror)]
+    layouts = list(dict.fromkeys(group.layouts))
+    players = [
+        _Player(layout, [group.teammates[group.layouts.index(layout)]], group.hidden, method, play, mirror)
+        for layout in layouts
+    ]
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    params = jax.eval_shape(lambda: method.init(jax.random.key(0)))
+    state, mates = jax.eval_shape(players[0].start, key), players[0].rollout.teammate_params
+    found = []
+    for episode in shared_programs([player.episode for player in players], params, mates, state, key):
+        # A start is a part of an episode, after which the next one starts: equal episodes have equal starts.
+        (start,) = shared_programs([players[number].start for number in episode.members], key)
+        own = [layouts[number] for number in episode.members]
+        tasks = [task for task, layout in enumerate(group.layouts) if layout in own]
+        rows = [own.index(group.layouts[task]) for task in tasks]
+        part = replace(
+            group,
+            layouts=[group.layouts[task] for task in tasks],
+            teammates=[group.teammates[task] for task in tasks],
+        )
+        found.append(_LayoutsPlayer(part, start.repeated(rows), episode.repeated(rows)))
+    return found
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
@@ -309,8 +382,8 @@ class PlayTrainer:
         mirror: bool = False,
     ) -> None:
         self.method, self.options, self.play = method, options, play
-        self.players = [_GroupPlayer(group, method, play, mirror) for group in groups]
-        self._mates = [player.rollout.teammate_params for player in self.players]
+        self.players = [player for group in groups for player in _group_players(group, method, play, mirror)]
+        self._mates = [player.mates for player in self.players]
         self.tasks = sum(player.tasks for player in self.players)
         if self.tasks < play.minibatches:
             raise OptionError(
@@ -371,7 +444,10 @@ class PlayTrainer:
         tasks, sequences, returns = zip(*played, strict=True)
         weight = imitation_weight(self.play, state.step, self.options.steps)
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
-        log |= {f"return {one.group.name}": own.mean() for one, own in zip(self.players, returns, strict=True)}
+        by_name: dict[str, list[Array]] = defaultdict(list)
+        for player, own in zip(self.players, returns, strict=True):
+            by_name[player.group.name].append(own)
+        log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:

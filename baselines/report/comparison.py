@@ -23,7 +23,7 @@ from baselines.report.results import (
     normalise,
     published_cells,
 )
-from baselines.report.stored_results import CellReturns, StoredResults
+from baselines.report.stored_results import UNSEEN, CellReturns, StoredResults
 from baselines.training.ablations import ABLATIONS
 from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
@@ -198,6 +198,42 @@ def ablation_table(stored: StoredResults, name: str) -> str:
     return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], rows)
 
 
+def unseen_table(stored: StoredResults) -> str:
+    """Returns a table with a row for each agent that played on unseen layouts, and a column for each layout's versions.
+
+    Returns are means over versions and families; normalised ones (return - `stay`) / (`oracle` - `stay`), mean over
+    layouts. Intervals are over the versions. Without `stay` and `oracle` there are no normalised ones.
+    """
+    found = {agent: stored.cells[agent, UNSEEN] for agent in stored.agents(UNSEEN)}
+    layouts = sorted({layout for cells in found.values() for layout, _ in cells})
+    versions = {  # agent -> layout -> (V,)
+        agent: {
+            layout: np.mean([cells[cell].mean.mean(axis=1) for cell in cells if cell[0] == layout], axis=0)
+            for layout in layouts
+            if layout in {name for name, _ in cells}
+        }
+        for agent, cells in found.items()
+    }
+    rows = []
+    for agent, own in versions.items():
+        texts = [_with_interval(own[layout][:, None]) if layout in own else "" for layout in layouts]
+        rows.append([_code(agent), *texts, _unseen_score(versions, agent, layouts)])
+    return markdown_table(["agent", *layouts, "normalised"], rows)
+
+
+def _unseen_score(versions: Mapping[str, Mapping[str, np.ndarray]], agent: str, layouts: Sequence[str]) -> str:
+    """Returns the normalised return of an agent on the versions of all layouts as text; empty if it has none."""
+    egos = [versions.get(name, {}) for name in ("stay", agent, "oracle")]
+    if agent in REFERENCES or not all(layout in ego for ego in egos for layout in layouts):
+        return ""
+    cells = []
+    for layout in layouts:
+        stay, own, oracle = (ego[layout] for ego in egos)
+        cells.append((own - stay) / (oracle.mean() - stay.mean()))
+    mean, low, high = mean_of_cells(cells)
+    return f"{mean:z.2f} ({low:z.2f} to {high:z.2f})"
+
+
 def _with_interval(values: Float[np.ndarray, "U S"], sign: str = "") -> str:
     low, high = bootstrap_interval(values, np.random.default_rng(0))
     return f"{values.mean():{sign}z.1f} ({low:{sign}z.1f} to {high:{sign}z.1f})"
@@ -268,6 +304,7 @@ def render_page(stored: StoredResults, agents: Sequence[str]) -> str:
         diverse=validation_table(stored, rising, "diverse"),
         windows=ablation_table(stored, "ablate windows"),
         contexts=ablation_table(stored, "ablate contexts"),
+        unseen=unseen_table(stored),
         marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
         references=", ".join(map(_code, REFERENCES)),
         forgets=f"`NAME{FORGETS}`",
@@ -305,4 +342,4 @@ def drawn_agents(stored: StoredResults) -> list[str]:
 
 def shown_agents(stored: StoredResults) -> list[str]:
     """Returns the agents that have results, in the order in which they were stored."""
-    return list(dict.fromkeys(agent for agent, protocol in stored.cells if protocol not in ABLATIONS))
+    return list(dict.fromkeys(agent for agent, protocol in stored.cells if protocol not in (*ABLATIONS, UNSEEN)))

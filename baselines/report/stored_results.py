@@ -1,7 +1,8 @@
 """The stored results of reference models, `cards/results.json`.
 
 For each agent and protocol, it has what each test task and seed earned: the mean return, and those of the first and the
-last 20 episodes. Ablations are stored in the same way, with the ablation's name in place of the protocol.
+last 20 episodes. Ablations are stored in the same way, with the ablation's name in place of the protocol, and so are
+returns on unseen layouts.
 
 Shapes: U tasks, S seeds with which each was played.
 """
@@ -28,6 +29,9 @@ from icrl4aht_data.utils.templates import card_file
 
 ENDS = 20
 """Episodes at each end of a task for the adaptation gain (paper, App. F)."""
+
+UNSEEN = "unseen"
+"""In place of a protocol: results on rearranged layouts, see `baselines.online.unseen`; a task for each of them."""
 
 _NUMBERS = ("mean", "first", "last", "opening")
 _DIGITS = 3
@@ -62,7 +66,7 @@ class StoredResults:
 
     Attributes:
         cells: (agent, protocol) -> cell -> returns. Entries of ablations are stored like agents, with the experiment's
-            name instead of a protocol.
+            name instead of a protocol; results on unseen layouts with `UNSEEN`.
         about: agent -> one sentence on how it was made.
     """
 
@@ -153,8 +157,7 @@ def _cell_returns(folder: Path, run: EvaluationRun) -> dict[Cell, CellReturns]:
         returns = np.array(result.returns, np.float64)
         if returns.shape[1] < 2 * ENDS:
             raise OptionError(f"{path}: {returns.shape[1]} episodes, expected at least {2 * ENDS}; evaluate more")
-        ends = returns[:, :ENDS].mean(axis=1), returns[:, -ENDS:].mean(axis=1), returns[:, 0]
-        parts.setdefault(cell_of(tasks[result.task_id]), []).append(np.stack([returns.mean(axis=1), *ends]))
+        parts.setdefault(cell_of(tasks[result.task_id]), []).append(returns)
     found = {}
     for cell in sorted(parts, key=cell_order):
         if group_of(cell) == "test" and not run.is_complete(cell):
@@ -162,9 +165,23 @@ def _cell_returns(folder: Path, run: EvaluationRun) -> dict[Cell, CellReturns]:
                 f"{folder}: {len(parts[cell])} of the {published_instances(cell)} published tasks of {' '.join(cell)}; "
                 f"evaluate all of them"
             )
-        mean, first, last, opening = np.stack(parts[cell], axis=1)
-        found[cell] = CellReturns(mean, first, last, opening, run.overlaps([cell]))
+        found[cell] = _parts(np.stack(parts[cell]))._replace(overlaps=run.overlaps([cell]))
     return found
+
+
+def _parts(returns: Float[np.ndarray, "U S E"]) -> CellReturns:
+    """Returns the parts of the returns of all episodes."""
+    first, last = returns[..., :ENDS], returns[..., -ENDS:]
+    return CellReturns(returns.mean(axis=-1), first.mean(axis=-1), last.mean(axis=-1), returns[..., 0])
+
+
+def add_unseen(stored: StoredResults, returns: Mapping[str, Mapping[Cell, Float[np.ndarray, "V E"]]]) -> StoredResults:
+    """Returns stored results with those on unseen layouts, V of each cell; equal cells are replaced."""
+    cells = dict(stored.cells)
+    for agent, found in returns.items():
+        key = agent, UNSEEN
+        cells[key] = cells.get(key, {}) | {cell: _parts(values[:, None]) for cell, values in found.items()}
+    return StoredResults(cells, stored.about)
 
 
 def add_ablation(stored: StoredResults, name: str, folder: Path) -> StoredResults:

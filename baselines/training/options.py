@@ -11,6 +11,9 @@ from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.option_fields import check_fields, option_field
 
+MOST_REARRANGED = 256
+"""Most rearranged versions of a layout to train on; the next ones are for validation."""
+
 
 @dataclass(frozen=True)
 class TrainOptions:
@@ -57,7 +60,10 @@ class PlayOptions:
     imitation: float = option_field(1.0, "Weight of imitating the oracle at the start.", at_least=0)
     imitation_end: float = option_field(0.5, "Share of the steps at which that weight has fallen to 0.", above=0)
     rearranged: int = option_field(
-        0, "Also play on so many rearranged versions of each layout, every second one with four recipes.", at_least=0
+        0,
+        "Also play on so many rearranged versions of each layout, every second one with four recipes.",
+        at_least=0,
+        at_most=MOST_REARRANGED,
     )
     four_recipes: bool = option_field(
         False, "Also play on each layout with the four recipes of the protocol published, with teammates of one family."

@@ -262,8 +262,8 @@ class NoiseWriter:
         timing = {
             "update": complete[-1],
             "steps_per_second": round(self._steps / seconds, 1),
-            "seconds": round(seconds, 3),
-            "recording": round(self._recording, 3),
+            "seconds": round(seconds, 6),
+            "recording": round(self._recording, 6),
         }
         self._log.write(*map(self._metrics, complete), timing=timing)
         return timing

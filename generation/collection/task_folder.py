@@ -229,8 +229,8 @@ class ArtefactWriter:
             self._started, self._recording = now, 0.0
         timing = {
             "steps_per_second": round(speed, 1),
-            "seconds": round(seconds, 3),
-            "recording": round(self._recording, 3),
+            "seconds": round(seconds, 6),
+            "recording": round(self._recording, 6),
         }
         self._log.write(line, timing={"update": number} | timing)
         return line | timing

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 
 def add_xla_flag(flag: str) -> str:
     """Return the value of `XLA_FLAGS` with another flag: programs compiled with different flags may differ in bits."""
     flags = os.environ.get("XLA_FLAGS", "").split()
     return " ".join(flags if flag in flags else [*flags, flag])
+
+
+def is_xla_flag(flag: str) -> bool:
+    """Return whether the installed XLA knows a flag; with an unknown one, every process that uses it is aborted."""
+    environment = {**os.environ, "XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", "import jax; jax.devices()"]
+    return not subprocess.run(command, env=environment, capture_output=True, check=False).returncode

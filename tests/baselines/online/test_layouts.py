@@ -6,7 +6,8 @@ from collections import Counter
 
 import pytest
 
-from baselines.online.layouts import rearranged_layouts, with_four_recipes
+from baselines.online.layouts import rearranged_layouts, unseen_layouts, with_four_recipes
+from baselines.training.options import MOST_REARRANGED
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -49,10 +50,18 @@ def test_no_layout_of_the_benchmark_and_none_twice_even_mirrored(name):
         known.append(other.rows)
 
 
-def test_the_same_seed_gives_the_same_layouts():
+def test_fewer_layouts_are_the_first_of_more():
     layout = get_layout("cramped_up")
-    rows = [[other.rows for other in rearranged_layouts(layout, 3, seed)] for seed in (0, 0, 1)]
-    assert rows[0] == rows[1] != rows[2]
+    many = [other.rows for other in rearranged_layouts(layout, 5)]
+    assert [other.rows for other in rearranged_layouts(layout, 3)] == many[:3]
+
+
+def test_unseen_layouts_are_none_that_models_are_trained_on():
+    layout = get_layout("asymm_both")
+    trained = {rows for one in rearranged_layouts(layout, MOST_REARRANGED) for rows in mirrored(one.rows)}
+    unseen = unseen_layouts(layout, 4)
+    assert len(unseen) == 4 and not {one.rows for one in unseen} & trained
+    assert {(one.name, one.recipes) for one in unseen} == {(layout.name, layout.recipes)}
 
 
 def test_more_layouts_than_there_are():

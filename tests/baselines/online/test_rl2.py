@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import json
 from pathlib import Path
@@ -21,10 +22,14 @@ from baselines.methods.options import RL2_SETTINGS, ModelOptions
 from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import StepInput
 from baselines.methods.view_change import ViewChange
-from baselines.online.prepare import FLAT_SHARE, _played, _shares, prepare_play
+from baselines.online.layouts import rearranged_layouts
+from baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _shares, prepare_play
 from baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
+    TaskGroup,
+    _group_players,
+    _Player,
     chosen_teammates,
     imitation_weight,
     make_groups,
@@ -184,6 +189,30 @@ def test_a_first_step_is_not_mirrored(layers):
     np.testing.assert_allclose(np.asarray(both[1][0]), np.asarray(alone), atol=1e-6)
 
 
+def test_tasks_on_layouts_of_their_own():
+    """Each plays and learns as on its layout alone."""
+    layouts, mates = rearranged_layouts(LAYOUT, 3)[::2], []
+    mates = [build_teammate(one, sample_teammate("assembly_line", 0, "train")) for one in layouts]
+    group = TaskGroup([*layouts, layouts[1]], "assembly_line", [*mates, mates[1]], True, "some")
+    (player,) = _group_players(group, METHOD, PLAY, mirror=False)
+    assert list(player.group.layouts) == group.layouts
+    params, key = METHOD.init(jax.random.key(0)), jax.random.key(1)
+    found = player.episode(params, player.mates, player.start(key), key)
+    alone = _Player(layouts[1], mates[1:], True, METHOD, PLAY, mirror=False)
+    own = jax.random.split(key, 3)[1]
+    expected = jax.jit(alone.episode)(params, alone.rollout.teammate_params, alone.start(own), own)
+    after, sequences, returns = found
+    one = jax.tree.map(lambda leaf: leaf[1:2], (after, returns)), jax.tree.map(lambda leaf: leaf[:, 1:2], sequences)
+    wanted = (expected[0], expected[2]), expected[1]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(_plain(a), _plain(b), atol=1e-5), one, wanted)
+    assert (np.asarray(sequences.action[:, 0]) != np.asarray(sequences.action[:, 1])).any()
+
+
+def _plain(leaf: Any) -> np.ndarray:
+    """Returns an array of numbers for one that may be of random keys."""
+    return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+
+
 class TestGroups:
     def test_shares(self):
         wide = get_layout("demo_wide")
@@ -270,13 +299,21 @@ class TestPreparing:
         assert sum(job.about["histories"]["groups"].values()) == job.trainer.tasks
 
     def test_other_layouts_are_played_as_well(self):
-        play = PlayOptions(rearranged=2, four_recipes=True)
-        groups = {one.group.name: one.group for one in self.prepare(play).trainer.players}
-        names = {group.layout.name for group in groups.values()}
-        assert names == {"cramped_up", "cramped_up four recipes", "cramped_up rearranged 0", "cramped_up rearranged 1"}
-        assert all(group.hidden for group in groups.values())
-        own = sum(len(group.teammates) for group in groups.values() if group.layout.name == "cramped_up")
-        assert own > sum(len(group.teammates) for group in groups.values()) / 2
+        """Every version of a layout is played by as many tasks as the others, or one more, in all families together."""
+        play = PlayOptions(rearranged=6, four_recipes=True)
+        groups = [one.group for one in self.prepare(play).trainer.players]
+        assert all(group.hidden and len(group.layouts) in (1, len(group.teammates)) for group in groups)
+        tasks = collections.Counter[str]()
+        for group in groups:
+            tasks[group.label] += len(group.teammates)
+        assert tasks["cramped_up rearranged"] == pytest.approx(REARRANGED_SHARE * tasks["cramped_up"], abs=3)
+        assert 0 < tasks["cramped_up four recipes"] < tasks["cramped_up"]
+        rearranged = [group for group in groups if group.label == "cramped_up rearranged"]
+        families = {group.family for group in groups} - {"fcp"}  # learned teammates play on their own layout only
+        assert {group.family for group in rearranged} == families
+        played = collections.Counter(layout for group in rearranged for layout in group.layouts)
+        assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
+        assert max(played.values()) - min(played.values()) <= 1
 
     def test_layouts_without_histories_need_tasks(self):
         choice = HistoryOptions(("cramped_down",))
@@ -293,12 +330,7 @@ class TestPreparing:
         few = self.prepare(PlayOptions(minibatches=1), tasks, batch=2)
         job = self.prepare(PlayOptions(rearranged=6, minibatches=1), tasks, batch=2)
         counts = [sum(cell["tasks"] for cell in one.about["trained_on"]) for one in (few, job)]
-        base = [one.group for one in job.trainer.players if one.group.layout.name == "cramped_up"]
-        assert sum(len(group.teammates) for group in base) <= counts[0] <= counts[1]
-        keys = [(one.group.layout, one.group.family) for one in job.trainer.players]
-        everywhere: Any = {key: {f"{key[1]}-{number}": None for number in range(9)} for key in keys}
-        groups = [dataclasses.replace(one.group, teammates=[None] * 9) for one in job.trainer.players[-1:]]
-        assert len(_played(everywhere, groups)) == 9  # those of a rearranged layout
+        assert counts[0] < counts[1]
 
     def test_shares_follow_what_was_measured(self):
         """The ego matters with diverse teammates on demo_simple, and with none of them on coord_simple."""

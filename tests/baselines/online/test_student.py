@@ -16,6 +16,7 @@ from baselines.agents.egos import AGENTS, NamedEgo, stay
 from baselines.commands.cli import cli
 from baselines.online import student
 from baselines.online.student import collect_release, record_histories, release_teammates, with_noise
+from baselines.reference import RL2_HISTORIES
 from generation.policy import Policy
 from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data import load_icrl4aht
@@ -154,6 +155,17 @@ def test_the_command(tmp_path):
     assert result.exit_code == 0 and "describes it" in result.output
     again = CliRunner().invoke(cli, arguments)
     assert isinstance(again.exception, OptionError) and "--overwrite" in str(again.exception)
+
+
+def test_histories_like_those_of_reference_models(monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(student, "collect_release", lambda *given, **options: made.append(given[2]))
+    arguments = ["collect", "--agent", "random", "--layout", "cramped_up", "--like", "rising", "--out", str(tmp_path)]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0 and made == [RL2_HISTORIES["rising"]]
+    result = CliRunner().invoke(cli, [*arguments, "--noise", "1", "0", "--episodes", "60"])
+    assert result.exit_code == 2 and len(made) == 1
+    assert "--like: not with --episodes, --noise, which it sets" in " ".join(result.output.split())
 
 
 def test_memory_of_the_noise():

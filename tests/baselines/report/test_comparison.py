@@ -25,14 +25,17 @@ from baselines.report.comparison import (
     rising_cells,
     shown_agents,
     summary_table,
+    unseen_table,
 )
 from baselines.report.overlap import OVERLAPS
 from baselines.report.results import OWN_TASKS, cell_of, published_cells, published_test_tasks
 from baselines.report.stored_results import (
+    UNSEEN,
     CellReturns,
     StoredResults,
     add_ablation,
     add_results,
+    add_unseen,
     read_stored,
     results_file,
     write_stored,
@@ -272,6 +275,33 @@ class TestAblations:
             add_ablation(StoredResults({}, {}), self.WINDOWS, tmp_path)
         with pytest.raises(UnknownNameError, match="unknown ablation 'ablate ta'; valid: ablate windows"):
             add_ablation(StoredResults({}, {}), "ablate ta", tmp_path)
+
+
+def test_unseen_layouts(tmp_path):
+    """Returns by hand: two versions of two layouts, one of them with two families, 40 episodes."""
+
+    def returns(*of_versions: float) -> np.ndarray:
+        return np.repeat(np.array(of_versions)[:, None], 40, axis=1)
+
+    wide, both, other = ("demo_wide", "H1"), ("asymm_both", "H1"), ("asymm_both", "H3")
+    found = {
+        "stay": {wide: returns(0, 0), both: returns(10, 10), other: returns(0, 0)},
+        "oracle": {wide: returns(40, 40), both: returns(30, 30), other: returns(20, 20)},
+        "mine": {wide: returns(10, 30), both: returns(10, 10), other: returns(0, 20)},
+    }
+    stored = add_unseen(StoredResults({}, {}), found)
+    assert stored.cells["mine", UNSEEN][wide].last.tolist() == [[10], [30]]
+    stay, oracle, mine = unseen_table(stored).splitlines()[2:]
+    assert stay == "| `stay` | 5.0 (5.0 to 5.0) | 0.0 (0.0 to 0.0) |  |"
+    assert oracle == "| `oracle` | 25.0 (25.0 to 25.0) | 40.0 (40.0 to 40.0) |  |"
+    # asymm_both: 5 and 15 of 5 to 25; demo_wide: 10 and 30 of 40: normalised 0 and 0.5, 0.25 and 0.75
+    assert mine == "| `mine` | 10.0 (5.0 to 15.0) | 20.0 (10.0 to 30.0) | 0.38 (0.12 to 0.62) |"
+    write_stored(tmp_path / "results.json", stored)
+    again = read_stored(tmp_path / "results.json")
+    assert unseen_table(again) == unseen_table(stored) and shown_agents(again) == []
+    assert "| `mine` | 20.0 (10.0 to 30.0) |  |" in unseen_table(
+        StoredResults({("mine", UNSEEN): {wide: again.cells["mine", UNSEEN][wide]}}, {})
+    )
 
 
 def test_agents_without_cells_with_headroom_have_a_row():

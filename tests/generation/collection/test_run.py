@@ -122,16 +122,15 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
-def test_a_full_disk_ends_one_task(built, pair, tmp_path, monkeypatch):
+def test_a_full_disk_ends_one_task(tasks, pair, tmp_path, monkeypatch):
     """The first of two tasks meets it; the second is finished, and the list of failures says so."""
-    profile = load_profile(str(built / "pair.toml"))
-    tasks = profile.works()
-    second = tmp_path / "artefacts" / tasks[1].name
+    works, profile = tasks
+    second = tmp_path / "artefacts" / works[1].name
     shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, used=10**9, free=5_000))
     output = StringIO()
-    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {tasks[0].name}; "):
-        collect_tasks(tasks, profile, tmp_path, Console(file=output, width=500), CollectOptions())
+    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {works[0].name}; "):
+        collect_tasks(works, profile, tmp_path, Console(file=output, width=500), CollectOptions())
     assert second.is_dir()
     (failure,) = failures(tmp_path)
     assert failure["error"].startswith("DiskFullError: ")

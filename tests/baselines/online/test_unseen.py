@@ -1,0 +1,90 @@
+"""Returns on unseen layouts: those of each layout played alone, and the command."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from baselines.agents.egos import AGENTS
+from baselines.commands.cli import cli
+from baselines.evaluate.protocols import bundled_tasks, get_protocol
+from baselines.evaluate.rollout import EvaluationRollout, task_key
+from baselines.online import unseen
+from baselines.online.layouts import unseen_layouts
+from baselines.online.unseen import unseen_returns
+from baselines.report import stored_results
+from baselines.report.stored_results import UNSEEN, read_stored
+from generation.teammates.registry import build_teammate
+from icrl4aht_data.errors import OptionError
+
+TASKS = [
+    task
+    for task in bundled_tasks("layout", "diverse")
+    if task.layout.name == "cramped_up" and task.teammate_family == "H1"
+]
+
+
+def test_returns_are_those_of_each_layout_alone():
+    found = unseen_returns({"oracle": AGENTS["oracle"]}, TASKS, 3, 2)["oracle"]["cramped_up", "H1"]
+    assert found.shape == (3, 2)
+    layout, task = unseen_layouts(TASKS[0].layout, 3)[-1], TASKS[-1]  # the last version meets the last teammate
+    mates = [build_teammate(layout, task.teammate)]
+    rollout = EvaluationRollout(layout, AGENTS["oracle"](layout), mates, get_protocol("seeded"))
+    state = rollout.start(task_key(2, task.task_id)[None])
+    episode = jax.jit(rollout.episode)
+    alone = []
+    for _ in range(2):
+        state, played = episode((), rollout.teammate_params, state)
+        alone.append(float(played.reward.sum()))
+    assert found[-1].tolist() == alone
+    assert found.any()
+
+
+def test_learned_teammates_play_on_their_own_layout_only():
+    task = TASKS[0]
+    learned = dataclasses.replace(task, teammate={**task.teammate, "kind": "rl"})
+    with pytest.raises(OptionError, match=rf"{task.task_id}: its teammate is learned and plays on cramped_up only"):
+        unseen_returns({}, [learned], 1, 1)
+
+
+class TestCommand:
+    @pytest.fixture
+    def played(self, monkeypatch) -> list[Any]:
+        """Arguments of the calls that play, in place of which returns are made up."""
+        calls = []
+
+        def returns(egos: dict[str, Any], tasks: list[Any], *sizes: Any) -> Any:
+            calls.append((list(egos), {task.layout.name for task in tasks}, *sizes[:2]))
+            cells = {(task.layout.name, task.teammate_family) for task in tasks}
+            values = {"stay": 0.0, "oracle": 20.0}
+            return {ego: {cell: np.full(sizes[:2], values.get(ego, 5.0)) for cell in cells} for ego in egos}
+
+        monkeypatch.setattr(unseen, "unseen_returns", returns)
+        return calls
+
+    def test_table_and_store(self, played, monkeypatch, tmp_path):
+        monkeypatch.setattr(stored_results, "results_file", lambda: tmp_path / "results.json")
+        command = ["unseen", "--agent", "rl2-reference", "--versions", "2", "--store"]
+        result = CliRunner().invoke(cli, command, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        assert played == [(["stay", "oracle", "rl2-reference"], {"asymm_both", "cramped_up"}, 2, 40)]
+        assert "| `rl2-reference` | 5.0 (5.0 to 5.0) | 5.0 (5.0 to 5.0) | 0.25 (0.25 to 0.25) |" in result.output
+        assert read_stored(tmp_path / "results.json").agents(UNSEEN) == ["stay", "oracle", "rl2-reference"]
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (["--episodes", "39", "--store"], "--episodes 39: expected at least 40 with --store"),
+            (["--layout", "asymm_right"], "--layout asymm_right: no validation tasks; choose layouts that models are"),
+            (["--agent", "rl2-refernce"], "rl2-refernce"),
+        ],
+    )
+    def test_misuse(self, played, options, message):
+        result = CliRunner().invoke(cli, ["unseen", *options])
+        assert result.exit_code == 2 and message in " ".join(result.output.split()), result.output
+        assert not played
