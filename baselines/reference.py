@@ -220,7 +220,13 @@ Show = Callable[..., None]
 
 
 def make_reference(
-    name: str, track: str, out: Path, show: Show, evaluates: bool = True, teacher: str | None = None
+    name: str,
+    track: str,
+    out: Path,
+    show: Show,
+    evaluates: bool = True,
+    teacher: str | None = None,
+    finished: Path | None = None,
 ) -> ReferenceOutcome:
     """Make a reference model of a track, with everything that it needs, or resume it.
 
@@ -232,6 +238,7 @@ def make_reference(
         evaluates: whether to evaluate it as well.
         teacher: agent whose histories are recorded and who labels them, such as the bundled `rl2-reference`; without
             it, RL^2 is trained first. Releases and runs that are there are used as they are, whoever taught them.
+        finished: run folder of the model, such as that of a bundled one, which is then only evaluated.
 
     Raises:
         UnknownNameError: for an unknown recipe or track.
@@ -246,7 +253,7 @@ def make_reference(
     recipe = RECIPES[name]
     if teacher is not None:
         check_taught(name)
-    run = made.play(name) if recipe.data == "tasks" else made.train(name, recipe)
+    run = finished or (made.play(name) if recipe.data == "tasks" else made.train(name, recipe))
     return ReferenceOutcome(name, track, run, made.evaluate(name, run, recipe) if evaluates else {})
 
 

@@ -199,7 +199,13 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     "unseen",
     epilog=examples("python -m baselines unseen --agent rl2-reference", "python -m baselines unseen --agent runs/rl2"),
 )
-@click.option("--agent", "agents", type=EGO_NAME, multiple=True, help="Model, besides stay and oracle; repeat.")
+@click.option(
+    "--agent",
+    "agents",
+    type=EGO_NAME,
+    multiple=True,
+    help="A bundled model such as ad-reference, or a folder that `train` made; stay and oracle always play. Repeat.",
+)
 @greedy_option
 @click.option(
     "--layout", "layouts", type=LAYOUT, multiple=True, default=TRACKS["layout"]["train"], help="Layout to rearrange."

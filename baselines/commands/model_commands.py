@@ -143,7 +143,10 @@ def collect_command(
 )
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
-    "--bundle-as", "bundle", metavar="NAME", help="Also put it into the package, under this name; see `models`."
+    "--bundle-as",
+    "bundle",
+    metavar="NAME",
+    help="Also put it into the package, under this name; see `models`. Its other tracks there are evaluated again.",
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
@@ -161,16 +164,22 @@ def reference_command(
     training teammates; ad and dpt learn from histories: -noise of the scripted oracle whose noise falls, -ppo and -both
     of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
     """
-    from baselines.agents.bundled import bundle_run, check_bundle_name
+    from baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
     from baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card
 
-    if bundle and (len(names) > 1 or set(track) != set(TRACKS) or not evaluates):
-        raise click.UsageError("--bundle-as: expected one --name of all tracks, evaluated: its card states its results")
-    try:
-        if bundle is not None:
+    kept: dict[str, Path] = {}  # tracks of the bundled model that stay
+    if bundle:
+        try:
             check_bundle_name(bundle)
-    except OptionError as error:
-        raise click.UsageError(f"--bundle-as: {error}") from error
+        except OptionError as error:
+            raise click.UsageError(f"--bundle-as: {error}") from error
+        runs = bundled_models()[bundle].runs if bundle in bundled_models() else {}
+        kept = {one: run for one, run in runs.items() if one not in track}
+        if len(names) != 1 or {*track, *kept} != set(TRACKS) or not evaluates:
+            raise click.UsageError(
+                "--bundle-as: expected one --name, evaluated, of all tracks or of those that are to be replaced in a "
+                "bundled model: its card states its results"
+            )
     if teacher:  # before hours of work
         find_ego("--teacher", teacher)
         for name in names:
@@ -179,6 +188,7 @@ def reference_command(
     with bars(edges=True) as show:
         for name, of_track in product(names, track):
             outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
+        others = [make_reference(names[0], one, out, show, finished=run) for one, run in kept.items()]
     for found in outcomes:
         _console.print(f"{found.name}, {found.track}: {found.run}", highlight=False)
         for kind, folder in found.results.items():
@@ -188,7 +198,7 @@ def reference_command(
             sampled = not RECIPES[found.name].mode.greedy
             target = bundle_run(found.run, bundle, found.track, sampled=sampled)
             _console.print(f"bundled: {target}", highlight=False)
-        _console.print(f"card: {write_bundled_card(bundle, outcomes, teacher=teacher)}", highlight=False)
+        _console.print(f"card: {write_bundled_card(bundle, [*others, *outcomes], teacher=teacher)}", highlight=False)
     if times := describe_times(out):
         _console.print(times, highlight=False)
 

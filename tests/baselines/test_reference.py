@@ -12,10 +12,19 @@ import pytest
 from click.testing import CliRunner
 
 from baselines import reference
+from baselines.agents import bundled
+from baselines.agents.bundled import MODELS
 from baselines.commands.cli import cli
 from baselines.methods.options import ModelOptions
 from baselines.methods.registry import get_method
-from baselines.reference import RECIPES, RL2_HISTORIES, TRACK_VIEWS, describe_times, make_reference
+from baselines.reference import (
+    RECIPES,
+    RL2_HISTORIES,
+    TRACK_VIEWS,
+    ReferenceOutcome,
+    describe_times,
+    make_reference,
+)
 from baselines.training.histories import read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
 from generation.profiles.noise_config import NoiseConfig
@@ -89,6 +98,37 @@ def test_times_of_parts(tmp_path):
     assert re.fullmatch(
         r"everything in .*out took 0\.00 hours on \d+ cores; see .*times\.jsonl", describe_times(made.out)
     )
+
+
+def test_one_track_of_a_bundled_model_is_replaced(tmp_path, monkeypatch):
+    """The other one stays and is evaluated again, for the card; a new model needs all tracks."""
+    made, copied, cards = [], [], []
+
+    def make(name: str, track: str, *given: Any, **options: Any) -> ReferenceOutcome:
+        made.append((track, options.get("finished")))
+        return ReferenceOutcome(name, track, tmp_path / track, {})
+
+    monkeypatch.setattr(reference, "make_reference", make)
+    monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
+    monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
+    command = ["reference", "--name", "rl2", "--track", "layout", "--out", str(tmp_path), "--bundle-as"]
+    result = CliRunner().invoke(cli, [*command, "rl2-reference"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert made == [("layout", None), ("teammate", MODELS / "rl2-reference" / "teammate")]
+    assert copied == [("rl2-reference", "layout")]
+    assert [found.track for found in cards[0]] == ["teammate", "layout"]
+    result = CliRunner().invoke(cli, [*command, "rl2-other"])
+    assert result.exit_code == 2
+    assert "of all tracks or of those that are to be replaced" in " ".join(result.output.split())
+    assert len(made) == 2
+
+
+def test_a_finished_run_is_only_evaluated(tmp_path, monkeypatch):
+    monkeypatch.setattr(reference._Making, "evaluate", lambda made, name, run, recipe: {"test-seeded": run / "results"})
+    run = MODELS / "rl2-reference" / "layout"
+    found = make_reference("rl2", "layout", tmp_path, print, finished=run)
+    assert found == ReferenceOutcome("rl2", "layout", run, {"test-seeded": run / "results"})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_second_round_keeps_the_own_histories_of_the_first(tmp_path, monkeypatch):
