@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,15 @@ def _plot_log_curve(axes: Any, label: str, color: str, points: Mapping[int, Sequ
     axes.plot(steps, running_mean(values, window), color=color, marker=marker, label=label, linewidth=1.4)
 
 
+def shrink_picture(picture: Path, path: Path) -> None:
+    """Write a PNG file with 64 colours instead of all: curves look the same in a third of the bytes."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        reduced = image.convert("RGB").quantize(64)
+    reduced.save(path, optimize=True)
+
+
 SMOOTHING = 10
 """Most episodes in the running mean of a curve of returns; of few episodes a tenth."""
 
@@ -85,8 +95,15 @@ def smooth_returns(returns: Float[np.ndarray, " E"]) -> Float[np.ndarray, " E"]:
     return running_mean(returns, min(SMOOTHING, len(returns) // 10))
 
 
+_AGENT_COLOUR = "#1f5fa8"
+_REFERENCE_LINES = {"oracle": ("#2c8a4b", "--"), "random": ("#b0653a", ":"), "stay": ("#6b7280", "-.")}
+
+
 def plot_return_curves(
-    runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]], cells: Sequence[Cell], path: Path
+    runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]],
+    cells: Sequence[Cell],
+    path: Path,
+    references: Mapping[Cell, Mapping[str, float]] = MappingProxyType({}),
 ) -> None:
     """Plot the return per episode on shared axes: a panel per cell, a line per run.
 
@@ -97,6 +114,7 @@ def plot_return_curves(
         runs: (label, cell -> returns (instances, episodes)).
         cells: the cells to draw, at most `MOST_PANELS`.
         path: file to write, of a type in `icrl4aht_data.plotting.PICTURES`.
+        references: cell -> reference ego, stay, random or oracle -> its mean return, drawn as a level line.
     """
     columns = min(4, len(cells))
     rows = -(-len(cells) // columns)
@@ -107,6 +125,10 @@ def plot_return_curves(
         for number, (label, returns) in enumerate(runs):
             if cell in returns:
                 limits += _plot_curve(axes, label, f"C{number}", returns[cell])
+        for name, level in references.get(cell, {}).items():
+            colour, dashes = _REFERENCE_LINES[name]
+            axes.axhline(level, color=colour, linestyle=dashes, linewidth=1.1, label=name)
+            limits.append(level)
         axes.set_title(f"{cell[0]}, {cell[1]}", fontsize=9)
         axes.grid(alpha=0.3)
     for axes in panels[len(cells) :]:
@@ -129,10 +151,6 @@ def _plot_curve(axes: Any, label: str, color: str, returns: np.ndarray) -> list[
     axes.plot(episodes, raw, color=color, alpha=0.35, linewidth=0.7)
     axes.plot(episodes, curves.mean(axis=0), color=color, label=label, linewidth=1.6)
     return [float(min(low.min(), raw.min())), float(max(high.max(), raw.max()))]
-
-
-_AGENT_COLOUR = "#1f5fa8"
-_REFERENCE_LINES = {"oracle": ("#2c8a4b", "--"), "random": ("#b0653a", ":"), "stay": ("#6b7280", "-.")}
 
 
 def plot_family_curves(

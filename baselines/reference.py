@@ -32,16 +32,18 @@ from baselines.evaluate.protocols import bundled_tasks, get_protocol
 from baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from baselines.online.prepare import prepare_play
 from baselines.online.student import collect_release, release_teammates
+from baselines.plotting import SMOOTHING, plot_return_curves, shrink_picture
 from baselines.report.comparison import cells_with_headroom
 from baselines.report.model_card import model_card
 from baselines.report.results import merge, note_results, read_run
 from baselines.training.histories import prepare, start_from
 from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
-from baselines.training.run_folder import CHECKPOINTS
+from baselines.training.run_folder import CHECKPOINTS, RUN_CURVES
 from baselines.training.trainer import format_loss, train
 from generation.learners.resume import Checkpoints
 from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import MINI, load_icrl4aht
@@ -156,12 +158,15 @@ see, so that of asymm_both is hidden from them."""
 
 TRACK_PLAY: dict[str, dict[str, Any]] = {
     "teammate": {},
-    "layout": {"rearranged": 6, "four_recipes": True},
+    "layout": {"rearranged": 70, "four_recipes": True},
 }
 """Track -> values of `PlayOptions` for its models that learn by playing."""
 
 TIMES = "times.jsonl"
 """File name of the times of parts, see this module's docstring."""
+
+RETURNS = "returns.png"
+"""File name of the curves of a bundled model's returns, in the folder of a track."""
 
 VALIDATION_KINDS = ("validation", "diverse")
 """Kinds of tasks that models are chosen by."""
@@ -189,7 +194,7 @@ class ReferenceOutcome(NamedTuple):
 def write_bundled_card(
     name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS, teacher: str | None = None
 ) -> Path:
-    """Write the card of a bundled model, with its results on test and validation tasks. Returns its path.
+    """Write the card of a bundled model: its results on test and validation tasks, and curves. Returns its path.
 
     Args:
         name: of the bundled model.
@@ -202,8 +207,28 @@ def write_bundled_card(
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in VALIDATION_KINDS])
     taught = f" --teacher {teacher}" if teacher else ""
     command = f"python -m baselines reference --name {outcomes[0].name}{taught} --bundle-as {name}"
-    path.write_text(model_card(run, name, command, validation), encoding="utf-8")
+    pictures = {}
+    for found in outcomes:
+        pictures |= _card_pictures(name, found, folder / name)
+    path.write_text(model_card(run, name, command, validation, pictures), encoding="utf-8")
     return path
+
+
+def _card_pictures(name: str, found: ReferenceOutcome, folder: Path) -> dict[str, str]:
+    """Draw the returns of a bundled model on a track. Returns the pictures of the track: path in the folder -> text."""
+    run, headroom = read_run(found.results["test-seeded"]), read_headroom("seeded")
+    cells = [cell for cell in cells_with_headroom("seeded") if cell in run.cells]
+    returns, training = f"{found.track}/{RETURNS}", f"{found.track}/{RUN_CURVES}"
+    plot_return_curves([(name, run.cells)], cells, folder / returns, headroom)
+    shrink_picture(folder / returns, folder / returns)
+    pictures = {
+        returns: f"Return in each episode of the test tasks of track {found.track}, protocol seeded: running mean over "
+        f"{SMOOTHING} episodes of the mean over a cell's instances and seeds, range over the instances (band), single "
+        f"episodes (thin)"
+    }
+    if (folder / training).is_file():
+        pictures[training] = f"Training of the model of track {found.track}"
+    return pictures
 
 
 def describe_times(out: Path) -> str:

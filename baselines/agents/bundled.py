@@ -1,7 +1,8 @@
 """The models that this package bundles, in `baselines/models`: NAME/TRACK is the run folder of a model of one track.
 
-A bundled run has its settings and its last parameters, without the optimizer's state. Next to the runs of a model are
-its card and `bundle.json`, which states the way in which it plays unless another one is chosen.
+A bundled run has its settings, its last parameters, without the optimizer's state, and the curves of its training. Next
+to the runs of a model are its card and `bundle.json`, which states the way in which it plays unless another one is
+chosen.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import NamedTuple
 
 import jax
 
+from baselines.plotting import shrink_picture
 from baselines.training.histories import read_trained
-from baselines.training.run_folder import CHECKPOINTS, CONFIG, read_config
+from baselines.training.run_folder import CHECKPOINTS, CONFIG, RUN_CURVES, read_config
 from generation.learners.resume import Checkpoints
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError
@@ -85,7 +87,7 @@ def check_bundle_name(name: str) -> None:
 
 
 def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False) -> Path:
-    """Copy a finished run into the bundled models, with its parameters alone; one that is there is replaced.
+    """Copy a finished run into the bundled models, with its parameters and curves; one that is there is replaced.
 
     Args:
         run: folder of the run.
@@ -113,5 +115,7 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampl
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
+    if (run / RUN_CURVES).is_file():
+        shrink_picture(run / RUN_CURVES, target / RUN_CURVES)
     (folder / name / BUNDLE).write_text(json.dumps({"sampled": sampled}) + "\n", encoding="utf-8")
     return target

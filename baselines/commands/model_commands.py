@@ -166,6 +166,7 @@ def reference_command(
     """
     from baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
     from baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card
+    from baselines.training.run_folder import read_config
 
     kept: dict[str, Path] = {}  # tracks of the bundled model that stay
     if bundle:
@@ -180,6 +181,13 @@ def reference_command(
                 "--bundle-as: expected one --name, evaluated, of all tracks or of those that are to be replaced in a "
                 "bundled model: its card states its results"
             )
+        for one, run in kept.items():
+            method, expected = read_config(run)["method"], RECIPES[names[0]].method
+            if method != expected:
+                raise click.UsageError(
+                    f"--bundle-as: track {one} of {bundle} has a model of {method}, expected one of {expected}, as "
+                    f"{names[0]} is: make both tracks, or choose another name"
+                )
     if teacher:  # before hours of work
         find_ego("--teacher", teacher)
         for name in names:
@@ -198,7 +206,8 @@ def reference_command(
             sampled = not RECIPES[found.name].mode.greedy
             target = bundle_run(found.run, bundle, found.track, sampled=sampled)
             _console.print(f"bundled: {target}", highlight=False)
-        _console.print(f"card: {write_bundled_card(bundle, [*others, *outcomes], teacher=teacher)}", highlight=False)
+        in_order = sorted([*others, *outcomes], key=lambda found: list(TRACKS).index(found.track))
+        _console.print(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}", highlight=False)
     if times := describe_times(out):
         _console.print(times, highlight=False)
 

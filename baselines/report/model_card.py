@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from baselines.methods.options import UNUSED_OPTIONS
@@ -25,7 +26,13 @@ _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 _NOT_LISTED = ("layouts", "root", "split", "labels", "held_out", "obs", "channels", "hide_recipe", *FILTERS)
 
 
-def model_card(run: EvaluationRun, title: str = "", command: str = "", validation: Sequence[EvaluationRun] = ()) -> str:
+def model_card(
+    run: EvaluationRun,
+    title: str = "",
+    command: str = "",
+    validation: Sequence[EvaluationRun] = (),
+    pictures: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """Returns README.md of a model, to publish with its run folder.
 
     Args:
@@ -35,6 +42,7 @@ def model_card(run: EvaluationRun, title: str = "", command: str = "", validatio
         title: name of the model; by default the agent's.
         command: command that makes the model.
         validation: further results of the model, on validation tasks under the same protocol, which get tables, too.
+        pictures: path of a picture with curves, relative to the card -> what it shows.
     """
     sources_of: dict[str, list[ResultSource]] = {}
     for source in run.sources:
@@ -70,8 +78,17 @@ def model_card(run: EvaluationRun, title: str = "", command: str = "", validatio
         settings=_settings(models),
         protocol=run.protocol,
         results="\n\n".join(f"### {heading[0].upper()}{heading[1:]}\n\n{table}" for heading, table in tables),
+        curves=_curves(pictures),
         limits="\n".join(f"* {limit}" for limit in limits),
     )
+
+
+def _curves(pictures: Mapping[str, str]) -> str:
+    """Returns the section with pictures, see `model_card`; empty if there are none."""
+    if not pictures:
+        return ""
+    shown = [f"{text}:\n\n![{Path(at).stem}]({at})" for at, text in pictures.items()]
+    return "\n\n".join(["## Curves", *shown]) + "\n\n"
 
 
 def _trained(sources: Sequence[ResultSource]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from baselines import reference
 from baselines.agents import bundled
@@ -24,7 +25,9 @@ from baselines.reference import (
     ReferenceOutcome,
     describe_times,
     make_reference,
+    write_bundled_card,
 )
+from baselines.report.results import EvaluationRun
 from baselines.training.histories import read_trained
 from baselines.training.options import HistoryOptions, TrainOptions
 from generation.profiles.noise_config import NoiseConfig
@@ -33,6 +36,7 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from tests.helpers.evaluated import evaluated_run
 
 TINY = {"steps": 2, "batch_size": 2, "context": 20}
 MODEL = {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp", "teammate_actions": True}
@@ -120,7 +124,37 @@ def test_one_track_of_a_bundled_model_is_replaced(tmp_path, monkeypatch):
     result = CliRunner().invoke(cli, [*command, "rl2-other"])
     assert result.exit_code == 2
     assert "of all tracks or of those that are to be replaced" in " ".join(result.output.split())
+    result = CliRunner().invoke(cli, [*command, "ad-reference"])
+    assert result.exit_code == 2
+    assert "track teammate of ad-reference has a model of ad, expected one of rl2" in " ".join(result.output.split())
     assert len(made) == 2
+
+
+def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
+    histories = {"root": "x", "layouts": ["demo_wide"], "data_version": "1.0.0", "sizes": {"train": 3}}
+    config = {"method": "ad", "model": {}, "train": {"seed": 3}, "package_version": "0", "histories": histories}
+    trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
+
+    def evaluated(folder: Path) -> EvaluationRun:
+        run = evaluated_run("ad-student", ("cramped_down",) if "layout" in folder.parts else ("demo_wide",))
+        return dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained, folder=str(folder)),))
+
+    monkeypatch.setattr(reference, "read_run", evaluated)
+    for track in TRACKS:
+        (tmp_path / "ad-x" / track).mkdir(parents=True)
+    (tmp_path / "ad-x" / "layout" / "curves.png").write_bytes(b"")
+    kinds = ("test-seeded", "validation", "diverse")
+    outcomes = [
+        ReferenceOutcome("ad-student", track, tmp_path, {kind: Path(track) / kind for kind in kinds})
+        for track in TRACKS
+    ]
+    card = write_bundled_card("ad-x", outcomes, tmp_path).read_text(encoding="utf-8")
+    assert "| made by | `python -m baselines reference --name ad-student --bundle-as ad-x` |" in card
+    shown = re.findall(r"!\[\w+\]\((.+)\)", card.split("## Curves")[1].split("## Limits")[0])
+    assert shown == ["teammate/returns.png", "layout/returns.png", "layout/curves.png"]
+    assert all((tmp_path / "ad-x" / path).is_file() for path in shown)
+    with Image.open(tmp_path / "ad-x" / shown[0]) as one, Image.open(tmp_path / "ad-x" / shown[1]) as other:
+        assert one.width == other.width and one.tobytes() != other.tobytes()
 
 
 def test_a_finished_run_is_only_evaluated(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from baselines.agents import Percept, bundled
 from baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
@@ -56,6 +57,8 @@ def test_a_bundled_model_is_the_run(run, models):
     assert (one.step, one.context, one.layouts, one.trained_on) == (two.step, two.context, two.layouts, two.trained_on)
     text = (models / "ad-tiny" / "teammate" / "config.json").read_text(encoding="utf-8")
     assert json.loads(text)["histories"]["root"] == "mini" and str(Path.home()) not in text
+    with Image.open(run / "curves.png") as drawn, Image.open(models / "ad-tiny" / "teammate" / "curves.png") as copied:
+        assert copied.size == drawn.size and copied.mode == "P"
 
 
 def test_it_plays_as_the_run_does(run, models, tmp_path):
