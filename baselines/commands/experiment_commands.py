@@ -208,7 +208,12 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 )
 @greedy_option
 @click.option(
-    "--layout", "layouts", type=LAYOUT, multiple=True, default=TRACKS["layout"]["train"], help="Layout to rearrange."
+    "--layout",
+    "layouts",
+    type=LAYOUT,
+    multiple=True,
+    default=TRACKS["layout"]["train"],
+    help="Layout to rearrange; repeat for several.",
 )
 @click.option("--versions", type=COUNT, default=16, help="Number of rearranged versions of each layout.")
 @click.option("--episodes", type=COUNT, default=40, help="Episodes on each version with each family of teammates.")
@@ -220,7 +225,7 @@ def unseen_command(
 
     They show whether a model knows the game or its training layouts, without a test task. Plays versions of training
     layouts that have pots, piles and counters in other places, with the diverse validation teammates. Prints mean
-    returns.
+    returns on each layout and the normalised return, with 95 % intervals over the versions.
     """
     from baselines.evaluate.protocols import bundled_tasks
     from baselines.online.unseen import unseen_returns

@@ -72,7 +72,8 @@ _console = Console(soft_wrap=True)
 @click.option(
     "--like",
     type=HISTORIES_NAME,
-    help="In place of these three: those of the histories of RL^2 for reference models, student or rising.",
+    help="As many and as long histories as the reference models learn from, with their noise: student, or rising, "
+    "which begin at random. Not with --histories, --episodes and --noise.",
 )
 @click.option(
     "--labeller",
@@ -146,7 +147,8 @@ def collect_command(
     "--bundle-as",
     "bundle",
     metavar="NAME",
-    help="Also put it into the package, under this name; see `models`. Its other tracks there are evaluated again.",
+    help="Also bundle the model with the package, under this name; see `models`. With --track, the bundled model's "
+    "other track stays and is evaluated again.",
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
@@ -160,9 +162,11 @@ def reference_command(
     """Make reference models, with everything that they need.
 
     Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
-    and evaluates. One model for each track. The same command resumes a stopped one. `rl2` is trained by playing with
-    training teammates; ad and dpt learn from histories: -noise of the scripted oracle whose noise falls, -ppo and -both
-    of the bundled release, -student of RL^2; ad-rising imitates the noise as well.
+    and evaluates. One model for each track. The same command resumes a stopped one. rl2 learns by playing with training
+    teammates, rl2-tests with test teammates, too. The other names are a method and its data. ad-noise, dpt-noise: noise
+    histories. ad-ppo, dpt-ppo: PPO histories of the bundled release. ad-both, dpt-both: both kinds. ad-learned:
+    histories of the bundled release with learned teammates. ad-student, dpt-student: histories of rl2, labelled with
+    its choices. ad-rising: histories of rl2 that begin at random, imitated with their noise.
     """
     from baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
     from baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card

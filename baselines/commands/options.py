@@ -109,11 +109,13 @@ greedy_option = click.option(
 experiment_acting_option = click.option(
     "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
 )
-evaluation_split_option = click.option(
+_SPLIT_HELP = "Which tasks: test, or validation and diverse, by which models are chosen."
+evaluation_split_option = click.option("--split", type=_EVALUATION_SPLIT, help=_SPLIT_HELP, show_default="test")
+_experiment_split_option = click.option(
     "--split",
     type=_EVALUATION_SPLIT,
-    help="Which tasks: test, or validation and diverse, by which models are chosen.",
-    show_default="test",
+    help=_SPLIT_HELP,
+    show_default="test; diverse in `ablate windows` and `contexts`",
 )
 tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
 episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
@@ -145,19 +147,19 @@ def history_filters(command: Any) -> Any:
             "--teammate-family",
             type=FAMILY,
             multiple=True,
-            help="Train only with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several.",
+            help="Only histories with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several.",
         ),
         click.option(
             "--algorithm",
             type=Names("algorithm", lambda: [*KIND_FAMILIES, *TEAMMATE_PLUGINS.names]),
             multiple=True,
-            help="Train only with teammates of this algorithm, such as fcp, or kind of heuristic; repeat for several.",
+            help="Only histories with teammates of this algorithm, such as fcp, or kind of heuristic; repeat.",
         ),
         click.option(
             "--source",
             metavar="NAME",
             multiple=True,
-            help="Train only on histories of this source: ppo, noise or student; repeat for several.",
+            help="Only histories of this source: ppo, noise or student; repeat for several.",
         ),
     ]
 
@@ -197,7 +199,7 @@ _experiment_size_option = click.option(
     "--size",
     type=_SIZE_NAME,
     help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
-    show_default="small, as in the paper",
+    show_default="small, as in the paper; `ablate windows` and `contexts` set tiny",
 )
 _PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
 _BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
@@ -417,7 +419,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         _experiment_size_option,
         history_filters,
         dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
-        evaluation_split_option,
+        _experiment_split_option,
         tasks_option,
         episodes_option,
         seeds_option,
@@ -433,7 +435,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             default_text={
                 "steps": "the paper's",
                 "batch_size": _PAPER_OR_CPU,
-                "context": "500; varied by `sweep context`",
+                "context": "500; varied by `sweep context`, set by `ablate windows` and `contexts`",
             },
         ),
         dataclass_options(
