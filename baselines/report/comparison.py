@@ -35,6 +35,9 @@ from icrl4aht_data.utils.templates import fill_template, markdown_table
 RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
 """Files of the page -> their first bytes, by which they are recognised before they are replaced."""
 
+MOST_DRAWN = 5
+"""Most agents in the figure: more have bars that are too thin to tell apart."""
+
 _PAPER = ("AD", "DPT")
 
 
@@ -308,6 +311,7 @@ def render_page(stored: StoredResults, agents: Sequence[str]) -> str:
         marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
         references=", ".join(map(_code, REFERENCES)),
         forgets=f"`NAME{FORGETS}`",
+        drawn=str(MOST_DRAWN),
         cells=str(len(cells_with_headroom("seeded"))),
     )
 
@@ -329,15 +333,21 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
 
 
 def drawn_agents(stored: StoredResults) -> list[str]:
-    """Returns the agents of the figure: those with all cells, none of which they have met the teammates of."""
+    """Returns the agents of the figure, in the order in which they were stored.
+
+    They are the `MOST_DRAWN` with the highest normalised return of those with all cells, none of which they have met
+    the teammates of.
+    """
     chosen = cells_with_headroom("seeded")
-    return [
-        agent
+    scores = {
+        agent: normalised_interval(stored.cells[agent, "seeded"], "seeded", chosen)[0]
         for agent in stored.agents("seeded")
         if not agent.endswith(FORGETS)
         and all(cell in stored.cells[agent, "seeded"] for cell in chosen)
         and all(one == "family" for cell in chosen for one in stored.cells[agent, "seeded"][cell].overlaps)
-    ]
+    }
+    best = sorted(scores, key=scores.__getitem__, reverse=True)[:MOST_DRAWN]
+    return [agent for agent in scores if agent in best]
 
 
 def shown_agents(stored: StoredResults) -> list[str]:

@@ -18,6 +18,7 @@ from baselines.report.comparison import (
     FORGETS,
     ablation_table,
     cells_with_headroom,
+    drawn_agents,
     gains_table,
     layouts_above_paper,
     normalised_interval,
@@ -167,6 +168,18 @@ class TestStoring:
         assert "* `ramp`: a ramp" in page and "| `ramp`† |  |  |  | 1 of 1 |" in page
         assert (tmp_path / "page" / "results.png").stat().st_size > 10_000
         assert read_stored(target).about == {"ramp": "a ramp"}
+
+
+def test_the_figure_has_the_best_models():
+    """All cells of seven agents, each a little better than the one before."""
+    cells, names = cells_with_headroom("seeded"), "gabcdef"
+    found = {
+        (name, "seeded"): {cell: CellReturns(*[np.full((5, 1), float(rank))] * 4, ()) for cell in cells}
+        for rank, name in enumerate(names)
+    }
+    missing = {("best", "seeded"): {cells[0]: CellReturns(*[np.full((5, 1), 99.0)] * 4, ())}}
+    assert drawn_agents(StoredResults(about={}, cells=found | missing)) == list("bcdef")
+    assert drawn_agents(StoredResults(about={}, cells=dict(reversed(found.items())))) == list("fedcb")
 
 
 def test_the_committed_page_is_that_of_the_stored_results():
