@@ -173,11 +173,8 @@ class TestStoring:
 def test_the_figure_has_the_best_models():
     """All cells of seven agents, each a little better than the one before."""
     cells, names = cells_with_headroom("seeded"), "gabcdef"
-    found = {
-        (name, "seeded"): {cell: CellReturns(*[np.full((5, 1), float(rank))] * 4, ()) for cell in cells}
-        for rank, name in enumerate(names)
-    }
-    missing = {("best", "seeded"): {cells[0]: CellReturns(*[np.full((5, 1), 99.0)] * 4, ())}}
+    found = {(name, "seeded"): {where: cell(float(rank)) for where in cells} for rank, name in enumerate(names)}
+    missing = {("best", "seeded"): {cells[0]: cell(99.0)}}
     assert drawn_agents(StoredResults(about={}, cells=found | missing)) == list("bcdef")
     assert drawn_agents(StoredResults(about={}, cells=dict(reversed(found.items())))) == list("fedcb")
 
