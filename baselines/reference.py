@@ -157,8 +157,8 @@ than they are trained on, so they learn from mirrored games, too; asymm_right ha
 see, so that of asymm_both is hidden from them."""
 
 TRACK_PLAY: dict[str, dict[str, Any]] = {
-    "teammate": {},
-    "layout": {"rearranged": 70, "four_recipes": True},
+    "teammate": {"oracle_teammate": True},
+    "layout": {"oracle_teammate": True, "rearranged": 70, "four_recipes": True},
 }
 """Track -> values of `PlayOptions` for its models that learn by playing."""
 

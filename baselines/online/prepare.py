@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from baselines.methods.method import Method
@@ -19,6 +20,7 @@ from baselines.training.histories import filter_histories, history_settings, tra
 from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.seen import TASKS_SOURCE
 from baselines.training.trainer import TrainingData
+from generation.experts.oracle import oracle_teammate
 from generation.policy import Policy
 from generation.teammates.draws import find_draw
 from generation.teammates.registry import build_teammate, recover_teammate
@@ -33,7 +35,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.files import json_hash
 
-FLAT_SHARE = 0.3
+FLAT_SHARE = 0.1
 """Number of tasks on a layout where the ego matters with no teammate, as a share of that on other layouts."""
 
 FOUR_RECIPES_SHARE = 0.2
@@ -41,6 +43,13 @@ FOUR_RECIPES_SHARE = 0.2
 
 REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
+
+
+ORACLE = "oracle"
+"""Kind and family of the oracle as a teammate."""
+
+ORACLE_IDLES = (0.0, 0.2, 0.4, 0.6, 0.8)
+"""Chances that oracles as teammates idle in a step."""
 
 
 class PlayJob(NamedTuple):
@@ -105,6 +114,8 @@ def prepare_play(
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     teammates = _teammates(dataset, tasks)
     _check_layouts(layouts, teammates)
+    if play.oracle_teammate:
+        teammates |= _oracles(layouts)
     shares = _shares(dataset, tasks)
     groups, played = _groups(teammates, shares, hidden, play, options.batch_size)
     labels: Labels | None = "oracle" if play.imitation else None
@@ -175,9 +186,25 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
             mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
             found.setdefault(key, {})[task_id] = mate
     for task in tasks:
-        mate = _Teammate(task.teammate, build_teammate(task.layout, task.teammate))
+        mate = _Teammate(task.teammate, _build(task.layout, task.teammate))
         found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
     return found
+
+
+def _oracles(layouts: Sequence[Layout]) -> _Teammates:
+    """Returns the oracle as a teammate of several speeds on each layout."""
+    entries = {f"{ORACLE} that idles in {idle:.0%}": {"kind": ORACLE, "idle": idle} for idle in ORACLE_IDLES}
+    return {
+        (layout, ORACLE): {name: _Teammate(entry, _build(layout, entry)) for name, entry in entries.items()}
+        for layout in layouts
+    }
+
+
+def _build(layout: Layout, entry: Mapping[str, Any]) -> Policy:
+    """Returns the policy of a teammate's entry, as in a task or of `_oracles`."""
+    if entry["kind"] == ORACLE:
+        return oracle_teammate(layout)._replace(params=jnp.float32(entry["idle"]))
+    return build_teammate(layout, dict(entry))
 
 
 def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
@@ -228,7 +255,7 @@ def _heuristic_families(teammates: _Teammates) -> dict[Layout, dict[str, dict[st
     """Returns the families of each layout that are heuristics, which can play on other layouts as well."""
     found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
     for (layout, family), mates in teammates.items():
-        if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):
+        if all(mate.entry["kind"] in ("heuristic", ORACLE) for mate in mates.values()):
             found[layout][family] = mates
     for layout, families in found.items():
         if not families:
@@ -257,7 +284,7 @@ def _rearranged_groups(
         count = max(len(own), round(tasks * len(own) / versions))
         where = [own[task % len(own)] for task in range(count)]
         chosen = [list(mates)[k] for k in chosen_teammates(len(mates), count)]
-        policies = [build_teammate(one, mates[name].entry) for one, name in zip(where, chosen, strict=True)]
+        policies = [_build(one, mates[name].entry) for one, name in zip(where, chosen, strict=True)]
         manners = [
             with_manners([policy], chances[None])[0]
             for policy, chances in zip(policies, mixed_chances(count), strict=True)
@@ -268,7 +295,7 @@ def _rearranged_groups(
 
 def _rebuilt(mates: Mapping[str, _Teammate], layout: Layout) -> dict[str, _Teammate]:
     """Returns heuristics on another layout."""
-    return {task_id: mate._replace(policy=build_teammate(layout, mate.entry)) for task_id, mate in mates.items()}
+    return {task_id: mate._replace(policy=_build(layout, mate.entry)) for task_id, mate in mates.items()}
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:

@@ -129,6 +129,7 @@ def _played_text(config: dict[str, Any], layouts: str) -> str:
     text += f", and with those of {others} other tasks" if others else ""
     if rearranged := config["play"].get("rearranged"):
         text += f"; also on {rearranged} rearranged versions of each layout"
+    text += "; also with the oracle as the teammate" if config["play"].get("oracle_teammate") else ""
     return text + ("; also with four recipes" if config["play"].get("four_recipes") else "")
 
 

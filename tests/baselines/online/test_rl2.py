@@ -23,7 +23,7 @@ from baselines.methods.registry import get_method, overcooked_world
 from baselines.methods.tokens import StepInput
 from baselines.methods.view_change import ViewChange
 from baselines.online.layouts import rearranged_layouts
-from baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _shares, prepare_play
+from baselines.online.prepare import FLAT_SHARE, ORACLE, ORACLE_IDLES, REARRANGED_SHARE, _shares, prepare_play
 from baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
@@ -314,6 +314,17 @@ class TestPreparing:
         played = collections.Counter(layout for group in rearranged for layout in group.layouts)
         assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
         assert max(played.values()) - min(played.values()) <= 1
+
+    def test_the_oracle_is_a_teammate_on_all_layouts(self):
+        """It plays in other tasks than the teammates of histories, and is none of those on record."""
+        plain, job = self.prepare(PlayOptions()), self.prepare(PlayOptions(oracle_teammate=True, rearranged=6))
+        groups = [one.group for one in job.trainer.players if one.group.family == ORACLE]
+        assert {group.label for group in groups} == {"cramped_up", "cramped_up rearranged"}
+        idles = {float(mate.params["script"]) for group in groups for mate in group.teammates}
+        assert idles <= {float(np.float32(idle)) for idle in ORACLE_IDLES} and len(idles) > 1
+        assert {cell["algorithm"] for cell in job.about["trained_on"]} == {
+            cell["algorithm"] for cell in plain.about["trained_on"]
+        }
 
     def test_layouts_without_histories_need_tasks(self):
         choice = HistoryOptions(("cramped_down",))
