@@ -70,6 +70,7 @@ class Recipe:
         model: values of `ModelOptions`.
         train: values of `TrainOptions`.
         histories: values of `HistoryOptions`.
+        play: values of `PlayOptions`, in addition to those of the track, `TRACK_PLAY`.
         rounds: number of further trainings, each with histories that the model plays and RL^2 labels, in addition to
             all earlier ones. After one round, 2 of 10 histories with each teammate are own ones (`OWN_HISTORIES`); they
             are shorter, a ninth of all episodes.
@@ -86,6 +87,7 @@ class Recipe:
     model: dict[str, Any] = field(default_factory=dict)
     train: dict[str, Any] = field(default_factory=dict)
     histories: dict[str, Any] = field(default_factory=dict)
+    play: dict[str, Any] = field(default_factory=dict)
     rounds: int = 0
     mode: PlayMode = AS_PUBLISHED
     protocols: Mapping[str, int] = field(default_factory=lambda: {"seeded": 3, "published": 1})
@@ -111,6 +113,14 @@ OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 
 RECIPES = {
     "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER, mode=PlayMode(greedy=False)),
+    "rl2-oracle": Recipe(
+        "rl2",
+        "tasks",
+        RL2_SETTINGS["model"],
+        _TEACHER,
+        play={"oracle_teammate": True},
+        mode=PlayMode(greedy=False),
+    ),
     "rl2-tests": Recipe(
         "rl2",
         "tasks",
@@ -157,8 +167,8 @@ than they are trained on, so they learn from mirrored games, too; asymm_right ha
 see, so that of asymm_both is hidden from them."""
 
 TRACK_PLAY: dict[str, dict[str, Any]] = {
-    "teammate": {"oracle_teammate": True},
-    "layout": {"oracle_teammate": True, "rearranged": 70, "four_recipes": True},
+    "teammate": {},
+    "layout": {"rearranged": 70, "four_recipes": True},
 }
 """Track -> values of `PlayOptions` for its models that learn by playing."""
 
@@ -343,7 +353,7 @@ class _Making:
         """Returns the run folder of RL^2."""
         recipe, folder = RECIPES[name], self.out / f"{name}-{self.track}"
         options = TrainOptions(**recipe.train)
-        layouts, tasks, play = self.layouts, self.diverse(), PlayOptions(**TRACK_PLAY[self.track])
+        layouts, tasks, play = self.layouts, self.diverse(), PlayOptions(**TRACK_PLAY[self.track], **recipe.play)
         if recipe.meets_tests:
             tasks, play = self._tasks("test"), PlayOptions()
             layouts = tuple(dict.fromkeys(task.layout.name for task in tasks))

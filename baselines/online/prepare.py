@@ -35,7 +35,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.files import json_hash
 
-FLAT_SHARE = 0.1
+FLAT_SHARE = 0.3
 """Number of tasks on a layout where the ego matters with no teammate, as a share of that on other layouts."""
 
 FOUR_RECIPES_SHARE = 0.2

@@ -90,7 +90,7 @@ baselines: train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only 
 baselines: collect --agent none --out c | A trained model is named by its folder
 baselines: collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
 baselines: collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<=x<=1
-baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-tests, ad-noise,
+baselines: reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-oracle, rl2-tests, ad-noise,
 baselines: reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 baselines: reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 baselines: results empty | Missing option '--out'
