@@ -20,7 +20,7 @@ from baselines.training.histories import filter_histories, history_settings, tra
 from baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from baselines.training.seen import TASKS_SOURCE
 from baselines.training.trainer import TrainingData
-from generation.experts.oracle import oracle_teammate
+from generation.experts.oracle_teammate import oracle_teammate
 from generation.policy import Policy
 from generation.teammates.draws import find_draw
 from generation.teammates.registry import build_teammate, recover_teammate

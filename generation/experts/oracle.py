@@ -12,9 +12,8 @@ Shapes: `P` pots that the ego reaches, `Q` recipes that it may cook (the current
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
@@ -23,8 +22,7 @@ from generation.paths import Paths, Scene
 from generation.policy import Policy
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, FACING_OF, GOAL, PILE, PLATE, PLATES, POT, WALL, Layout
-from icrl4aht_data.overcooked.state import ingredient_count, record_size, swapped, unpack
-from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
 
 FAR = 1000
 """Time to a cell that cannot be reached, or only when the teammate steps aside."""
@@ -175,31 +173,6 @@ def oracle(layout: Layout) -> Policy:
         return action, memory._replace(action=action)
 
     return Policy((), init, act, "state")
-
-
-class _ExchangedAgents(Layout):
-    """A layout whose agents are exchanged: the ego starts where the teammate does."""
-
-    @cached_property
-    def agent_cells(self) -> tuple[int, ...]:
-        return super().agent_cells[::-1]
-
-
-def oracle_teammate(layout: Layout) -> Policy:
-    """Returns the oracle as agent 1, a policy that sees the state record, uint8 (S,).
-
-    It does all of the work that its room allows, and leaves it to an ego that cooks and delivers. Its one parameter,
-    float32 (), is the chance that it idles in a step.
-    """
-    exchanged = _ExchangedAgents(layout.name, layout.alias, layout.rows, layout.recipes, layout.indicates_delivery)
-    script = oracle(exchanged)
-
-    def act(idle: Any, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        action, memory = script.act((), memory, swapped(record), key)
-        action = jnp.where(jax.random.bernoulli(key, idle), STAY, action).astype(jnp.int32)
-        return action, memory._replace(action=action)
-
-    return Policy(jnp.float32(0), lambda idle, key: script.init((), key), act, script.sees)
 
 
 def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:

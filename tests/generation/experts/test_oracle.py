@@ -15,7 +15,7 @@ from baselines.agents.egos import get_agent
 from baselines.evaluate.evaluator import play_tasks
 from baselines.evaluate.protocols import PROTOCOLS
 from baselines.evaluate.rollout import EvaluationRollout
-from generation.experts.oracle import oracle_teammate
+from generation.experts.oracle_teammate import oracle_teammate
 from generation.policy import Policy
 from generation.teammates.instances import published_tasks, published_thetas
 from generation.teammates.registry import build_teammate
