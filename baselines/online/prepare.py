@@ -44,7 +44,6 @@ FOUR_RECIPES_SHARE = 0.2
 REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
 
-
 ORACLE = "oracle"
 """Kind and family of the oracle as a teammate."""
 
@@ -186,7 +185,7 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
             mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
             found.setdefault(key, {})[task_id] = mate
     for task in tasks:
-        mate = _Teammate(task.teammate, _build(task.layout, task.teammate))
+        mate = _Teammate(task.teammate, build_teammate(task.layout, task.teammate))
         found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
     return found
 
@@ -200,11 +199,11 @@ def _oracles(layouts: Sequence[Layout]) -> _Teammates:
     }
 
 
-def _build(layout: Layout, entry: Mapping[str, Any]) -> Policy:
+def _build(layout: Layout, entry: dict[str, Any]) -> Policy:
     """Returns the policy of a teammate's entry, as in a task or of `_oracles`."""
     if entry["kind"] == ORACLE:
         return oracle_teammate(layout)._replace(params=jnp.float32(entry["idle"]))
-    return build_teammate(layout, dict(entry))
+    return build_teammate(layout, entry)
 
 
 def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
