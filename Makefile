@@ -29,19 +29,19 @@ $(STAMP): pyproject.toml
 	@touch $@
 
 demo: install ## load, sample, verify, train, evaluate on validation tasks and draw it (at most 10 minutes)
-	$(BIN)/python -m baselines demo
+	$(BIN)/icrl4aht-data demo
 
 generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|small|mini|cpu|paper, OUT=folder, OPTIONS=...
-	$(BIN)/python -m generation generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
+	$(BIN)/icrl4aht-data generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
 teammates: install ## train the suite of learned teammates: PROFILE=smoke|small|mini|cpu|paper
-	$(BIN)/python -m generation teammates --profile $(PROFILE)
+	$(BIN)/icrl4aht-data teammates --profile $(PROFILE)
 
 verify: install ## verify every byte and the physics of a release: ROOT=folder (default: the bundled mini release)
 	$(BIN)/icrl4aht-data verify --deep $(ROOT)
 
 control: install ## show that the models adapt in context in worlds built for it (about 10 minutes)
-	$(BIN)/python -m baselines control
+	$(BIN)/icrl4aht-data control
 
 test: check ## lint, types and the default tests (8 minutes on 2 cores): WORKERS=2 (2 GB each)
 	$(PYTEST) -m "not slow"

@@ -28,16 +28,16 @@ from typing import Any
 import click
 import h5py
 import jax
+from icrl4aht_generation.collection.noise import run_noise
+from icrl4aht_generation.collection.task import make_learner, run_task
+from icrl4aht_generation.collection.task_folder import last_timing
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from benchmarks.common import folder_size, peak_memory, print_line
-from generation.collection.noise import run_noise
-from generation.collection.task import make_learner, run_task
-from generation.collection.task_folder import last_timing
-from generation.learners.config import Widths
-from generation.profiles import Profile, load_profile
-from generation.profiles.noise_config import NoiseConfig
-from generation.profiles.work import Work
-from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks

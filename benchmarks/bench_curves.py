@@ -22,15 +22,15 @@ import click
 import jax
 import numpy as np
 from filelock import FileLock, Timeout
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.ego import compiled_update
+from icrl4aht_generation.learners.resume import limit_xla_threads
+from icrl4aht_generation.profiles import load_profile
 from matplotlib.figure import Figure
 from scipy.stats import t as student_t
 
 from benchmarks.bench_learner import heuristic_learner
 from benchmarks.common import print_line
-from generation.learners.config import PPOConfig
-from generation.learners.ego import compiled_update
-from generation.learners.resume import limit_xla_threads
-from generation.profiles import load_profile
 from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import save_figure

@@ -27,13 +27,13 @@ from typing import Any
 import click
 import jax
 import jax.numpy as jnp
+from icrl4aht_generation.adapters.jaxmarl_env import JaxMARLEnv
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.config import PPOConfig
 
 from benchmarks.common import compiled_call, print_line, rates_in_turn, ratio_facts
 from benchmarks.ippo import train_ippo
 from benchmarks.peers import jaxmarl_environment, jaxmarl_training
-from generation.adapters.jaxmarl_env import JaxMARLEnv
-from generation.env import Environment
-from generation.learners.config import PPOConfig
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 

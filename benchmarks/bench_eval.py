@@ -15,15 +15,15 @@ from typing import Any
 import click
 import jax
 import jax.numpy as jnp
+from icrl4aht_baselines.agents.egos import random
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.teammates.instances import published_tasks
+from icrl4aht_generation.teammates.registry import build_teammate
 
-from baselines.agents.egos import random
-from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.evaluate.rollout import EvaluationRollout, task_key
 from benchmarks.common import elapsed, print_line, rates_in_turn
-from generation.env import Environment
-from generation.teammates.instances import published_tasks
-from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout

@@ -36,27 +36,27 @@ from typing import Any
 import click
 import jax
 import jax.numpy as jnp
+from icrl4aht_baselines.agents.egos import learned
+from icrl4aht_baselines.evaluate.evaluator import play_episodes, prepare_rollout
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.methods.attention import causal_attention
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.options import SIZES, ModelOptions
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_baselines.training.trainer import Trainer
+from icrl4aht_generation.collection.options import request_determinism
+from icrl4aht_generation.learners.config import EncoderKind, PPOConfig, Widths
+from icrl4aht_generation.learners.ego import Learner, compiled_update
+from icrl4aht_generation.learners.resume import xla_threads
+from icrl4aht_generation.teammates.instances import published_tasks
 from jax.extend.backend import get_backend
 from jaxlib import version as jaxlib_version
 
-from baselines.agents.egos import learned
-from baselines.evaluate.evaluator import play_episodes, prepare_rollout
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.methods.attention import causal_attention
-from baselines.methods.method import Method
-from baselines.methods.options import SIZES, ModelOptions
-from baselines.methods.registry import get_method, overcooked_world
-from baselines.training.options import TrainOptions
-from baselines.training.trainer import Trainer
 from benchmarks.bench_learner import heuristic_learner
 from benchmarks.common import print_line
 from benchmarks.flops import compile_measured, device_memory, gib
 from benchmarks.isolated import run_isolated
-from generation.collection.options import request_determinism
-from generation.learners.config import EncoderKind, PPOConfig, Widths
-from generation.learners.ego import Learner, compiled_update
-from generation.learners.resume import xla_threads
-from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout

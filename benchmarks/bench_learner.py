@@ -21,21 +21,21 @@ import click
 import jax
 import jax.numpy as jnp
 import optax
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.ego import Learner, compiled_update
+from icrl4aht_generation.learners.encoder import WindowEncoder
+from icrl4aht_generation.learners.network import GRU
+from icrl4aht_generation.learners.population.fcp import FCP
+from icrl4aht_generation.learners.population.population import Population
+from icrl4aht_generation.learners.ppo import ppo_optimizer
+from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads
+from icrl4aht_generation.learners.rollout import roll_out
+from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from benchmarks.common import compiled_call, elapsed, print_line, rates_in_turn, ratio_facts
 from benchmarks.flops import compile_measured
-from generation.env import Environment
-from generation.learners.config import PPOConfig
-from generation.learners.ego import Learner, compiled_update
-from generation.learners.encoder import WindowEncoder
-from generation.learners.network import GRU
-from generation.learners.population.fcp import FCP
-from generation.learners.population.population import Population
-from generation.learners.ppo import ppo_optimizer
-from generation.learners.resume import limit_xla_threads, xla_threads
-from generation.learners.rollout import roll_out
-from generation.profiles import load_profile
-from generation.teammates.registry import build_teammate, heuristic_teammate
 from icrl4aht_data.commands.options import COUNT, LAYOUT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 

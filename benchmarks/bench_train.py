@@ -24,21 +24,21 @@ import click
 import h5py
 import jax
 import numpy as np
+from icrl4aht_baselines.agents.egos import Acting, PlayMode, learned
+from icrl4aht_baselines.evaluate.evaluator import PreparedRollout, evaluate, play_episodes, prepare_rollout
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol
+from icrl4aht_baselines.methods.ad import dropped_steps
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.options import SIZES, ModelOptions, ModelSize
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.methods.tokens import plain_view
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_baselines.training.trainer import Trainer
+from icrl4aht_generation.learners.config import EncoderKind
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.instances import published_tasks
 
-from baselines.agents.egos import Acting, PlayMode, learned
-from baselines.evaluate.evaluator import PreparedRollout, evaluate, play_episodes, prepare_rollout
-from baselines.evaluate.protocols import PROTOCOLS, Protocol
-from baselines.methods.ad import dropped_steps
-from baselines.methods.method import Method
-from baselines.methods.options import SIZES, ModelOptions, ModelSize
-from baselines.methods.registry import get_method, overcooked_world
-from baselines.methods.tokens import plain_view
-from baselines.training.options import TrainOptions
-from baselines.training.trainer import Trainer
 from benchmarks.common import elapsed, print_line
-from generation.learners.config import EncoderKind
-from generation.policy import Policy
-from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.commands.options import COUNT

@@ -1,6 +1,6 @@
 """Independent PPO of both agents with shared parameters, on any environment with JaxMARL's interface.
 
-The losses and updates are those of `generation.learners.ppo`; the network is a small one without memory, so that the
+The losses and updates are those of `icrl4aht_generation.learners.ppo`; the network is a small one without memory, so that the
 environment is a large part of the work. T denotes the steps of a roll-out, N the environments, M = 2 N the agents in
 them, those of the first agent first.
 """
@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer, shaping_weight
 from jaxtyping import Array, Float, Key, Num
-
-from generation.learners.config import PPOConfig
-from generation.learners.ppo import PPO, Sequences, ppo_optimizer, shaping_weight
 
 if TYPE_CHECKING:
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv

@@ -17,9 +17,9 @@ from typing import Any
 
 import click
 import jax
+from icrl4aht_generation.learners.config import PPOConfig
 
 from benchmarks.common import compiled_call
-from generation.learners.config import PPOConfig
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 

@@ -172,7 +172,7 @@ class Dataset(Selection):
         """Divide this selection into histories to train on and histories to validate with.
 
         The choice depends on names and the seed alone, not on the order of the selection, and is the one that
-        `python -m baselines train` makes where a release has no histories of split validation.
+        `icrl4aht-data train` makes where a release has no histories of split validation.
 
         Args:
             validation: share of the teammates, or of the histories, that is held out; at least one is.
@@ -288,7 +288,7 @@ class Dataset(Selection):
         Args:
             history_id: a history of the release, whether selected or not.
             options: options of `gymnasium.make`, such as `max_episode_steps` or `render_mode`, and of
-                `generation.adapters.gymnasium_env.TaskEnv`. Channels are those of the dataset by default.
+                `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`. Channels are those of the dataset by default.
 
         Raises:
             NotStoredError: if the release was made without its tasks.

@@ -3,7 +3,7 @@
 `gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")` makes the environment of a published test task, and
 `gymnasium.make("icrl4aht/task-v0", task=...)` that of any other task. `import icrl4aht_data` registers the ids, since
 Gymnasium loads no plugins since version 1.0; `gymnasium.make("icrl4aht_data:icrl4aht/demo_wide-H4-t0-v0")` imports it.
-The environment itself is `generation.adapters.gymnasium_env.TaskEnv`, which needs JAX.
+The environment itself is `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, which needs JAX.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 TASK_ENVIRONMENT = "icrl4aht/task-v0"
 """Gymnasium id of the environment of any task, which is its argument `task`."""
 
-_MODULE = "generation.adapters.gymnasium_env"
+_MODULE = "icrl4aht_generation.adapters.gymnasium_env"
 _TRACKS = ("teammate", "layout")
 
 
@@ -54,7 +54,7 @@ def environment_spec(max_steps: int, arguments: dict[str, Any]) -> EnvSpec:
 
     Args:
         max_steps: steps of an episode.
-        arguments: arguments of `generation.adapters.gymnasium_env.TaskEnv`.
+        arguments: arguments of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`.
 
     Raises:
         ImportError: if Gymnasium is not installed.
@@ -69,7 +69,7 @@ def make_environment(**options: Any) -> gymnasium.Env:
     """Return the Gymnasium environment of a task.
 
     Args:
-        options: options of `gymnasium.make` and of `generation.adapters.gymnasium_env.TaskEnv`, among them `task`.
+        options: options of `gymnasium.make` and of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, among them `task`.
 
     Raises:
         OptionError: if Gymnasium or JAX is not installed.

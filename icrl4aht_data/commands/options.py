@@ -1,4 +1,4 @@
-"""Shared parts of the command lines `icrl4aht-data`, `python -m generation` and `python -m baselines`.
+"""Shared parts of the command lines `icrl4aht-data`, `icrl4aht-data` and `icrl4aht-data`.
 
 Exit codes: 0 success; 1 an error, or a release in which `verify` found a problem, or the reader of the output has gone;
 2 a misused command.

@@ -8,15 +8,15 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+from icrl4aht_baselines import demo
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.results import Result, write_result
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.report import episode_gifs
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_generation.teammates.registry import sample_teammate
 from rich.console import Console
 
-from baselines import demo
-from baselines.evaluate.protocols import get_protocol
-from baselines.evaluate.results import Result, write_result
-from baselines.methods.options import ModelOptions
-from baselines.report import episode_gifs
-from baselines.training.options import TrainOptions
-from generation.teammates.registry import sample_teammate
 from icrl4aht_data.benchmark.tasks import make_task
 from tests.helpers.random_releases import random_release
 

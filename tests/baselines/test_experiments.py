@@ -12,14 +12,13 @@ import jax
 import jax.numpy as jnp
 import pytest
 from click.testing import CliRunner
-
-from baselines import experiments
-from baselines.agents.egos import NamedEgo, PlayMode, stay
-from baselines.commands.cli import cli
-from baselines.evaluate import protocols
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.evaluate.results import read_result
-from baselines.experiments import (
+from icrl4aht_baselines import experiments
+from icrl4aht_baselines.agents.egos import NamedEgo, PlayMode, stay
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate import protocols
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.evaluate.results import read_result
+from icrl4aht_baselines.experiments import (
     CONTEXTS,
     EXPERIMENTS,
     TESTED_ON,
@@ -28,14 +27,15 @@ from baselines.experiments import (
     held_out_tasks,
     run_experiment,
 )
-from baselines.report.episode_gifs import family_gifs
-from baselines.report.results import TEST_LAYOUTS, read_run
-from baselines.training.histories import TrainingTask
-from baselines.training.run_folder import CHECKPOINTS
-from generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
-from generation.learners.config import Widths
-from generation.learners.network import ActorCritic
-from generation.learners.resume import Checkpoints
+from icrl4aht_baselines.report.episode_gifs import family_gifs
+from icrl4aht_baselines.report.results import TEST_LAYOUTS, read_run
+from icrl4aht_baselines.training.histories import TrainingTask
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS
+from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.resume import Checkpoints
+
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.format.manifest import write_manifest

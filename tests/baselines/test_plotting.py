@@ -7,8 +7,8 @@ from itertools import product
 
 import numpy as np
 import pytest
+from icrl4aht_baselines import plotting
 
-from baselines import plotting
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
 from tests.helpers.evaluated import evaluated_run
 

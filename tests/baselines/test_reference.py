@@ -10,15 +10,13 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from PIL import Image
-
-from baselines import reference
-from baselines.agents import bundled
-from baselines.agents.bundled import MODELS
-from baselines.commands.cli import cli
-from baselines.methods.options import ModelOptions
-from baselines.methods.registry import get_method
-from baselines.reference import (
+from icrl4aht_baselines import reference
+from icrl4aht_baselines.agents import bundled
+from icrl4aht_baselines.agents.bundled import MODELS
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.registry import get_method
+from icrl4aht_baselines.reference import (
     RECIPES,
     RL2_HISTORIES,
     TRACK_VIEWS,
@@ -27,10 +25,12 @@ from baselines.reference import (
     make_reference,
     write_bundled_card,
 )
-from baselines.report.results import EvaluationRun
-from baselines.training.histories import read_trained
-from baselines.training.options import HistoryOptions, TrainOptions
-from generation.profiles.noise_config import NoiseConfig
+from icrl4aht_baselines.report.results import EvaluationRun
+from icrl4aht_baselines.training.histories import read_trained
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from PIL import Image
+
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
@@ -149,7 +149,7 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
         for track in TRACKS
     ]
     card = write_bundled_card("ad-x", outcomes, tmp_path).read_text(encoding="utf-8")
-    assert "| made by | `python -m baselines reference --name ad-student --bundle-as ad-x` |" in card
+    assert "| made by | `icrl4aht-data research reference --name ad-student --bundle-as ad-x` |" in card
     shown = re.findall(r"!\[\w+\]\((.+)\)", card.split("## Curves")[1].split("## Limits")[0])
     assert shown == ["teammate/returns.png", "layout/returns.png", "layout/curves.png"]
     assert all((tmp_path / "ad-x" / path).is_file() for path in shown)

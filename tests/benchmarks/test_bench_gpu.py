@@ -12,13 +12,15 @@ from typing import Any
 import jax
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.agents.egos import learned
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
+from icrl4aht_baselines.methods.options import SIZES
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_baselines.training.trainer import Trainer
+from icrl4aht_generation.learners.ego import compiled_update
+from icrl4aht_generation.teammates.registry import build_teammate
 
-from baselines.agents.egos import learned
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.evaluate.rollout import EvaluationRollout
-from baselines.methods.options import SIZES
-from baselines.training.options import TrainOptions
-from baselines.training.trainer import Trainer
 from benchmarks import bench_gpu
 from benchmarks.bench_gpu import (
     CASES,
@@ -35,8 +37,6 @@ from benchmarks.bench_gpu import (
     measure_training,
 )
 from benchmarks.flops import product_flops
-from generation.learners.ego import compiled_update
-from generation.teammates.registry import build_teammate
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from tests.helpers.paths import ROOT

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.methods.options import SIZES, ModelSize
+from icrl4aht_generation.teammates.instances import published_tasks
 
-from baselines.methods.options import SIZES, ModelSize
 from benchmarks import bench_train
 from benchmarks.bench_train import main, published_batches
-from generation.teammates.instances import published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.published import to_published
 

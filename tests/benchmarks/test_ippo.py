@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_generation.adapters.jaxmarl_env import JaxMARLEnv
+from icrl4aht_generation.learners.config import PPOConfig
 from jaxmarl.environments import spaces
 from jaxmarl.environments.multi_agent_env import MultiAgentEnv
 
 from benchmarks import bench_env
 from benchmarks.ippo import train_ippo
 from benchmarks.peers import jaxmarl_training
-from generation.adapters.jaxmarl_env import JaxMARLEnv
-from generation.learners.config import PPOConfig
 
 UPDATES, STEPS = 10, 8
 PEER = os.environ.get("PEER", "")

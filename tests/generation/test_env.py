@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.env import Environment, EnvState
 
-from generation.env import Environment, EnvState
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout

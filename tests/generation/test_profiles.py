@@ -9,12 +9,12 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
+from icrl4aht_generation.cli import cli
+from icrl4aht_generation.collection.task_folder import artefact_settings
+from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_names
+from icrl4aht_generation.teammates.registry import heuristic_teammate
 
-from generation.cli import cli
-from generation.collection.task_folder import artefact_settings
-from generation.learners.config import PPOConfig, Widths
-from generation.profiles import FOLDER, Profile, load_profile, profile_names
-from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_id, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.evaluate.results import Result
-from baselines.report.results import EvaluationRun, as_run
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.evaluate.results import Result
+from icrl4aht_baselines.report.results import EvaluationRun, as_run
+
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks

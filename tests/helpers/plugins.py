@@ -8,7 +8,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from unittest import mock
 
-from baselines.methods.registry import METHOD_PLUGINS
+from icrl4aht_baselines.methods.registry import METHOD_PLUGINS
+
 from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
 

@@ -6,11 +6,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.learners.population.lbrdiv import Multipliers
+from icrl4aht_generation.learners.population.population import Algorithm, Population
 
-from generation.env import Environment
-from generation.learners.config import PPOConfig, Widths
-from generation.learners.population.lbrdiv import Multipliers
-from generation.learners.population.population import Algorithm, Population
 from icrl4aht_data.overcooked.layouts import get_layout
 
 LAYOUT = get_layout("cramped_up")

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from icrl4aht_baselines.methods.encoder import FlatEncoder
+from icrl4aht_baselines.methods.method import Method, World
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.tokens import plain_view
 
-from baselines.methods.encoder import FlatEncoder
-from baselines.methods.method import Method, World
-from baselines.methods.options import ModelOptions
-from baselines.methods.tokens import plain_view
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 

@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from fsspec.implementations.memory import MemoryFileSystem
+from icrl4aht_baselines.methods.registry import METHODS
+from icrl4aht_generation.cli import cli as generation_cli
+from icrl4aht_generation.planning import plan
 
-from baselines.methods.registry import METHODS
-from generation.cli import cli as generation_cli
-from generation.planning import plan
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import ReleaseInfo
@@ -349,7 +349,7 @@ class TestScale:
         """All lines are equal, except for numbers that depend on measurements."""
         monkeypatch.setattr(plan, "calibrate", lambda config, make: plan.LearnerSpeed(1000.0, 1.0))
         monkeypatch.setattr(plan, "bytes_per_transition", lambda kind, source: 1.0)
-        (arguments,) = (a for a in commands("python -m generation", PAGES["scale"]) if a[0] == "plan")
+        (arguments,) = (a for a in commands("icrl4aht-data", PAGES["scale"]) if a[0] == "plan")
         result = CliRunner().invoke(generation_cli, arguments)
         assert result.exit_code == 0, result.output
         (written,) = (block for block in blocks("text", PAGES["scale"]) if block.startswith("profile"))

@@ -260,7 +260,7 @@ def test_missing_module_names_its_extra(tmp_path):
     """A process without flax, as where only the reader is installed."""
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['flax'] = None\n")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    command = [sys.executable, "-m", "generation", "speed", "--profile", "smoke"]
+    command = [sys.executable, "-m", "icrl4aht_generation", "speed", "--profile", "smoke"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.endswith(

@@ -12,17 +12,17 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.commands.cli import cli as baselines_cli
+from icrl4aht_generation.cli import cli as generation_cli
 
-from baselines.commands.cli import cli as baselines_cli
-from generation.cli import cli as generation_cli
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import LAYOUT, Names, Sections
 from tests.packaging.test_readme import ROOT, understand
 
 PROGRAMS = {
     "icrl4aht-data": cli,
-    "python -m generation": generation_cli,
-    "python -m baselines": baselines_cli,
+    "icrl4aht-data": generation_cli,
+    "icrl4aht-data": baselines_cli,
 }
 
 

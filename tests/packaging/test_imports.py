@@ -29,13 +29,13 @@ ORDER = {
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
 
 BASELINES_MAY_USE = (
-    "generation.env",
-    "generation.policy",
-    "generation.teammates",
-    "generation.learners",
-    "generation.experts",
-    "generation.collection",
-    "generation.profiles",
+    "icrl4aht_generation.env",
+    "icrl4aht_generation.policy",
+    "icrl4aht_generation.teammates",
+    "icrl4aht_generation.learners",
+    "icrl4aht_generation.experts",
+    "icrl4aht_generation.collection",
+    "icrl4aht_generation.profiles",
 )
 JAX = {"jax", "jaxlib", "flax", "optax"}
 JAX_ON_DEMAND = {"icrl4aht_data.sampling.batches"}
@@ -222,40 +222,42 @@ def test_wrong_imports_are_found(tmp_path):
         "icrl4aht_data/interop.py": "def f():\n    from flax import nnx",
         "icrl4aht_data/reading/shard.py": "from icrl4aht_data import dataset",
         "icrl4aht_data/sampling/batches.py": "import jax.numpy as jnp",
-        "generation/cli.py": "import jax\ndef f():\n    from generation.env import step",
-        "generation/env.py": "import baselines.demo, jax.numpy",
+        "generation/cli.py": "import jax\ndef f():\n    from icrl4aht_generation.env import step",
+        "generation/env.py": "import icrl4aht_baselines.demo, jax.numpy",
         "generation/new.py": "from . import env",
-        "generation/learners/a.py": "from generation.learners import b",
-        "generation/learners/b.py": "import PIL.Image\ndef f():\n    from generation.learners.a import x",
-        "generation/releases.py": "import generation.new, os",
-        "baselines/demo.py": "import numpy\nif TYPE_CHECKING:\n    import generation.releases",
+        "generation/learners/a.py": "from icrl4aht_generation.learners import b",
+        "generation/learners/b.py": "import PIL.Image\ndef f():\n    from icrl4aht_generation.learners.a import x",
+        "generation/releases.py": "import icrl4aht_generation.new, os",
+        "baselines/demo.py": "import numpy\nif TYPE_CHECKING:\n    import icrl4aht_generation.releases",
         "benchmarks/bench.py": "import tests.conftest",
         "tests/conftest.py": "",
     }
     tree = _tree(tmp_path, files)
     no_reason = "it loads no optional library, import it at the top"
     allowed = f"baselines may use {', '.join(BASELINES_MAY_USE)}"
-    cycle = "generation.learners.a is imported by generation.learners.b is imported by generation.learners.a: a cycle"
+    cycle = "icrl4aht_generation.learners.a is imported by icrl4aht_generation.learners.b is imported by icrl4aht_generation.learners.a: a cycle"
     assert {rule: sorted(rule(tree)) for rule in RULES} == {
-        absolute: ["generation.new imports .: write the full name"],
+        absolute: ["icrl4aht_generation.new imports .: write the full name"],
         downwards: [
             "benchmarks.bench imports tests.conftest: benchmarks comes before tests",
-            "generation.env imports baselines.demo: generation comes before baselines",
-            "generation.releases imports generation.new: new is not in the order of generation",
+            "icrl4aht_generation.env imports icrl4aht_baselines.demo: generation comes before baselines",
+            "icrl4aht_generation.releases imports icrl4aht_generation.new: new is not in the order of generation",
             "icrl4aht_data.reading.shard imports icrl4aht_data.dataset: reading comes before dataset in icrl4aht_data",
         ],
         acyclic: [cycle],
         at_the_top: [
-            f"baselines.demo imports generation.releases under TYPE_CHECKING: {no_reason}",
-            f"generation.cli imports generation.env in a function: {no_reason}",
-            f"generation.learners.b imports generation.learners.a in a function: {no_reason}",
+            f"icrl4aht_baselines.demo imports icrl4aht_generation.releases under TYPE_CHECKING: {no_reason}",
+            f"icrl4aht_generation.cli imports icrl4aht_generation.env in a function: {no_reason}",
+            f"icrl4aht_generation.learners.b imports icrl4aht_generation.learners.a in a function: {no_reason}",
         ],
         reader_without_jax: [
             "icrl4aht_data.interop imports flax in a function: the reader works without JAX",
             "icrl4aht_data.sampling.batches imports jax.numpy: the reader works without JAX",
         ],
-        narrow_use_of_generation: [f"baselines.demo imports generation.releases under TYPE_CHECKING: {allowed}"],
-        pictures_on_demand: ["generation.learners.b imports PIL.Image: import it where it draws"],
+        narrow_use_of_generation: [
+            f"icrl4aht_baselines.demo imports icrl4aht_generation.releases under TYPE_CHECKING: {allowed}"
+        ],
+        pictures_on_demand: ["icrl4aht_generation.learners.b imports PIL.Image: import it where it draws"],
     }
 
 
@@ -265,8 +267,8 @@ def test_right_imports_are_not_found(tmp_path):
         "generation/env.py": "import icrl4aht_data.sampling.batches\nimport jax.numpy",
         "generation/plotting.py": "def f():\n    from matplotlib.figure import Figure",
         "benchmarks/bench.py": "import matplotlib",
-        "generation/policy.py": "import generation.env",
-        "generation/cli.py": "import numpy\ndef f():\n    from generation.env import step",
+        "generation/policy.py": "import icrl4aht_generation.env",
+        "generation/cli.py": "import numpy\ndef f():\n    from icrl4aht_generation.env import step",
         "baselines/demo.py": "from generation import env",
     }
     tree = _tree(tmp_path, files)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import click
 import pytest
+from icrl4aht_baselines.commands.cli import cli as baselines_cli
+from icrl4aht_generation.cli import cli as generation_cli
+from icrl4aht_generation.collection import ray_executor as on_ray
+from icrl4aht_generation.collection.options import CollectOptions
 
-from baselines.commands.cli import cli as baselines_cli
-from generation.cli import cli as generation_cli
-from generation.collection import ray_executor as on_ray
-from generation.collection.options import CollectOptions
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import run
@@ -101,7 +101,7 @@ baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, 
 baselines: evaluate --agent none --out e | A trained model is named by its folder
 baselines: evaluate --agent empty --out e | empty: no run: config.json is missing
 baselines: evaluate --agent stay --out e --acting cach | unknown acting 'cach'; valid: cached, exact.
-baselines: evaluate --agent stay --out e --suite none | none: no such folder; `python -m generation teammates`
+baselines: evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 baselines: evaluate --agent stay --out e --manifest empty | 'empty' is a directory
 baselines: watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 baselines: watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
@@ -132,7 +132,7 @@ reader: combine --out out {MINI} {MINI} | leave one of them out
 reader: release build empty --out out | empty: no release here
 reader: upload none hf://datasets/a/b --dry-run | none: no release here
 generation: check none empty | none: no such folder
-generation: diversity --suite empty | empty: no layout has all its populations finished; `python -m generation
+generation: diversity --suite empty | empty: no layout has all its populations finished; `icrl4aht-data
 baselines: train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 baselines: train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
 baselines: train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
@@ -141,11 +141,11 @@ baselines: collect --agent stay --source student --out c | source = student: non
 baselines: ablate windows --reward-scale 1 | reward_scale = 1.0: `ablate windows` sets it; choose by --only, such as
 baselines: results --ablation windows empty --out r | empty: no results of plain; expected a folder that `python -m
 baselines: collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
-baselines: results empty --out r | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
+baselines: results empty --out r | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 baselines: train ad --layout all --channels own | channels = own: the layouts coord_simple,
 baselines: train ad --layout demo_wide --source nois | source = nois: none of Dataset(
 baselines: train ad --layout demo_wide --root none | none: no release here
-baselines: report empty | empty: no results in empty/tasks; run `python -m baselines evaluate --out empty`
+baselines: report empty | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 baselines: evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 baselines: drift empty | empty: not a run
 """

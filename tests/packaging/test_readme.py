@@ -10,15 +10,15 @@ import shlex
 
 import click
 import pytest
+from icrl4aht_baselines.commands.cli import cli as baselines_cli
+from icrl4aht_baselines.report.summary import published_table
+from icrl4aht_generation.cli import cli as generation_cli
 
-from baselines.commands.cli import cli as baselines_cli
-from baselines.report.summary import published_table
-from generation.cli import cli as generation_cli
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.utils.templates import card_file
 from tests.helpers.paths import ROOT
 
-PROGRAMS = {"icrl4aht-data": cli, "python -m generation": generation_cli, "python -m baselines": baselines_cli}
+PROGRAMS = {"icrl4aht-data": cli, "icrl4aht-data": generation_cli, "icrl4aht-data": baselines_cli}
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CHARACTERS = 8000
 """Length limit of the README: the rest is in docs/."""

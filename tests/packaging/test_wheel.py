@@ -67,10 +67,10 @@ import sys
 
 import numpy as np
 
-from baselines.agents import from_host
-from baselines.evaluate import evaluate, get_protocol
-from baselines.report import as_run, markdown
-from generation.teammates.instances import published_tasks
+from icrl4aht_baselines.agents import from_host
+from icrl4aht_baselines.evaluate import evaluate, get_protocol
+from icrl4aht_baselines.report import as_run, markdown
+from icrl4aht_generation.teammates.instances import published_tasks
 
 
 class MyAgent:
@@ -160,8 +160,12 @@ def test_the_wheel_contains_the_packages_and_nothing_else(wheel):
     assert names == {f"{package}/{name}" for package in PACKAGES for name in files_below(ROOT / package)} | cards
     data = ("mini/MANIFEST.sha256", "manifests/teammate_test.jsonl", "cards/dataset.md", "py.typed")
     assert {f"{READER}/{name}" for name in data} <= names
-    assert {"generation/teammates/draws.jsonl", "generation/profiles/smoke.toml", "generation/py.typed"} <= names
-    assert any(name.startswith("baselines/models/ad-reference/") for name in names)
+    assert {
+        "generation/icrl4aht_generation/teammates/draws.jsonl",
+        "generation/icrl4aht_generation/profiles/smoke.toml",
+        "generation/icrl4aht_generation/py.typed",
+    } <= names
+    assert any(name.startswith("baselines/icrl4aht_baselines/models/ad-reference/") for name in names)
     assert f"Name: {NAME}\nVersion: {VERSION}\n" in metadata
     assert "License-Expression: MIT" in metadata
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
@@ -271,7 +275,7 @@ def test_the_reader_works_without_extras(installed, wheel, tmp_path):
 @pytest.mark.parametrize("package", ["generation", "baselines"])
 def test_commands_name_the_missing_extra(installed, wheel, tmp_path, package):
     run = runner(installed, tmp_path)
-    script = {"generation": "icrl4aht-generate", "baselines": "icrl4aht-baselines"}[package]
+    script = {"generation": "icrl4aht-data", "baselines": "icrl4aht-data"}[package]
     for program in ((script,), ("python", "-m", package)):
         assert run(*program, "--version") == f"{NAME} {VERSION}\n"
         assert "Examples:" in run(*program, "--help")
@@ -285,7 +289,7 @@ def test_commands_name_the_missing_extra(installed, wheel, tmp_path, package):
         message = run(script, *arguments, code=1)
         assert message.startswith("error: this needs "), message
         assert message.endswith(f", which is not installed: {hinted(wheel, package)}\n"), message
-    module = {"generation": "generation.env", "baselines": "baselines.evaluate"}[package]
+    module = {"generation": "icrl4aht_generation.env", "baselines": "icrl4aht_baselines.evaluate"}[package]
     done = call(installed / "python", "-c", f"import {module}", cwd=tmp_path)
     assert done.stderr.endswith(f"Error: this needs jax, which is not installed: {hinted(wheel, package)}\n"), (
         done.stderr
@@ -298,23 +302,23 @@ def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
     run = runner(grown, tmp_path)
     run("python", "-c", "import jax, flax, optax, importlib.util as u; assert not u.find_spec('matplotlib')")
     assert run("python", "-c", EVALUATE).endswith("\nFalse\n")
-    assert "ad-reference" in run("icrl4aht-baselines", "models")
-    run("icrl4aht-generate", "manifests", "--check")
+    assert "ad-reference" in run("icrl4aht-data", "models")
+    run("icrl4aht-data", "manifests", "--check")
     small = ("--layout", "demo_wide", "--tasks", "1", "--episodes", "2")
-    run("icrl4aht-baselines", "evaluate", "--agent", "ad-reference", *small, "--out", "results")
+    run("icrl4aht-data", "evaluate", "--agent", "ad-reference", *small, "--out", "results")
     settings = ("--layout", "demo_wide", "--steps", "2", "--batch-size", "2", "--context", "20")
-    trained = run("icrl4aht-baselines", "train", "ad", *settings, "--out", "run")
+    trained = run("icrl4aht-data", "train", "ad", *settings, "--out", "run")
     assert f"curves.png was not drawn, matplotlib is not installed: {hinted(wheel, 'plot')}" in trained
     assert not list(tmp_path.rglob("*.png"))
-    generate = ("icrl4aht-generate", "generate", "--profile", "smoke", "--out", "rebuilt")
-    for command in (generate, ("icrl4aht-baselines", "report", "results")):
+    generate = ("icrl4aht-data", "generate", "--profile", "smoke", "--out", "rebuilt")
+    for command in (generate, ("icrl4aht-data", "report", "results")):
         message = run(*command, code=1)
         assert message == f"error: drawing needs matplotlib and Pillow: {hinted(wheel, 'plot')}\n"
     assert not (tmp_path / "rebuilt").exists() and not (tmp_path / "results" / "report").exists()
 
     follow(hinted(wheel, "baselines"), grown)
     assert "| demo_wide |" in run("python", "-c", EVALUATE)
-    run("icrl4aht-baselines", "report", "results")
+    run("icrl4aht-data", "report", "results")
     assert (tmp_path / "results" / "report" / "curves.png").stat().st_size > 5000
 
 

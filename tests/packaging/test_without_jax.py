@@ -31,8 +31,8 @@ print(json.dumps(found))
 @pytest.mark.parametrize(
     ("package", "free", "needing"),
     [
-        ("baselines", "baselines.commands.cli", "baselines.evaluate"),
-        ("generation", "generation.cli", "generation.env"),
+        ("baselines", "icrl4aht_baselines.commands.cli", "icrl4aht_baselines.evaluate"),
+        ("generation", "icrl4aht_generation.cli", "icrl4aht_generation.env"),
     ],
 )
 def test_every_module_imports_or_names_the_extra(package, free, needing):
@@ -64,11 +64,11 @@ def test_with_jax_imports_are_left_alone():
     ],
 )
 def test_an_adapter_names_the_extra_of_its_library(module, library, extra, monkeypatch):
-    monkeypatch.delitem(sys.modules, f"generation.adapters.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, f"icrl4aht_generation.adapters.{module}", raising=False)
     monkeypatch.setitem(sys.modules, library, None)
     for name in [name for name in sys.modules if name.startswith(f"{library}.")]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError) as caught:
-        importlib.import_module(f"generation.adapters.{module}")
+        importlib.import_module(f"icrl4aht_generation.adapters.{module}")
     assert caught.value.msg.endswith(f" needs {caught.value.name}: {install_command(extra)}")
     assert (caught.value.name or "").partition(".")[0] == library

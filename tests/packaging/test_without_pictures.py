@@ -7,15 +7,15 @@ import sys
 
 import numpy as np
 import pytest
+from icrl4aht_baselines.demo import run_demo
+from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
+from icrl4aht_baselines.report import write_report
+from icrl4aht_generation.plotting import plot_matrix
+from icrl4aht_generation.populations.build import build_suite, report_diversity
+from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.releases.build import build_releases
 from rich.console import Console
 
-from baselines.demo import run_demo
-from baselines.experiments import ExperimentPlan, run_experiment
-from baselines.report import write_report
-from generation.plotting import plot_matrix
-from generation.populations.build import build_suite, report_diversity
-from generation.profiles import load_profile
-from generation.releases.build import build_releases
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.installation import install_command

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
 from safetensors.numpy import save_file
 
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli

@@ -11,22 +11,22 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.agents import Percept, bundled
+from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
+from icrl4aht_baselines.agents.egos import PlayMode, find_agent
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.commands.options import find_ego
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.results import Result
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.report.results import as_run
+from icrl4aht_baselines.training.histories import prepare, read_trained
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.trainer import train
+from icrl4aht_generation.teammates.instances import published_task
 from PIL import Image
 
-from baselines.agents import Percept, bundled
-from baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
-from baselines.agents.egos import PlayMode, find_agent
-from baselines.commands.cli import cli
-from baselines.commands.options import find_ego
-from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import get_protocol
-from baselines.evaluate.results import Result
-from baselines.methods.options import ModelOptions
-from baselines.report.results import as_run
-from baselines.training.histories import prepare, read_trained
-from baselines.training.options import HistoryOptions, TrainOptions
-from baselines.training.trainer import train
-from generation.teammates.instances import published_task
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 

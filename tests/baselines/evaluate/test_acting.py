@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.agents.egos import PlayMode, find_agent
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.drift import Drift, measure_drift
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.methods.options import SIZES, ModelOptions, ModelSize
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.training.histories import prepare, read_trained
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions, open_run
+from icrl4aht_generation.learners.resume import Checkpoints
+from icrl4aht_generation.teammates.instances import published_tasks
 
-from baselines.agents.egos import PlayMode, find_agent
-from baselines.commands.cli import cli
-from baselines.evaluate.drift import Drift, measure_drift
-from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.methods.options import SIZES, ModelOptions, ModelSize
-from baselines.methods.registry import get_method, overcooked_world
-from baselines.training.histories import prepare, read_trained
-from baselines.training.options import HistoryOptions, TrainOptions
-from baselines.training.run_folder import CHECKPOINTS, format_versions, open_run
-from generation.learners.resume import Checkpoints
-from generation.teammates.instances import published_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.small_models import random_parameters
@@ -75,7 +75,7 @@ def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
         found.extend(measure_drift(two_layer_ad, params, context, WIDE[:1], protocol))
         return found
 
-    monkeypatch.setattr("baselines.evaluate.drift.measure_drift", on_two_layers)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.drift.measure_drift", on_two_layers)
     result = CliRunner().invoke(cli, ["drift", str(runs / "ad")], catch_exceptions=False)
     assert "AD+TA on demo_wide with 5 teammates of H4, K = 30" in result.output
     (episode,) = found
@@ -92,7 +92,7 @@ def test_the_drift_command(runs, monkeypatch):
         assert (context, len(tasks), planned.episodes, channels) == (30, 5, 2, "own")
         yield Drift(np.full((5, 100), 0.25), np.ones((5, 100), bool))
 
-    monkeypatch.setattr("baselines.evaluate.drift.measure_drift", play)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.drift.measure_drift", play)
     command = ["drift", str(runs / "ad"), "--episodes", "2", "--family", "H1"]
     result = CliRunner().invoke(cli, command, catch_exceptions=False)
     assert "AD+TA on demo_wide with 5 teammates of H1, K = 30" in result.output

@@ -12,22 +12,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines import experiments
+from icrl4aht_baselines.agents.egos import find_agent, with_channels
+from icrl4aht_baselines.agents.host import Percept, from_host
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.report.model_card import model_card
+from icrl4aht_baselines.report.results import note_results, read_run
+from icrl4aht_baselines.training.histories import prepare, read_trained
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_generation.learners.encoder import CompactView
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.instances import published_task
 
-from baselines import experiments
-from baselines.agents.egos import find_agent, with_channels
-from baselines.agents.host import Percept, from_host
-from baselines.commands.cli import cli
-from baselines.evaluate.evaluator import evaluate
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
-from baselines.methods.options import ModelOptions
-from baselines.report.model_card import model_card
-from baselines.report.results import note_results, read_run
-from baselines.training.histories import prepare, read_trained
-from baselines.training.options import HistoryOptions, TrainOptions
-from generation.learners.encoder import CompactView
-from generation.policy import Policy
-from generation.teammates.instances import published_task
 from icrl4aht_data.benchmark.facts import TESTED_ON
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout

@@ -12,20 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.agents.egos import NamedEgo, get_agent, random, stay
+from icrl4aht_baselines.agents.host import Percept, from_host
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
+from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
+from icrl4aht_baselines.report import results as results_of_runs
+from icrl4aht_baselines.report.headroom import write_headroom_cards
+from icrl4aht_baselines.report.intervals import bootstrap_interval
+from icrl4aht_baselines.report.results import OWN_TASKS, EvaluationRun, as_run, normalized_return, read_run
+from icrl4aht_baselines.report.summary import csv_text, markdown
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.instances import published_tasks
 
-from baselines.agents.egos import NamedEgo, get_agent, random, stay
-from baselines.agents.host import Percept, from_host
-from baselines.commands.cli import cli
-from baselines.evaluate.evaluator import evaluate, play_tasks
-from baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
-from baselines.evaluate.results import Result, read_result, write_result
-from baselines.report import results as results_of_runs
-from baselines.report.headroom import write_headroom_cards
-from baselines.report.intervals import bootstrap_interval
-from baselines.report.results import OWN_TASKS, EvaluationRun, as_run, normalized_return, read_run
-from baselines.report.summary import csv_text, markdown
-from generation.policy import Policy
-from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
@@ -304,17 +304,19 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
         write_tasks(path(track, "validation", "diverse"), [])
     write_tasks(path("layout", "validation"), [])
     write_tasks(path("layout", "test"), [])
-    monkeypatch.setattr("baselines.evaluate.protocols.manifest_path", path)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.protocols.manifest_path", path)
     for name in ("_bundled_by_id", "_instances"):  # what is cached of other manifests would outlast this test
         monkeypatch.setattr(results_of_runs, name, getattr(results_of_runs, name).__wrapped__)
-    monkeypatch.setattr("baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name)))
+    monkeypatch.setattr(
+        "icrl4aht_baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name))
+    )
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
 
     def write_results(name, ego, tasks, protocol, *, out, **options):
         for task in tasks:
             write_result(out, Result(task.task_id, settings, [[1.0, 2.0]]))
 
-    monkeypatch.setattr("baselines.evaluate.evaluator.evaluate", write_results)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.evaluate", write_results)
     command = ["evaluate", "--agent", "stay", "--track", "teammate", "--out", str(tmp_path / "run")]
     for split in (["--split", "validation"], ["--split", "test"], []):
         result = CliRunner().invoke(cli, [*command, *split])

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.methods.tokens import batch_steps, plain_view
+from icrl4aht_baselines.training.histories import prepare
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_generation.learners import encoder
+from icrl4aht_generation.learners.encoder import CompactView, GroupedWords
 
-from baselines.methods.method import Method
-from baselines.methods.registry import get_method, overcooked_world
-from baselines.methods.tokens import batch_steps, plain_view
-from baselines.training.histories import prepare
-from baselines.training.options import HistoryOptions, TrainOptions
-from generation.learners import encoder
-from generation.learners.encoder import CompactView, GroupedWords
 from icrl4aht_data import get_layout, load_icrl4aht
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import TINY, random_parameters

@@ -12,20 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-
-from baselines.agents.host import Percept
-from baselines.methods import attention
-from baselines.methods.conditional import change_if
-from baselines.methods.method import Method
-from baselines.methods.options import ModelOptions
-from baselines.methods.registry import get_method, overcooked_world
-from baselines.methods.tokens import (
+from icrl4aht_baselines.agents.host import Percept
+from icrl4aht_baselines.methods import attention
+from icrl4aht_baselines.methods.conditional import change_if
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.methods.tokens import (
     Transition,
     batch_steps,
     batch_transitions,
     percept_step,
     plain_view,
 )
+
 from icrl4aht_data import get_layout
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.sampling.ad import ADBatch

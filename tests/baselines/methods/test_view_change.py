@@ -9,8 +9,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_baselines.methods.view_change import ViewChange, changed_view, mirrored_action, no_change
 
-from baselines.methods.view_change import ViewChange, changed_view, mirrored_action, no_change
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import EGO, INTERACT
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS

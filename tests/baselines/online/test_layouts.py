@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
+from icrl4aht_baselines.online.layouts import rearranged_layouts, unseen_layouts, with_four_recipes
+from icrl4aht_baselines.training.options import MOST_REARRANGED
 
-from baselines.online.layouts import rearranged_layouts, unseen_layouts, with_four_recipes
-from baselines.training.options import MOST_REARRANGED
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from baselines.online.programs import run_all, shared_programs
+from icrl4aht_baselines.online.programs import run_all, shared_programs
 
 
 def walker(table: list[int], steps: int = 3) -> Callable[..., Any]:

@@ -13,18 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
-
-from baselines.agents.egos import PlayMode, find_agent
-from baselines.commands.cli import cli
-from baselines.evaluate.evaluator import prepare_rollout
-from baselines.evaluate.protocols import get_protocol
-from baselines.methods.options import RL2_SETTINGS, ModelOptions
-from baselines.methods.registry import get_method, overcooked_world
-from baselines.methods.tokens import StepInput
-from baselines.methods.view_change import ViewChange
-from baselines.online.layouts import rearranged_layouts
-from baselines.online.prepare import FLAT_SHARE, ORACLE, ORACLE_IDLES, REARRANGED_SHARE, _shares, prepare_play
-from baselines.online.rl2 import (
+from icrl4aht_baselines.agents.egos import PlayMode, find_agent
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.methods.tokens import StepInput
+from icrl4aht_baselines.methods.view_change import ViewChange
+from icrl4aht_baselines.online.layouts import rearranged_layouts
+from icrl4aht_baselines.online.prepare import FLAT_SHARE, ORACLE, ORACLE_IDLES, REARRANGED_SHARE, _shares, prepare_play
+from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
     TaskGroup,
@@ -35,13 +34,14 @@ from baselines.online.rl2 import (
     make_groups,
     seen_steps,
 )
-from baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
-from baselines.training.histories import read_trained
-from baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
-from baselines.training.seen import read_trained_on
-from baselines.training.trainer import TrainingData, train
-from generation.teammates.instances import published_task
-from generation.teammates.registry import build_teammate, sample_teammate
+from icrl4aht_baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
+from icrl4aht_baselines.training.histories import read_trained
+from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
+from icrl4aht_baselines.training.seen import read_trained_on
+from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_generation.teammates.instances import published_task
+from icrl4aht_generation.teammates.registry import build_teammate, sample_teammate
+
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError

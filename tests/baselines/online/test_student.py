@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.online import student
+from icrl4aht_baselines.online.student import collect_release, record_histories, release_teammates, with_noise
+from icrl4aht_baselines.reference import RL2_HISTORIES
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
-from baselines.agents.egos import AGENTS, NamedEgo, stay
-from baselines.commands.cli import cli
-from baselines.online import student
-from baselines.online.student import collect_release, record_histories, release_teammates, with_noise
-from baselines.reference import RL2_HISTORIES
-from generation.policy import Policy
-from generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks

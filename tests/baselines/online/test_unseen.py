@@ -9,17 +9,17 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.agents.egos import AGENTS
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
+from icrl4aht_baselines.online import unseen
+from icrl4aht_baselines.online.layouts import unseen_layouts
+from icrl4aht_baselines.online.unseen import unseen_returns
+from icrl4aht_baselines.report import stored_results
+from icrl4aht_baselines.report.stored_results import UNSEEN, read_stored
+from icrl4aht_generation.teammates.registry import build_teammate
 
-from baselines.agents.egos import AGENTS
-from baselines.commands.cli import cli
-from baselines.evaluate.protocols import bundled_tasks, get_protocol
-from baselines.evaluate.rollout import EvaluationRollout, task_key
-from baselines.online import unseen
-from baselines.online.layouts import unseen_layouts
-from baselines.online.unseen import unseen_returns
-from baselines.report import stored_results
-from baselines.report.stored_results import UNSEEN, read_stored
-from generation.teammates.registry import build_teammate
 from icrl4aht_data.errors import OptionError
 
 TASKS = [

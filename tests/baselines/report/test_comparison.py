@@ -9,12 +9,11 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from click.testing import CliRunner
-
-from baselines.commands.cli import cli
-from baselines.evaluate.protocols import bundled_tasks, get_protocol
-from baselines.evaluate.results import Result, read_result, write_result
-from baselines.report import stored_results
-from baselines.report.comparison import (
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
+from icrl4aht_baselines.report import stored_results
+from icrl4aht_baselines.report.comparison import (
     FORGETS,
     ablation_table,
     cells_with_headroom,
@@ -28,9 +27,9 @@ from baselines.report.comparison import (
     summary_table,
     unseen_table,
 )
-from baselines.report.overlap import OVERLAPS
-from baselines.report.results import OWN_TASKS, cell_of, published_cells, published_test_tasks
-from baselines.report.stored_results import (
+from icrl4aht_baselines.report.overlap import OVERLAPS
+from icrl4aht_baselines.report.results import OWN_TASKS, cell_of, published_cells, published_test_tasks
+from icrl4aht_baselines.report.stored_results import (
     UNSEEN,
     CellReturns,
     StoredResults,
@@ -41,8 +40,9 @@ from baselines.report.stored_results import (
     results_file,
     write_stored,
 )
-from baselines.training.ablations import ABLATIONS
-from baselines.training.run_folder import RUN_FORMAT
+from icrl4aht_baselines.training.ablations import ABLATIONS
+from icrl4aht_baselines.training.run_folder import RUN_FORMAT
+
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import OptionError, UnknownNameError
@@ -281,7 +281,7 @@ class TestAblations:
             add_ablation(StoredResults({}, {}), self.WINDOWS, tmp_path)
 
     def test_a_folder_without_an_ablation(self, tmp_path):
-        with pytest.raises(OptionError, match="no results of plain; expected a folder that `python -m baselines"):
+        with pytest.raises(OptionError, match="no results of plain; expected a folder that `icrl4aht-data"):
             add_ablation(StoredResults({}, {}), self.WINDOWS, tmp_path)
         with pytest.raises(UnknownNameError, match="unknown ablation 'ablate ta'; valid: ablate windows"):
             add_ablation(StoredResults({}, {}), "ablate ta", tmp_path)

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from icrl4aht_baselines.report import page
+from icrl4aht_baselines.report.overlap import OVERLAPS
+from icrl4aht_baselines.report.results import GROUP_TEXTS, EvaluationRun, merge
+from icrl4aht_baselines.report.summary import csv_text, markdown, rows
+from icrl4aht_baselines.report.tables import PAPER_TABLES, fill_table, score_cells, sweep_points
 
-from baselines.report import page
-from baselines.report.overlap import OVERLAPS
-from baselines.report.results import GROUP_TEXTS, EvaluationRun, merge
-from baselines.report.summary import csv_text, markdown, rows
-from baselines.report.tables import PAPER_TABLES, fill_table, score_cells, sweep_points
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, make_task, teammate_id
 from icrl4aht_data.errors import OptionError

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icrl4aht_baselines.report.episode_gifs import EpisodePair, ShownEpisode
+from icrl4aht_baselines.report.page import write_page
+from icrl4aht_baselines.report.results import TEST_LAYOUTS
 from PIL import Image
 
-from baselines.report.episode_gifs import EpisodePair, ShownEpisode
-from baselines.report.page import write_page
-from baselines.report.results import TEST_LAYOUTS
 from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
 from tests.helpers.evaluated import evaluated_run
 

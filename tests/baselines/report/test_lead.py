@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from icrl4aht_baselines.evaluate.results import Result
+from icrl4aht_baselines.plotting import plot_family_curves
+from icrl4aht_baselines.report.lead import (
+    FamilyReturns,
+    describe_rise,
+    family_returns,
+    find_lead,
+    lead_table,
+    lead_verdict,
+)
 
-from baselines.evaluate.results import Result
-from baselines.plotting import plot_family_curves
-from baselines.report.lead import FamilyReturns, describe_rise, family_returns, find_lead, lead_table, lead_verdict
 from tests.helpers.evaluated import TEST_TASKS
 
 

@@ -10,18 +10,18 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.commands.cli import cli
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.report import episode_gifs as gifs
+from icrl4aht_baselines.report import rendering
+from icrl4aht_baselines.report.episode_gifs import EpisodePair, ShownEpisode, restore_ego
+from icrl4aht_baselines.report.model_card import model_card, write_model_cards
+from icrl4aht_baselines.report.page import write_page, write_page_with_episodes
+from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, merge, read_published, split_cells
+from icrl4aht_baselines.report.summary import report_begins, write_report
+from icrl4aht_baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, returns_table, score_cells, sweep_points
 from matplotlib.figure import Figure
 
-from baselines.commands.cli import cli
-from baselines.evaluate.protocols import PROTOCOLS, get_protocol
-from baselines.report import episode_gifs as gifs
-from baselines.report import rendering
-from baselines.report.episode_gifs import EpisodePair, ShownEpisode, restore_ego
-from baselines.report.model_card import model_card, write_model_cards
-from baselines.report.page import write_page, write_page_with_episodes
-from baselines.report.results import TEST_LAYOUTS, EvaluationRun, merge, read_published, split_cells
-from baselines.report.summary import report_begins, write_report
-from baselines.report.tables import AVERAGE, PAPER_TABLES, fill_table, returns_table, score_cells, sweep_points
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from icrl4aht_baselines.report.charts import curve_figure, return_bars, score_bars, sweep_figure
+from icrl4aht_baselines.report.headline import find_headlines, headline_text
+from icrl4aht_baselines.report.results import published_cells
+from icrl4aht_baselines.report.tables import sweep_points
 
-from baselines.report.charts import curve_figure, return_bars, score_bars, sweep_figure
-from baselines.report.headline import find_headlines, headline_text
-from baselines.report.results import published_cells
-from baselines.report.tables import sweep_points
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.plotting import return_limits, running_mean

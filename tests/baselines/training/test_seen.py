@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from icrl4aht_baselines.training.histories import hold_out, training_cells
+from icrl4aht_baselines.training.seen import SeenInTraining, read_trained_on
+from icrl4aht_generation.teammates.instances import published_task
 
-from baselines.training.histories import hold_out, training_cells
-from baselines.training.seen import SeenInTraining, read_trained_on
-from generation.teammates.instances import published_task
 from icrl4aht_data import Dataset, load_icrl4aht
 from icrl4aht_data.benchmark.tasks import teammate_id
 from icrl4aht_data.dataset import teammate_ids

@@ -19,15 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental import multihost_utils
-from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
-
-from baselines.methods.registry import get_method
-from baselines.training.histories import hold_out, prepare
-from baselines.training.options import HistoryOptions, TrainOptions
-from baselines.training.run_folder import CHECKPOINTS
-from baselines.training.stopping import StopSignals, TrainingStopped
-from baselines.training.trainer import (
+from icrl4aht_baselines.methods.registry import get_method
+from icrl4aht_baselines.training.histories import hold_out, prepare
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS
+from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
+from icrl4aht_baselines.training.trainer import (
     Trainer,
     TrainingData,
     TrainState,
@@ -36,7 +33,10 @@ from baselines.training.trainer import (
     train,
     training_optimizer,
 )
-from generation.learners.resume import Checkpoints
+from icrl4aht_generation.learners.resume import Checkpoints
+from jax.experimental import multihost_utils
+from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
+
 from icrl4aht_data import dataset as dataset_module
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
@@ -192,7 +192,7 @@ class TestStopping:
             return {name: value for name, value in dataclasses.asdict(options).items() if name != "weight_decay"}
 
         with monkeypatch.context() as older, pytest.raises(TrainingStopped):
-            older.setattr("baselines.training.trainer.asdict", before)
+            older.setattr("icrl4aht_baselines.training.trainer.asdict", before)
             trained(tmp_path, done=terminate_at_4)
         assert "weight_decay" not in json.loads((tmp_path / "config.json").read_text())["train"]
         method, other = get_method("amago_offline")(MODEL, FLAT), dataclasses.replace(OPTIONS, weight_decay=0.5)
@@ -444,10 +444,10 @@ import jax
 if len(sys.argv) > 2:
     jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
 from pathlib import Path
-from baselines.training.histories import prepare
-from baselines.methods.options import ModelOptions
-from baselines.training.options import HistoryOptions, TrainOptions
-from baselines.training.trainer import train
+from icrl4aht_baselines.training.histories import prepare
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.trainer import train
 options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
 model = ModelOptions(layers=1, width=8, heads=2)
 root, out = sys.argv[1].split(",")
@@ -531,7 +531,18 @@ def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
 def test_the_command_that_is_told_to_stop(lite, tmp_path):
     run = tmp_path / "run"
     small = ["--batch-size", "2", "--context", "4", "--layers", "1", "--width", "8", "--heads", "2", "--log-every", "1"]
-    command = ["-m", "baselines", "train", "ad", "--layout", "demo_wide", "--root", str(lite[0]), "--out", str(run)]
+    command = [
+        "-m",
+        "icrl4aht_baselines",
+        "train",
+        "ad",
+        "--layout",
+        "demo_wide",
+        "--root",
+        str(lite[0]),
+        "--out",
+        str(run),
+    ]
     process = start(*command, *small)
     end = time.monotonic() + 120
     while not ((run / "metrics.jsonl").exists() and metrics(run)) and time.monotonic() < end:

@@ -12,10 +12,10 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from icrl4aht_generation.adapters.draws import recorded_draws
+from icrl4aht_generation.adapters.gymnasium_env import TaskEnv, published_environment
+from icrl4aht_generation.teammates.instances import published_task, published_tasks
 
-from generation.adapters.draws import recorded_draws
-from generation.adapters.gymnasium_env import TaskEnv, published_environment
-from generation.teammates.instances import published_task, published_tasks
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.environments import TASK_ENVIRONMENT, make_environment
 from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, UnknownNameError

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.adapters.jaxmarl_env import JaxMARLEnv
+from icrl4aht_generation.env import Environment
 from jaxmarl.environments.multi_agent_env import MultiAgentEnv
 from jaxmarl.wrappers.baselines import LogWrapper
 
-from generation.adapters.jaxmarl_env import JaxMARLEnv
-from generation.env import Environment
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import get_layout

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icrl4aht_generation.adapters.pettingzoo_env import BothAgentsEnv
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from generation.adapters.pettingzoo_env import BothAgentsEnv
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe_both

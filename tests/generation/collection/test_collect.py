@@ -9,22 +9,22 @@ import time
 
 import numpy as np
 import pytest
+from icrl4aht_generation.collection import task as collect
+from icrl4aht_generation.collection import task_folder as artefacts
+from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, partial_folder
+from icrl4aht_generation.learners.resume import StateFile
+from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.releases.check import compare_rebuilds
 
-from generation.collection import task as collect
-from generation.collection import task_folder as artefacts
-from generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, partial_folder
-from generation.learners.resume import StateFile
-from generation.profiles import Profile, load_profile
-from generation.profiles.work import Work
-from generation.releases.check import compare_rebuilds
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import TINY, artefact, start
 
 COLLECT = """
 import sys, time
 from pathlib import Path
-from generation.collection.task import run_task
-from generation.profiles import Profile, load_profile
+from icrl4aht_generation.collection.task import run_task
+from icrl4aht_generation.profiles import Profile, load_profile
 
 def report(update, metrics):
     print(update, flush=True)

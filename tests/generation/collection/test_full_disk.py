@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from icrl4aht_generation.collection import failures
+from icrl4aht_generation.collection.failures import FailureLog
+from icrl4aht_generation.collection.job import TaskOutcome
+from icrl4aht_generation.collection.record import array_shapes
+from icrl4aht_generation.collection.task import run_task
+from icrl4aht_generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
+from icrl4aht_generation.learners.resume import RunLog, StateFile
+from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles.work import Work
 
-from generation.collection import failures
-from generation.collection.failures import FailureLog
-from generation.collection.job import TaskOutcome
-from generation.collection.record import array_shapes
-from generation.collection.task import run_task
-from generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
-from generation.learners.resume import RunLog, StateFile
-from generation.profiles import Profile, load_profile
-from generation.profiles.work import Work
 from tests.helpers.tiny import artefact, start
 from tests.robustness.limits import can_mount, file_size_limit
 
@@ -110,10 +110,10 @@ COLLECT_ON_SMALL_DISKS = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from generation.collection.job import CollectionError
-from generation.collection.options import CollectOptions
-from generation.collection.run import collect_tasks
-from generation.profiles import Profile, load_profile
+from icrl4aht_generation.collection.job import CollectionError
+from icrl4aht_generation.collection.options import CollectOptions
+from icrl4aht_generation.collection.run import collect_tasks
+from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_data.benchmark.tasks import Task
 from tests.robustness.limits import small_disk
 

@@ -13,20 +13,20 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.collection import noise
+from icrl4aht_generation.collection.curate import oracle_labels
+from icrl4aht_generation.collection.noise import noise_bytes, run_noise
+from icrl4aht_generation.collection.noise_rollout import noise_schedules, play_noisy_episodes
+from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, last_timing, partial_folder
+from icrl4aht_generation.learners.resume import StateFile
+from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.releases.check import compare_rebuilds
+from icrl4aht_generation.teammates.distances import act_along
+from icrl4aht_generation.teammates.learned import build_learned
+from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
-from generation.collection import noise
-from generation.collection.curate import oracle_labels
-from generation.collection.noise import noise_bytes, run_noise
-from generation.collection.noise_rollout import noise_schedules, play_noisy_episodes
-from generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, last_timing, partial_folder
-from generation.learners.resume import StateFile
-from generation.profiles import Profile, load_profile
-from generation.profiles.noise_config import NoiseConfig
-from generation.profiles.work import Work
-from generation.releases.check import compare_rebuilds
-from generation.teammates.distances import act_along
-from generation.teammates.learned import build_learned
-from generation.teammates.registry import build_teammate, heuristic_teammate
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import DiskFullError, OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -42,8 +42,8 @@ WORK = Work(make_task("teammate", "train", "demo_wide", MATE, 7), "noise")
 COLLECT = """
 import sys, time
 from pathlib import Path
-from generation.collection import noise
-from generation.profiles import load_profile
+from icrl4aht_generation.collection import noise
+from icrl4aht_generation.profiles import load_profile
 from tests.generation.collection.test_noise import PIECE, WORK
 
 def report(history, metrics):
@@ -300,7 +300,7 @@ def test_killed_at_two_moments(made, tmp_path):
 def test_the_commands(tmp_path):
     """A release generated in one process, then its tasks on Ray, with the same bits; the release is valid."""
     (tmp_path / "noise.toml").write_text(NOISE)
-    command = ("-m", "generation", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
+    command = ("-m", "icrl4aht_generation", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
     again = ("--tasks", str(tmp_path / "a/lite/meta/tasks.jsonl"), "--executor", "ray", "--workers", "1")
     for name, options in (("a", ()), ("b", again)):
         process = start(*command, str(tmp_path / name), *options)
@@ -308,7 +308,7 @@ def test_the_commands(tmp_path):
         assert process.returncode == 0, output + errors
         assert "demo_wide with utility_greedy, noise: finished at " in output
     for command in (
-        ("-m", "generation", "check", str(tmp_path / "a"), str(tmp_path / "b")),
+        ("-m", "icrl4aht_generation", "check", str(tmp_path / "a"), str(tmp_path / "b")),
         ("-m", "icrl4aht_data", "verify", str(tmp_path / "a" / "lite"), "--deep"),
     ):
         process = start(*command)

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.collection import curate, record
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.rollout import Rollout, init_rollout, policy_player, random_player, roll_out
 
-from generation.collection import curate, record
-from generation.env import Environment
-from generation.experts.oracle import oracle
-from generation.learners.config import PPOConfig, Widths
-from generation.learners.network import ActorCritic
-from generation.learners.rollout import Rollout, init_rollout, policy_player, random_player, roll_out
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe

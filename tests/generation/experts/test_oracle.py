@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_baselines.agents.egos import get_agent
+from icrl4aht_baselines.evaluate.evaluator import play_tasks
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
+from icrl4aht_generation.experts.oracle_teammate import oracle_teammate
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.instances import published_tasks, published_thetas
+from icrl4aht_generation.teammates.registry import build_teammate
 
-from baselines.agents.egos import get_agent
-from baselines.evaluate.evaluator import play_tasks
-from baselines.evaluate.protocols import PROTOCOLS
-from baselines.evaluate.rollout import EvaluationRollout
-from generation.experts.oracle_teammate import oracle_teammate
-from generation.policy import Policy
-from generation.teammates.instances import published_tasks, published_thetas
-from generation.teammates.registry import build_teammate
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout, get_layout

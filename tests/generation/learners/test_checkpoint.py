@@ -5,12 +5,12 @@ import json
 import jax
 import numpy as np
 import pytest
+from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.encoder import CompactView
+from icrl4aht_generation.learners.network import ActorCritic
 from safetensors.numpy import load_file, save_file
 
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
-from generation.learners.config import Widths
-from generation.learners.encoder import CompactView
-from generation.learners.network import ActorCritic
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 

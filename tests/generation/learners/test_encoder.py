@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.encoder import CompactView, WindowEncoder, WindowEntries, WindowWords
 
-from generation.learners.config import Widths
-from generation.learners.encoder import CompactView, WindowEncoder, WindowEntries, WindowWords
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe

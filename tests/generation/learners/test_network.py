@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from generation.learners.config import Widths
-from generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
 
 STEPS, ENVS, CHANNELS = 4, 3, 40
 

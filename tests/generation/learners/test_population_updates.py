@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.learners.population import population as population_module
+from icrl4aht_generation.learners.population.comedi import CoMeDi
+from icrl4aht_generation.learners.population.lbrdiv import LBRDiv, Multipliers
+from icrl4aht_generation.learners.population.population import Algorithm, Population, PopulationState
+from icrl4aht_generation.learners.ppo import Batch, Sequences, sequences, shaping_weight
+from icrl4aht_generation.learners.rollout import Rollout, RolloutCarry, roll_out
 
-from generation.learners.population import population as population_module
-from generation.learners.population.comedi import CoMeDi
-from generation.learners.population.lbrdiv import LBRDiv, Multipliers
-from generation.learners.population.population import Algorithm, Population, PopulationState
-from generation.learners.ppo import Batch, Sequences, sequences, shaping_weight
-from generation.learners.rollout import Rollout, RolloutCarry, roll_out
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.populations import CONFIG, EPISODE, LAYOUT, plain_adapt, population

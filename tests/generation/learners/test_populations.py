@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.learners.population.brdiv import BRDiv
+from icrl4aht_generation.learners.population.comedi import CoMeDi
+from icrl4aht_generation.learners.population.fcp import FCP
+from icrl4aht_generation.learners.population.lbrdiv import LBRDiv, Multipliers
 
-from generation.learners.population.brdiv import BRDiv
-from generation.learners.population.comedi import CoMeDi
-from generation.learners.population.fcp import FCP
-from generation.learners.population.lbrdiv import LBRDiv, Multipliers
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from tests.helpers.populations import plain_adapt, population
 from tests.helpers.trees import same_bytes

@@ -15,12 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from generation.env import Environment
-from generation.learners.config import PPOConfig, Widths
-from generation.learners.ego import Learner, LearnerState
-from generation.learners.encoder import CompactView
-from generation.learners.ppo import (
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.learners.ego import Learner, LearnerState
+from icrl4aht_generation.learners.encoder import CompactView
+from icrl4aht_generation.learners.ppo import (
     PPO,
     Batch,
     Sequences,
@@ -28,8 +27,9 @@ from generation.learners.ppo import (
     ppo_optimizer,
     sequences,
 )
-from generation.learners.rollout import Choice, Rollout, policy_player, roll_out
-from generation.policy import Policy
+from icrl4aht_generation.learners.rollout import Choice, Rollout, policy_player, roll_out
+from icrl4aht_generation.policy import Policy
+
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe

@@ -13,10 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import SingleDeviceSharding
-
-from generation.learners import resume
-from generation.learners.resume import (
+from icrl4aht_generation.learners import resume
+from icrl4aht_generation.learners.resume import (
     BusyError,
     Checkpoints,
     OtherSettingsError,
@@ -29,6 +27,8 @@ from generation.learners.resume import (
     software_versions,
     xla_threads,
 )
+from jax.sharding import SingleDeviceSharding
+
 from icrl4aht_data.errors import OptionError
 
 
@@ -93,7 +93,7 @@ def test_threads_cannot_change_after_jax_was_used(monkeypatch):
 def test_threads_are_limited_before_jax_is_used():
     """The number of XLA's threads among those of the process grows with the limit."""
     script = (
-        "import os, jax; from generation.learners.resume import limit_xla_threads, xla_threads\n"
+        "import os, jax; from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads\n"
         "limit_xla_threads({0}); jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((500, 500))))\n"
         "names = [open(f'/proc/self/task/{{task}}/comm').read() for task in os.listdir('/proc/self/task')]\n"
         "print(xla_threads(), sum('XLAEigen' in name for name in names))"

@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from generation.env import Environment, EnvState
-from generation.learners.config import Widths
-from generation.learners.network import ActorCritic
-from generation.learners.rollout import (
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.rollout import (
     Choice,
     Player,
     Rollout,
@@ -28,7 +27,8 @@ from generation.learners.rollout import (
     roll_out,
     slot_records,
 )
-from generation.policy import Policy
+from icrl4aht_generation.policy import Policy
+
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe

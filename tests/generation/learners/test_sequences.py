@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from icrl4aht_generation.learners.ppo import sequences
+from icrl4aht_generation.learners.rollout import Choice, Rollout
 
-from generation.learners.ppo import sequences
-from generation.learners.rollout import Choice, Rollout
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 
 REWARDS = np.array([-20, -25, -30, -10, -5, 0, 20, 15], np.float32)

@@ -1,4 +1,4 @@
-"""`python -m generation plan`."""
+"""`icrl4aht-data plan`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, cast
 import jax
 import pytest
 from click.testing import CliRunner
+from icrl4aht_generation.cli import cli
+from icrl4aht_generation.collection.noise import noise_bytes
+from icrl4aht_generation.planning import plan
+from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.teammates.registry import heuristic_teammate
 
-from generation.cli import cli
-from generation.collection.noise import noise_bytes
-from generation.planning import plan
-from generation.profiles import load_profile
-from generation.profiles.work import Work
-from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.progress import LineProgress

@@ -21,22 +21,21 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-
-from generation.env import Environment
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
-from generation.learners.config import Widths
-from generation.learners.network import ActorCritic
-from generation.learners.resume import BusyError, run_lock
-from generation.learners.rollout import init_rollout, network_player, policy_player, random_player, roll_out
-from generation.policy import stacked
-from generation.populations import cross_play
-from generation.populations.select import (
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.resume import BusyError, run_lock
+from icrl4aht_generation.learners.rollout import init_rollout, network_player, policy_player, random_player, roll_out
+from icrl4aht_generation.policy import stacked
+from icrl4aht_generation.populations import cross_play
+from icrl4aht_generation.populations.select import (
     TeammateSelection,
     make_tasks,
     select_teammates,
     write_manifests,
 )
-from generation.populations.train import (
+from icrl4aht_generation.populations.train import (
     PopulationRun,
     SuiteCheckpoint,
     is_population_finished,
@@ -44,9 +43,10 @@ from generation.populations.train import (
     suite_checkpoints,
     train_population,
 )
-from generation.profiles import load_profile
-from generation.releases.check import compare_rebuilds
-from generation.teammates import learned
+from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.releases.check import compare_rebuilds
+from icrl4aht_generation.teammates import learned
+
 from icrl4aht_data.benchmark.facts import ALGORITHMS, layout_number
 from icrl4aht_data.benchmark.tasks import read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
@@ -71,7 +71,7 @@ CHILD = """
 import sys, time
 from pathlib import Path
 from tests.generation.populations import test_suite
-from generation.populations import train as suite
+from icrl4aht_generation.populations import train as suite
 
 def report(update, updates, metrics):
     print(update, flush=True)

@@ -16,23 +16,23 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from icrl4aht_generation.cli import cli, main
+from icrl4aht_generation.collection import job
+from icrl4aht_generation.collection import task as collect
+from icrl4aht_generation.collection import task_folder as artefacts
+from icrl4aht_generation.collection.job import CollectionError
+from icrl4aht_generation.collection.task_folder import METADATA
+from icrl4aht_generation.learners.checkpoint import checkpoint_updates, load_policy
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.populations import select
+from icrl4aht_generation.populations import train as suite
+from icrl4aht_generation.populations.build import build_suite
+from icrl4aht_generation.profiles import FOLDER, load_profile, profile_names
+from icrl4aht_generation.releases import build, measures, package
+from icrl4aht_generation.releases.check import compare_rebuilds
+from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
 from rich.console import Console
 
-from generation.cli import cli, main
-from generation.collection import job
-from generation.collection import task as collect
-from generation.collection import task_folder as artefacts
-from generation.collection.job import CollectionError
-from generation.collection.task_folder import METADATA
-from generation.learners.checkpoint import checkpoint_updates, load_policy
-from generation.learners.config import PPOConfig
-from generation.populations import select
-from generation.populations import train as suite
-from generation.populations.build import build_suite
-from generation.profiles import FOLDER, load_profile, profile_names
-from generation.releases import build, measures, package
-from generation.releases.check import compare_rebuilds
-from generation.teammates.registry import build_teammate, recover_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import OptionError
@@ -449,7 +449,7 @@ def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
 def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):
     requests = []
     monkeypatch.setattr(
-        "generation.populations.build.build_suite", lambda *arguments: requests.append(dict(arguments[2]))
+        "icrl4aht_generation.populations.build.build_suite", lambda *arguments: requests.append(dict(arguments[2]))
     )
     path = FOLDER / "mini.toml"  # has no task with CoMeDi
 

@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.collection.curate import relabel
+from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
+from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.releases import labeller
+from icrl4aht_generation.releases.labeller import choose_checkpoint, choose_labeller
+from icrl4aht_generation.releases.package import package_release
+from icrl4aht_generation.teammates.registry import build_teammate
 
-from generation.collection.curate import relabel
-from generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
-from generation.env import Environment
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
-from generation.profiles import load_profile
-from generation.profiles.work import Work
-from generation.releases import labeller
-from generation.releases.labeller import choose_checkpoint, choose_labeller
-from generation.releases.package import package_release
-from generation.teammates.registry import build_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
 from icrl4aht_data.errors import IndexFormatError

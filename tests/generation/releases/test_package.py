@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from icrl4aht_generation.cli import cli
+from icrl4aht_generation.collection.curate import oracle_labels
+from icrl4aht_generation.collection.record import HistoryArrays
+from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
+from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.releases import measures
+from icrl4aht_generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
+from icrl4aht_generation.releases.package import package_release, recorded_sources
+from icrl4aht_generation.teammates import draws as draws_table
+from icrl4aht_generation.teammates.draws import Draw
+from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 
-from generation.cli import cli
-from generation.collection.curate import oracle_labels
-from generation.collection.record import HistoryArrays
-from generation.collection.task_folder import LABELLER_RETURNS, METADATA
-from generation.profiles import Profile, load_profile
-from generation.profiles.work import Work
-from generation.releases import measures
-from generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
-from generation.releases.package import package_release, recorded_sources
-from generation.teammates import draws as draws_table
-from generation.teammates.draws import Draw
-from generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task, make_task

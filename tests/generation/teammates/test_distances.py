@@ -6,22 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from generation.learners.rollout import Rollout
-from generation.policy import Policy
-from generation.teammates import references
-from generation.teammates.distances import (
+from icrl4aht_generation.learners.rollout import Rollout
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates import references
+from icrl4aht_generation.teammates.distances import (
     CommonStates,
     common_states,
     distances_to_tests,
     group_behaviours,
     nearest_test,
 )
-from generation.teammates.draws import read_draws
-from generation.teammates.instances import published_thetas
-from generation.teammates.measuring import measure_draws
-from generation.teammates.references import reference_egos, reference_returns
-from generation.teammates.registry import build_teammate
+from icrl4aht_generation.teammates.draws import read_draws
+from icrl4aht_generation.teammates.instances import published_thetas
+from icrl4aht_generation.teammates.measuring import measure_draws
+from icrl4aht_generation.teammates.references import reference_egos, reference_returns
+from icrl4aht_generation.teammates.registry import build_teammate
+
 from icrl4aht_data.errors import UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-
-from generation.cli import cli
-from generation.teammates import draws, measuring
-from generation.teammates.draws import (
+from icrl4aht_generation.cli import cli
+from icrl4aht_generation.teammates import draws, measuring
+from icrl4aht_generation.teammates.draws import (
     DRAWS_PER_SEED,
     DRAWS_TABLE,
     Draw,
@@ -23,7 +22,8 @@ from generation.teammates.draws import (
     validation_tasks,
     write_draws_table,
 )
-from generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, TRACKS
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 

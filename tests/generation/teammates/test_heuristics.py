@@ -11,20 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from generation.env import Environment
-from generation.paths import Paths, Scene
-from generation.policy import Noise
-from generation.teammates.heuristics import territory
-from generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
-from generation.teammates.heuristics.heuristic import draw
-from generation.teammates.instances import published_thetas
-from generation.teammates.registry import (
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.paths import Paths, Scene
+from icrl4aht_generation.policy import Noise
+from icrl4aht_generation.teammates.heuristics import territory
+from icrl4aht_generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
+from icrl4aht_generation.teammates.heuristics.heuristic import draw
+from icrl4aht_generation.teammates.instances import published_thetas
+from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
     build_teammate,
     heuristic_teammate,
     sample_teammate,
 )
+
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, PLATE, Layout

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.rollout import policy_player
+from icrl4aht_generation.teammates import learned, registry
 
-from generation.env import Environment, EnvState
-from generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, save_policy
-from generation.learners.config import Widths
-from generation.learners.network import ActorCritic
-from generation.learners.rollout import policy_player
-from generation.teammates import learned, registry
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from icrl4aht_generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
+from icrl4aht_generation.teammates.registry import (
+    HEURISTIC_FAMILIES,
+    build_teammate,
+    heuristic_teammate,
+    sample_teammate,
+)
 
-from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
-from generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, heuristic_teammate, sample_teammate
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from tests.generation.teammates.test_utility_greedy import NAMES

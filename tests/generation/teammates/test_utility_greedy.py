@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from icrl4aht_generation.paths import UNREACHABLE, Paths
+from icrl4aht_generation.policy import Noise
+from icrl4aht_generation.teammates.heuristics import utility_greedy
+from icrl4aht_generation.teammates.heuristics.heuristic import next_key
+from icrl4aht_generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY, GreedyMemory
+from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
-from generation.paths import UNREACHABLE, Paths
-from generation.policy import Noise
-from generation.teammates.heuristics import utility_greedy
-from generation.teammates.heuristics.heuristic import next_key
-from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY, GreedyMemory
-from generation.teammates.registry import build_teammate, heuristic_teammate
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, PUBLISHED_ACTIONS, RIGHT, STAY, TEAMMATE, UP
 from icrl4aht_data.overcooked.layouts import BUTTON, GOAL, LAYOUTS, PLATES, WALL, Layout

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icrl4aht_generation.teammates.registry import recover_teammate
 
-from generation.teammates.registry import recover_teammate
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, ReleaseError, RootNotFoundError

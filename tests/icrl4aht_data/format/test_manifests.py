@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
+from icrl4aht_generation.cli import cli
+from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
+from icrl4aht_generation.teammates.instances import published_tasks
 
-from generation.cli import cli
-from generation.teammates.draws import diverse_tasks, validation_tasks
-from generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
@@ -86,7 +86,7 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
     assert CliRunner().invoke(cli, ["manifests", "--check"]).exit_code == 0
-    monkeypatch.setattr("generation.cli.manifest_path", lambda track, split, teammates="": short)
+    monkeypatch.setattr("icrl4aht_generation.cli.manifest_path", lambda track, split, teammates="": short)
     result = CliRunner().invoke(cli, ["manifests", "--check"])
     assert result.exit_code == 1
     assert "differs from the parameter sets or draws" in str(result.exception)

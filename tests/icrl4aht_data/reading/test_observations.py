@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 import pytest
 
-from generation.cli import cli as generation
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError

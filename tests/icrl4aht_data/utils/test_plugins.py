@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.registry import all_methods, get_method, overcooked_world
+from icrl4aht_generation.teammates.registry import heuristic_teammate
 
-from baselines.methods.options import ModelOptions
-from baselines.methods.registry import all_methods, get_method, overcooked_world
-from generation.teammates.registry import heuristic_teammate
 from icrl4aht_data import get_layout, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, layout_number, track_of
 from icrl4aht_data.benchmark.tasks import make_task, manifest_path, read_tasks
@@ -45,8 +45,8 @@ LAYOUT_POINTS = {
 METHODS = """
 import dataclasses
 
-from baselines.methods.ad import ad
-from generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY as GREEDY
+from icrl4aht_baselines.methods.ad import ad
+from icrl4aht_generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY as GREEDY
 
 
 def renamed(options, world):

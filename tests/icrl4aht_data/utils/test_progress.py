@@ -6,9 +6,9 @@ import io
 import time
 
 import pytest
+from icrl4aht_generation.progress import ProgressBoard, progress_bars
 from rich.console import Console
 
-from generation.progress import ProgressBoard, progress_bars
 from icrl4aht_data.commands import options
 from icrl4aht_data.utils.progress import LineProgress
 

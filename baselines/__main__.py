@@ -1,3 +1,0 @@
-from baselines.commands.cli import main
-
-main()

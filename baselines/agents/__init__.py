@@ -1,6 +1,0 @@
-"""Ego agents: reference egos, trained models, and an adapter for agents outside JAX."""
-
-from baselines.agents.egos import AGENTS, find_agent, get_agent, stay
-from baselines.agents.host import HostAgent, Percept, from_host
-
-__all__ = ["AGENTS", "HostAgent", "Percept", "find_agent", "from_host", "get_agent", "stay"]

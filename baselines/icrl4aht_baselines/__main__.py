@@ -1,0 +1,3 @@
+from icrl4aht_baselines.commands.cli import main
+
+main()

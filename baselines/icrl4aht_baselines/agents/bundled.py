@@ -1,0 +1,121 @@
+"""The models that this package bundles, in `baselines/icrl4aht_baselines/models`: NAME/TRACK is the run folder of a model of one track.
+
+A bundled run has its settings, its last parameters, without the optimizer's state, and the curves of its training. Next
+to the runs of a model are its card and `bundle.json`, which states the way in which it plays unless another one is
+chosen.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+from icrl4aht_generation.learners.resume import Checkpoints
+
+from icrl4aht_baselines.plotting import shrink_picture
+from icrl4aht_baselines.training.histories import read_trained
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, CONFIG, RUN_CURVES, read_config
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.utils.files import parse_json, read_text
+
+MODELS = Path(__file__).parents[1] / "models"
+"""Folder of the bundled models."""
+
+MODEL_CARD = "README.md"
+"""File name of a bundled model's card, in the folder NAME."""
+
+BUNDLE = "bundle.json"
+"""File name of a bundled model's way of playing, in the folder NAME: {"sampled": whether it draws its actions}."""
+
+_LARGEST = 2 * 10**6  # bytes of a bundled model's parameters
+
+
+class BundledModel(NamedTuple):
+    """A bundled model.
+
+    Attributes:
+        name: such as "ad-reference".
+        runs: track -> run folder of its model.
+        sampled: whether it draws its actions unless another way of playing is chosen.
+    """
+
+    name: str
+    runs: dict[str, Path]
+    sampled: bool = False
+
+
+def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
+    """Returns the bundled models by name."""
+    found = {}
+    for path in sorted(folder.glob("*/")):
+        runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
+        if runs:
+            found[path.name] = BundledModel(path.name, runs, parse_json(read_text(path / BUNDLE))["sampled"])
+    return found
+
+
+def describe_model(model: BundledModel) -> list[str]:
+    """Returns a line for each track of a bundled model."""
+    lines = []
+    for track, folder in model.runs.items():
+        trained = read_trained(folder)
+        count = sum(leaf.size for leaf in jax.tree.leaves(trained.params))
+        sources = sorted({cell["source"] for cell in trained.trained_on})
+        context = "" if trained.method.data == "tasks" else f", K = {trained.context}"
+        lines.append(
+            f"{model.name}, track {track}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
+            f"{', '.join(trained.layouts)} (source {' and '.join(sources)})"
+            + (", draws its actions" if model.sampled else "")
+        )
+    return lines
+
+
+def check_bundle_name(name: str) -> None:
+    """Check the name of a bundled model.
+
+    Raises:
+        OptionError: if it is not of small letters, digits and hyphens.
+    """
+    if not re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)+", name):
+        raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
+
+
+def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False) -> Path:
+    """Copy a finished run into the bundled models, with its parameters and curves; one that is there is replaced.
+
+    Args:
+        run: folder of the run.
+        name: name of the bundled model.
+        track: the track whose tasks the run plays.
+        folder: folder of the bundled models.
+        sampled: whether the model draws its actions by default, on all tracks.
+
+    Raises:
+        OptionError: if the name is not of small letters, digits and hyphens, or if the run is not finished or its
+            parameters are too large.
+    """
+    check_bundle_name(name)
+    trained, steps = read_trained(run), read_config(run)["train"]["steps"]
+    if trained.step < steps:
+        raise OptionError(f"{run}: at step {trained.step} of {steps}: continue the training with the same command")
+    size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
+    if size > _LARGEST:
+        raise OptionError(f"{run}: parameters of {size:,} bytes, expected at most {_LARGEST:,}: bundle a smaller model")
+    target = folder / name / track
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    config = json.loads((run / CONFIG).read_text(encoding="utf-8"))
+    if not is_address(config["histories"]["root"]):  # a path of the machine that trained it
+        config["histories"]["root"] = Path(config["histories"]["root"]).name
+    (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
+    if (run / RUN_CURVES).is_file():
+        shrink_picture(run / RUN_CURVES, target / RUN_CURVES)
+    (folder / name / BUNDLE).write_text(json.dumps({"sampled": sampled}) + "\n", encoding="utf-8")
+    return target

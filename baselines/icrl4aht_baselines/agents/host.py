@@ -1,0 +1,108 @@
+"""Adapter for egos outside JAX: NumPy, PyTorch, or anything else that maps a batch of percepts to actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import io_callback
+
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.overcooked.channels import CHANNELS, Channels, to_canonical
+from icrl4aht_data.overcooked.layouts import Layout
+
+
+class Percept(NamedTuple):
+    """Input of an ego with memory: its observation and the outcome of the previous step.
+
+    As in training, the step before the first step of an episode is the last step of the previous episode. Before the
+    first step of a task all `prev_*` fields are zero. A `HostAgent` receives arrays of B tasks, with a leading axis
+    (B,).
+
+    Attributes:
+        obs: uint8 (5, 5, C), the ego's observation.
+        prev_action: int32 (), the ego's action in the previous step, 0..5.
+        prev_reward: float32 (), the team's reward in the previous step.
+        prev_teammate_action: int32 (), the teammate's action in the previous step, 0..5.
+        prev_done: bool (), whether the previous step ended an episode.
+    """
+
+    obs: Any
+    prev_action: Any
+    prev_reward: Any
+    prev_teammate_action: Any
+    prev_done: Any
+
+
+class HostPolicy(NamedTuple):
+    """A `icrl4aht_generation.policy.Policy` whose functions take a batch of B tasks, for agents that cannot be vmapped.
+
+    Attributes:
+        params: pytree of parameters.
+        init: (params, keys (B,)) -> memory of the batch.
+        act: (params, memory, views of the batch, keys (B,)) -> actions, int32 (B,), and the memory.
+        sees: content of the views, as in `Policy`.
+    """
+
+    params: Any
+    init: Callable[[Any, Any], Any]
+    act: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
+    sees: Literal["state", "observation", "percept"]
+
+
+class HostAgent(Protocol):
+    """Interface of an ego outside JAX. It plays B tasks in parallel and keeps its own memory."""
+
+    def reset(self, batch: int) -> None:
+        """Clear the memory: a new set of `batch` tasks begins."""
+        ...
+
+    def act(self, percept: Percept) -> np.ndarray:
+        """Returns actions, integers (B,) in 0..5, for a `Percept` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
+        ...
+
+
+def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout], HostPolicy]:
+    """Returns the `make_ego` argument of `icrl4aht_baselines.evaluate.evaluate` for a `HostAgent`.
+
+    For each layout and teammate family `reset` is called once, then `act` once per step with all their tasks.
+
+    Args:
+        agent: the ego.
+        channels: channels of the observations that it takes: "own", those of each layout, or "canonical", which all
+            layouts share.
+
+    Raises:
+        UnknownNameError: if there are no such channels.
+        OptionError: during evaluation, if `act` does not return B integers.
+    """
+
+    if channels not in CHANNELS:
+        raise unknown("channels", channels, CHANNELS)
+
+    def make(layout: Layout) -> HostPolicy:
+        def init(params, keys):
+            agent.reset(keys.shape[0])
+            return ()
+
+        def call(*percept) -> np.ndarray:
+            batch = len(percept[1])
+            actions = np.asarray(agent.act(Percept(*(np.asarray(part) for part in percept))))
+            if actions.shape != (batch,) or not np.issubdtype(actions.dtype, np.integer):
+                raise OptionError(
+                    f"the agent's act returned {actions.dtype} of shape {actions.shape}, expected integers ({batch},)"
+                )
+            return actions.astype(np.int32)
+
+        def act(params, carry, percept: Percept, keys):
+            if channels == "canonical":
+                percept = percept._replace(obs=to_canonical(layout, percept.obs))
+            shape = jax.ShapeDtypeStruct(keys.shape, jnp.int32)
+            return io_callback(call, shape, *percept, ordered=True), carry
+
+        return HostPolicy((), init, act, "percept")
+
+    return make

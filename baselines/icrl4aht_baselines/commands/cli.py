@@ -1,0 +1,385 @@
+"""The command line `icrl4aht-data`, and its commands that train, evaluate and report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+from icrl4aht_generation.teammates.instances import published_task
+from rich.console import Console
+
+from icrl4aht_baselines.commands.experiment_commands import EXPERIMENT_COMMANDS
+from icrl4aht_baselines.commands.model_commands import MODEL_COMMANDS
+from icrl4aht_baselines.commands.options import (
+    EGO_NAME,
+    METHOD_NAME,
+    TRAINING_LAYOUT,
+    acting_option,
+    episodes_option,
+    evaluation_split_option,
+    find_ego,
+    forget_option,
+    gifs_option,
+    greedy_option,
+    hide_recipe_option,
+    history_filters,
+    join_processes,
+    manifests_option,
+    model_options,
+    play_options,
+    prepare_method,
+    prepare_rl2,
+    process_options,
+    protocol_option,
+    root_option,
+    save_minutes_option,
+    seeds_option,
+    size_option,
+    suite_option,
+    tasks_option,
+    tensorboard_option,
+    training_options,
+)
+from icrl4aht_baselines.training.options import HistoryOptions
+from icrl4aht_baselines.training.stopping import TrainingStopped
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.tasks import read_tasks
+from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
+from icrl4aht_data.commands.options import (
+    LAYOUT,
+    SEED,
+    SETTINGS,
+    TRACK,
+    Folder,
+    NewFile,
+    Sections,
+    bars,
+    counted,
+    examples,
+    overwrite_option,
+    run,
+    version_option,
+)
+from icrl4aht_data.errors import EmptySelectionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import can_draw
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.new_file import check_new_file, check_new_files
+
+_console = Console(soft_wrap=True)
+
+
+_SECTIONS = {
+    "Train and evaluate": ("demo", "train", "evaluate", "report", "watch", "collect"),
+    "Reference models": ("models", "reference", "results"),
+    "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
+    "Check": ("control", "drift", "headroom", "unseen"),
+}
+
+
+@click.group(
+    cls=Sections,
+    sections=_SECTIONS,
+    context_settings=SETTINGS,
+    epilog=examples(
+        "icrl4aht-data train ad --layout demo_wide --out runs/ad",
+        "icrl4aht-data evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
+        "icrl4aht-data report runs/ad-results",
+    ),
+)
+@version_option
+def cli() -> None:
+    """Train reference learners and evaluate agents on the ICRL4AHT benchmark.
+
+    Needs the extra baselines. The same program is installed as icrl4aht-data. Finished work is kept: the same
+    command resumes a stopped one. Exit codes: 0 done, 1 a failure or a failed check, 2 a misused command, 130 or 143
+    training stopped by SIGINT or SIGTERM, and saved.
+    """
+
+
+@cli.command(
+    "evaluate",
+    epilog=examples(
+        "icrl4aht-data evaluate --agent random --out runs/random",
+        "icrl4aht-data evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
+        "icrl4aht-data evaluate --agent runs/ad --split validation --layout demo_wide --out runs/ad-validation",
+        "icrl4aht-data evaluate --agent oracle --layout demo_wide --tasks 1 --episodes 5 --out runs/oracle",
+    ),
+)
+@click.option(
+    "--agent",
+    type=EGO_NAME,
+    required=True,
+    help="stay, random, oracle, a bundled model such as ad-reference, or a folder that `train` made.",
+)
+@acting_option
+@greedy_option
+@forget_option
+@protocol_option
+@click.option(
+    "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
+)
+@evaluation_split_option
+@click.option("--layout", type=LAYOUT, multiple=True, help="Only tasks on this layout; repeat for several.")
+@click.option(
+    "--manifest",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Tasks of this file instead of the tracks' tasks; not with --split.",
+)
+@tasks_option
+@episodes_option
+@suite_option
+@seeds_option
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
+def evaluate_command(
+    agent: str,
+    acting: Any,
+    greedy: bool | None,
+    forget: bool,
+    protocol: str,
+    track: tuple[str, ...],
+    split: str | None,
+    layout: tuple[str, ...],
+    manifest: Path | None,
+    tasks: int | None,
+    episodes: int | None,
+    suite: Path | None,
+    seeds: int,
+    out: Path,
+) -> None:
+    """Evaluate an agent on test tasks, or on validation tasks.
+
+    Plays 100 episodes of each task, writes one JSON file per task into OUT/tasks, and prints a summary of OUT. Finished
+    tasks are kept. Choose models by the validation tasks: their layouts are in training, their teammates are in neither
+    training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
+    ranges.
+    """
+    from icrl4aht_baselines.evaluate.evaluator import evaluate
+    from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
+    from icrl4aht_baselines.report.results import note_results, read_run
+    from icrl4aht_baselines.report.summary import summary_lines
+
+    if manifest and split:
+        raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
+    split = split or "test"
+    given = read_tasks(manifest) if manifest else [task for name in track for task in bundled_tasks(name, split)]
+    ego = find_ego("--agent", agent, acting=acting, greedy=greedy, forget=forget)
+    names = {get_layout(name).name for name in layout}
+    chosen = limit_tasks([task for task in given if not names or task.layout.name in names], tasks)
+    if not chosen:
+        raise EmptySelectionError(
+            f"no task on {', '.join(sorted(names))} in {manifest or f'the {split} tasks'}: choose another --layout, or "
+            f"none"
+        )
+    for name in {task.layout.name for task in chosen}:
+        ego.make(get_layout(name))  # a model that does not fit fails before any work
+    played = get_protocol(protocol, episodes)
+    with bars(edges=True, unit="episodes") as show:
+        evaluate(
+            ego.name,
+            ego.make,
+            chosen,
+            played,
+            seeds=range(seeds),
+            suite=suite,
+            out=out,
+            details=ego.details,
+            played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
+        )
+    note_results(out, ego.run, chosen if manifest or split != "test" else ())
+    for line in summary_lines([read_run(out)]):
+        click.echo(line)
+    noun = "result" if len(chosen) == 1 else "results"
+    _console.print(f"{len(chosen)} {noun} in {out}; `icrl4aht-data report {out}` shows them")
+
+
+@cli.command("report")
+@click.argument("runs", nargs=-1, required=True, type=Folder(), metavar="RESULTS...")
+@click.option(
+    "--out", type=Folder(), metavar="FOLDER", help="Write the report here.", show_default="report in the first RESULTS"
+)
+@click.option(
+    "--html",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also write one HTML page: the summary, curves, episodes, tables.",
+)
+@overwrite_option
+@gifs_option
+@suite_option
+def report_command(
+    runs: tuple[Path, ...], out: Path | None, html: Path | None, overwrite: bool, gifs: bool, suite: Path | None
+) -> None:
+    """Compare results with the paper's.
+
+    RESULTS are folders that `evaluate` made. Prints a summary of each agent, and a table for each agent and track with
+    the paper's numbers next to results of protocol published; marks scores with teammates or on layouts that were in
+    training. Writes them as Markdown, CSV and curves, with a card for each trained model. Results of one agent on
+    different layouts are merged.
+    """
+    from icrl4aht_baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
+    from icrl4aht_baselines.report.page import write_page_with_episodes
+    from icrl4aht_baselines.report.rendering import check_can_render
+    from icrl4aht_baselines.report.results import merge, read_run
+    from icrl4aht_baselines.report.summary import markdown, report_begins, write_report
+
+    loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
+    check_new_files(folder, overwrite, report_begins(loaded) | {card_name(run): CARD_BEGINS for run in loaded})
+    if html:
+        check_can_render()
+        check_new_file(html, overwrite)
+    paths = write_report(loaded, folder)
+    if html:
+        with bars(edges=True) as show:
+            paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
+    paths += write_model_cards(loaded, paths[0].parent)
+    click.echo(markdown(loaded))
+    for path in paths:
+        click.echo(f"wrote {path}")
+
+
+@cli.command(
+    "watch",
+    epilog=examples("icrl4aht-data watch --layout demo_wide --teammate H3/t1 --ego oracle --out episode.gif"),
+)
+@click.option("--layout", type=LAYOUT, required=True, help="Layout of the episode.")
+@click.option(
+    "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate: its family, H1 to H4, and number."
+)
+@click.option(
+    "--ego", type=EGO_NAME, default="random", help="stay, random, oracle, a model such as ad-reference, or a run."
+)
+@protocol_option
+@click.option("--seed", type=SEED, default=0, help="Seed of the episode.")
+@click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
+@overwrite_option
+def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path, overwrite: bool) -> None:
+    """Play an episode and draw it as a GIF."""
+    from icrl4aht_baselines.evaluate.protocols import get_protocol
+    from icrl4aht_baselines.report.episode_gifs import save_episodes
+
+    check_new_file(out, overwrite)
+    task = published_task(layout, teammate)
+    (shown,) = save_episodes({1: out}, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
+    mate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
+    _console.print(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
+
+
+@cli.command(
+    "train",
+    epilog=examples(
+        "icrl4aht-data train ad --layout demo_wide --out runs/ad",
+        "icrl4aht-data train dpt --layout demo_wide --ta --out runs/dpt-ta",
+        "icrl4aht-data train ad --layout demo_wide --steps 20 --context 50 --out runs/small",
+        "icrl4aht-data train ad --layout all --out runs/ad-all",
+    ),
+)
+@click.argument("method", type=METHOD_NAME)
+@click.option(
+    "--layout",
+    "layouts",
+    type=TRAINING_LAYOUT,
+    multiple=True,
+    required=True,
+    help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
+)
+@root_option
+@click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
+@click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run.")
+@size_option
+@training_options
+@model_options
+@dataclass_options(HistoryOptions, "histories")
+@hide_recipe_option
+@history_filters
+@play_options
+@manifests_option
+@save_minutes_option
+@tensorboard_option
+@process_options
+def train_command(
+    method: str,
+    layouts: tuple[str, ...],
+    root: Any,
+    out: Path | None,
+    init: Path | None,
+    size: str | None,
+    train: dict[str, Any],
+    model: dict[str, Any],
+    histories: dict[str, Any],
+    hide_recipe: tuple[str, ...],
+    filters: dict[str, Any],
+    play: dict[str, Any],
+    manifests: tuple[Path, ...],
+    save_minutes: float,
+    tensorboard: bool,
+    coordinator: str | None,
+    processes: int,
+    process: int,
+) -> None:
+    """Train a model on learning histories.
+
+    METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories;
+    --epochs to --manifest are its own. Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png
+    into OUT; the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a
+    second Ctrl-C does not wait for it.
+    """
+    join_processes(coordinator, processes, process)
+    from icrl4aht_baselines.methods.registry import PLAYING
+    from icrl4aht_baselines.training.histories import start_from
+    from icrl4aht_baselines.training.run_folder import RUN_CURVES
+    from icrl4aht_baselines.training.trainer import format_loss
+    from icrl4aht_baselines.training.trainer import train as run_training
+
+    choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
+    choice = replace_given(choice, histories)
+    folder, plays = out or Path("runs") / method, method in PLAYING
+    if plays and processes > 1:
+        raise click.UsageError(f"--processes {processes}: {method} is trained by one process on one device")
+    if plays:
+        job, options, description = prepare_rl2(size, model, train, play, choice, manifests)
+    else:
+        job, options, description = prepare_method(method, size, model, train, play, choice, manifests)
+    _console.print(description, highlight=False)
+    with bars(edges=True, unit="steps") as show:
+
+        def done(step: int, loss: float | None) -> None:
+            show(method, step, options.steps, format_loss(loss))
+
+        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
+        watched |= {"trainer": job.trainer} if plays else {}
+        if init is not None:
+            watched["params"] = start_from(init, job.method, job.about)
+        run_training(job.method, job.data, options, folder, job.about, **watched)
+    noun = "step" if options.steps == 1 else "steps"
+    _console.print(f"{options.steps} {noun} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
+    if not can_draw():
+        click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")
+
+
+@cli.command("demo")
+@click.option("--out", type=Folder(), metavar="FOLDER", default="build/demo", help="Write everything here.")
+def demo_command(out: Path) -> None:
+    """Demonstrate every step on the bundled release.
+
+    Loads, samples and verifies it, trains a small AD model, compares it with the reference egos on validation tasks,
+    draws its return in each episode, and writes a report of one page.
+    """
+    from icrl4aht_baselines.demo import run_demo
+
+    run_demo(out, _console)
+
+
+for _command in (*MODEL_COMMANDS, *EXPERIMENT_COMMANDS):
+    cli.add_command(_command)
+
+
+def main() -> None:
+    """Entry point of `icrl4aht-data` and `icrl4aht-data`."""
+    try:
+        run(cli, extra="baselines")
+    except TrainingStopped as stopped:
+        click.echo(stopped.message, err=True)
+        raise

@@ -1,0 +1,282 @@
+"""Commands of the paper's experiments and of checks: the positive control, drift, headroom and unseen layouts."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+from icrl4aht_generation.teammates.instances import INSTANCES, published_task
+from rich.console import Console
+
+from icrl4aht_baselines.commands.options import (
+    EGO_NAME,
+    PROTOCOL_NAME,
+    default_batch_size,
+    experiment_options,
+    find_ego,
+    greedy_option,
+    protocol_option,
+    variant_names,
+)
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, bars, examples
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.templates import card_file
+
+_console = Console(soft_wrap=True)
+
+
+@click.command(
+    "sweep",
+    epilog=examples(
+        "icrl4aht-data research sweep size --layout demo_wide",
+        "icrl4aht-data research sweep context --only K250 --steps 20 --layout demo_wide --tasks 1 --episodes 5",
+    ),
+)
+@click.argument("what", type=variant_names("sweep"))
+@experiment_options("runs/sweep-WHAT")
+def sweep_command(what: str, **options: Any) -> None:
+    """Train and evaluate over sizes, or context lengths.
+
+    WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
+    """
+    _run_experiment(f"sweep {what}", **options)
+
+
+@click.command("ablate", epilog=examples("icrl4aht-data research ablate ta --layout demo_wide"))
+@click.argument("what", type=variant_names("ablate"))
+@experiment_options("runs/ablate-WHAT")
+def ablate_command(what: str, **options: Any) -> None:
+    """Train and evaluate with and without parts.
+
+    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both; or windows (of AD) or contexts (of DPT):
+    length, episodes, labels and inputs, one difference each. Writes runs, results and OUT/report.
+    """
+    _run_experiment(f"ablate {what}", **options)
+
+
+@click.command("tracks")
+@experiment_options("runs/tracks")
+def tracks_command(**options: Any) -> None:
+    """Train and evaluate on both tracks.
+
+    The paper's Tables 1 and 2; with other methods 4 and 5. Its numbers are shown with --protocol published. Writes
+    runs, results and OUT/report.
+    """
+    _run_experiment("tracks", **options)
+
+
+@click.command("heldout-rl")
+@click.option(
+    "--suite",
+    type=Folder(),
+    metavar="FOLDER",
+    default="build/suite",
+    help="Folder of learned teammates.",
+)
+@experiment_options("runs/heldout-rl")
+def heldout_rl_command(suite: Path, **options: Any) -> None:
+    """Train, and evaluate with held-out teammates.
+
+    These are a suite's learned teammates that are not in training. Writes runs, results and OUT/report.
+    """
+    _run_experiment("heldout-rl", suite=suite, **options)
+
+
+def _run_experiment(
+    name: str,
+    out: Path | None,
+    root: Any,
+    train: dict[str, Any],
+    histories: dict[str, Any],
+    suite: Path | None = None,
+    size: str | None = None,
+    **options: Any,
+) -> None:
+    from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
+
+    size = size or "small"
+    sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
+    plan = ExperimentPlan(root=root and str(root), suite=suite, **sizes, **histories, **options)
+    with bars(edges=True) as show:
+        found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
+    for note in found.notes:
+        click.echo(note)
+    for path in found.report:
+        click.echo(f"wrote {path}")
+
+
+@click.command("control")
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/control", help="Write the runs here.")
+def control_command(out: Path) -> None:
+    """Check that the models adapt in context.
+
+    Trains them on bandits and Dark Room (about 10 minutes), and prints the checks: they adapt there, and do not with
+    their context cut off. Exits with 1 if a check fails.
+    """
+    from icrl4aht_baselines.control.control import format_checks, run_control
+    from icrl4aht_baselines.training.trainer import format_loss
+
+    with bars(edges=True, unit="steps") as show:
+
+        def done(name: str, total: int, step: int, loss: float | None) -> None:
+            show(name, step, total, format_loss(loss))
+
+        checks = run_control(out, done=done)
+    click.echo(format_checks(checks))
+    if not all(check.passed for check in checks):
+        sys.exit(1)
+
+
+@click.command("headroom")
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/headroom", help="Write the results here.")
+@click.option(
+    "--protocol",
+    type=PROTOCOL_NAME,
+    multiple=True,
+    default=lambda: tuple(PROTOCOL_NAME.valid()),
+    show_default="all",
+    help="published or seeded; repeat for several.",
+)
+@click.option("--bundle", is_flag=True, help="Also replace headroom.json and headroom.md of the package's cards.")
+def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
+    """Measure the reference egos on every test task.
+
+    Writes their results into OUT, and OUT/headroom.json and OUT/headroom.md from them.
+    """
+    from icrl4aht_baselines.report.headroom import HEADROOM_BEGINS, measure_headroom, write_headroom_cards
+
+    folders = [out, card_file("headroom.json").parent] if bundle else [out]
+    for folder in folders:
+        check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
+    with bars(edges=True, unit="tasks") as show:
+        runs = measure_headroom(out, protocol, show)
+    for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
+        _console.print(f"wrote {path}")
+
+
+@click.command("drift")
+@click.argument("run", type=Folder())
+@click.option("--layout", type=LAYOUT, help="Layout to play.", show_default="the first that the model was trained on")
+@click.option(
+    "--family", type=Names("family", HEURISTIC_KINDS.values), default="H4", help="Teammates: H1, H2, H3 or H4."
+)
+@protocol_option
+@click.option("--episodes", type=COUNT, help="Episodes to play.", show_default="as many as fill the window three times")
+def drift_command(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
+    """Measure the difference between cached and exact acting.
+
+    RUN is a folder that `train` made. Prints one line per episode: the share of equal actions, and the total variation
+    between both policies. Writes nothing.
+    """
+    from icrl4aht_baselines.agents.egos import check_fits
+    from icrl4aht_baselines.evaluate.drift import measure_drift
+    from icrl4aht_baselines.evaluate.protocols import get_protocol
+    from icrl4aht_baselines.training.histories import read_trained
+
+    trained = read_trained(run)
+    fill_window = -(-trained.context // get_protocol(protocol).steps)
+    played = get_protocol(protocol, episodes or 3 * fill_window)
+    name = get_layout(layout or trained.layouts[0]).name
+    check_fits(trained, get_layout(name), run)
+    tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
+    with bars(edges=True, unit="episodes") as show:
+        found = []
+        model = trained.method, trained.params, trained.context
+        for episode in measure_drift(*model, tasks, played, trained.channels):
+            found.append(episode)
+            show(f"{trained.label}, {family} on {name}", len(found), played.episodes)
+    click.echo(f"{trained.label} on {name} with {len(tasks)} teammates of {family}, K = {trained.context}")
+    click.echo("episode  same action  total variation: mean     largest")
+    for number, (distance, same) in enumerate(found):
+        click.echo(f"{number:>7}  {same.mean():>11.1%}  {distance.mean():>21.6f}  {distance.max():>10.6f}")
+
+
+@click.command(
+    "unseen",
+    epilog=examples(
+        "icrl4aht-data research unseen --agent rl2-reference", "icrl4aht-data research unseen --agent runs/rl2"
+    ),
+)
+@click.option(
+    "--agent",
+    "agents",
+    type=EGO_NAME,
+    multiple=True,
+    help="A bundled model such as ad-reference, or a folder that `train` made; stay and oracle always play. Repeat.",
+)
+@greedy_option
+@click.option(
+    "--layout",
+    "layouts",
+    type=LAYOUT,
+    multiple=True,
+    default=TRACKS["layout"]["train"],
+    help="Layout to rearrange; repeat for several.",
+)
+@click.option("--versions", type=COUNT, default=16, help="Number of rearranged versions of each layout.")
+@click.option("--episodes", type=COUNT, default=40, help="Episodes on each version with each family of teammates.")
+@click.option("--store", is_flag=True, help="Also add the results to the package's stored results.")
+def unseen_command(
+    agents: tuple[str, ...], greedy: bool | None, layouts: tuple[str, ...], versions: int, episodes: int, store: bool
+) -> None:
+    """Evaluate on rearranged layouts that no model was trained on.
+
+    They show whether a model knows the game or its training layouts, without a test task. Plays versions of training
+    layouts that have pots, piles and counters in other places, with the diverse validation teammates. Prints mean
+    returns on each layout and the normalised return, with 95 % intervals over the versions.
+    """
+    from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+    from icrl4aht_baselines.online.unseen import unseen_returns
+    from icrl4aht_baselines.report.comparison import unseen_table
+    from icrl4aht_baselines.report.stored_results import (
+        ENDS,
+        StoredResults,
+        add_unseen,
+        read_stored,
+        results_file,
+        write_stored,
+    )
+
+    if store and episodes < 2 * ENDS:
+        raise click.UsageError(f"--episodes {episodes}: expected at least {2 * ENDS} with --store")
+    names = {get_layout(name).name for name in layouts}
+    tasks = [
+        task
+        for track in TRACKS
+        for task in bundled_tasks(track, "diverse")
+        if task.layout.name in names and track == track_of(task.layout.name)
+    ]
+    if missing := names - {task.layout.name for task in tasks}:
+        raise click.UsageError(
+            f"--layout {' '.join(sorted(missing))}: no validation tasks; choose layouts that models are trained on"
+        )
+    egos = [find_ego("--agent", name, greedy=greedy) for name in dict.fromkeys(("stay", "oracle", *agents))]
+    for ego in egos:
+        for task in {task.layout.name: task for task in tasks}.values():
+            ego.make(task.layout)  # a model that does not fit fails before any work
+    with bars(edges=True, unit="episodes") as show:
+
+        def played(what: str, done: int, total: int) -> None:
+            show("unseen layouts", done, total, f": {what}")
+
+        found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
+    click.echo(unseen_table(add_unseen(StoredResults({}, {}), found)))
+    if store:
+        write_stored(results_file(), add_unseen(read_stored(results_file()), found))
+
+
+EXPERIMENT_COMMANDS = (
+    sweep_command,
+    ablate_command,
+    tracks_command,
+    heldout_rl_command,
+    control_command,
+    headroom_command,
+    drift_command,
+    unseen_command,
+)
+"""Commands of this module."""

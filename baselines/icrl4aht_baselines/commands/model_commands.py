@@ -1,0 +1,285 @@
+"""Commands about models that play: recording their histories, reference models, and the page of results."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from icrl4aht_baselines.commands.options import (
+    ABLATION_NAME,
+    EGO_NAME,
+    HISTORIES_NAME,
+    REFERENCE_NAME,
+    check_alone,
+    find_ego,
+    greedy_option,
+    history_filters,
+    manifests_option,
+    root_option,
+)
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.tasks import read_tasks
+from icrl4aht_data.commands.dataclass_options import FiniteRange
+from icrl4aht_data.commands.options import (
+    COUNT,
+    COUNT_OR_NONE,
+    LAYOUT,
+    TRACK,
+    Folder,
+    bars,
+    examples,
+    overwrite_option,
+)
+from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.new_file import check_new_files
+
+_console = Console(soft_wrap=True)
+
+
+@click.command(
+    "collect",
+    epilog=examples(
+        "icrl4aht-data collect --agent runs/rl2 --root build/noise/lite --out build/student",
+        "icrl4aht-data collect --agent runs/ad --layout demo_wide --histories 2 --out build/student",
+    ),
+)
+@click.option(
+    "--agent",
+    type=EGO_NAME,
+    required=True,
+    help="A folder that `train` made, a bundled model such as ad-reference, or a reference ego.",
+)
+@greedy_option
+@root_option
+@click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
+@history_filters
+@click.option("--histories", type=COUNT, default=8, help="Histories with each teammate.")
+@click.option("--episodes", type=click.IntRange(min=10), default=60, help="Episodes of each history, of 100 steps.")
+@click.option(
+    "--noise",
+    nargs=2,
+    type=FiniteRange(min=0, max=1),
+    default=(0.0, 0.0),
+    metavar="START END",
+    help="Chance of a random action in a history's first and in its last episode.",
+)
+@click.option(
+    "--like",
+    type=HISTORIES_NAME,
+    help="As many and as long histories as the reference models learn from, with their noise: student, or rising, "
+    "which begin at random. Not with --histories, --episodes and --noise.",
+)
+@click.option(
+    "--labeller",
+    type=EGO_NAME,
+    help="Another agent, such as rl2-reference, whose most probable actions become the expert actions.",
+)
+@manifests_option
+@click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
+@overwrite_option
+def collect_command(
+    agent: str,
+    greedy: bool | None,
+    root: Any,
+    layouts: tuple[str, ...],
+    filters: dict[str, Any],
+    histories: int,
+    episodes: int,
+    noise: tuple[float, float],
+    like: str | None,
+    labeller: str | None,
+    manifests: tuple[Path, ...],
+    number: int,
+    out: Path,
+    overwrite: bool,
+) -> None:
+    """Record histories of an agent with the teammates of a release.
+
+    Writes a release of source student: what the agent did, what it would have done without the noise (expert actions),
+    and what the scripted oracle would have done (oracle actions). Validation teammates are played, too.
+    """
+    from icrl4aht_generation.profiles.noise_config import NoiseConfig
+
+    from icrl4aht_baselines.online.student import collect_release, release_teammates
+    from icrl4aht_baselines.reference import RL2_HISTORIES
+    from icrl4aht_baselines.training.histories import filter_histories
+
+    start, end = noise
+    config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
+    if like is not None:
+        check_alone("--like", "histories", "episodes", "noise")
+        config = RL2_HISTORIES[like]
+    ego = find_ego("--agent", agent, greedy=greedy)
+    other = find_ego("--labeller", labeller, greedy=True) if labeller else None
+    names = [get_layout(name).name for name in layouts] or None
+    dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
+    tasks = [task for manifest in manifests for task in read_tasks(manifest)]
+    teammates = release_teammates(dataset, number, tasks)
+    with bars(edges=True, unit="episodes") as show:
+        options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
+        collect_release(ego, teammates, config, out, **options)
+    _console.print(f"wrote {out}; `icrl4aht-data show {out}` describes it")
+
+
+@click.command(
+    "reference",
+    epilog=examples(
+        "icrl4aht-data research reference --name ad-student",
+        "icrl4aht-data research reference --name rl2 --track teammate --out runs/reference",
+        "icrl4aht-data research reference --name ad-rising --teacher rl2-reference",
+    ),
+)
+@click.option(
+    "--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model, such as ad-student; repeat."
+)
+@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
+@click.option(
+    "--teacher", type=EGO_NAME, help="Learn from histories of this agent, such as rl2-reference, not of a new rl2."
+)
+@click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
+@click.option(
+    "--bundle-as",
+    "bundle",
+    metavar="NAME",
+    help="Also bundle the model with the package, under this name; see `models`. With --track, the bundled model's "
+    "other track stays and is evaluated again.",
+)
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
+def reference_command(
+    names: tuple[str, ...],
+    track: tuple[str, ...],
+    teacher: str | None,
+    evaluates: bool,
+    bundle: str | None,
+    out: Path,
+) -> None:
+    """Make reference models, with everything that they need.
+
+    Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
+    and evaluates. One model for each track. The same command resumes a stopped one. rl2 learns by playing with training
+    teammates, rl2-oracle with the scripted oracle, too, and rl2-tests with test teammates. The other names are a method
+    and its data. ad-noise, dpt-noise: noise histories. ad-ppo, dpt-ppo: PPO histories of the bundled release. ad-both,
+    dpt-both: both kinds. ad-learned: histories of the bundled release with learned teammates. ad-student, dpt-student:
+    histories of rl2, labelled with its choices. ad-rising: histories of rl2 that begin at random, imitated with their
+    noise.
+    """
+    from icrl4aht_baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
+    from icrl4aht_baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card
+    from icrl4aht_baselines.training.run_folder import read_config
+
+    kept: dict[str, Path] = {}  # tracks of the bundled model that stay
+    if bundle:
+        try:
+            check_bundle_name(bundle)
+        except OptionError as error:
+            raise click.UsageError(f"--bundle-as: {error}") from error
+        runs = bundled_models()[bundle].runs if bundle in bundled_models() else {}
+        kept = {one: run for one, run in runs.items() if one not in track}
+        if len(names) != 1 or {*track, *kept} != set(TRACKS) or not evaluates:
+            raise click.UsageError(
+                "--bundle-as: expected one --name, evaluated, of all tracks or of those that are to be replaced in a "
+                "bundled model: its card states its results"
+            )
+        for one, run in kept.items():
+            method, expected = read_config(run)["method"], RECIPES[names[0]].method
+            if method != expected:
+                raise click.UsageError(
+                    f"--bundle-as: track {one} of {bundle} has a model of {method}, expected one of {expected}, as "
+                    f"{names[0]} is: make both tracks, or choose another name"
+                )
+    if teacher:  # before hours of work
+        find_ego("--teacher", teacher)
+        for name in names:
+            check_taught(name)
+    outcomes = []
+    with bars(edges=True) as show:
+        for name, of_track in product(names, track):
+            outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
+        others = [make_reference(names[0], one, out, show, finished=run) for one, run in kept.items()]
+    for found in outcomes:
+        _console.print(f"{found.name}, {found.track}: {found.run}", highlight=False)
+        for kind, folder in found.results.items():
+            _console.print(f"  {kind}: {folder}", highlight=False)
+    if bundle:
+        for found in outcomes:
+            sampled = not RECIPES[found.name].mode.greedy
+            target = bundle_run(found.run, bundle, found.track, sampled=sampled)
+            _console.print(f"bundled: {target}", highlight=False)
+        in_order = sorted([*others, *outcomes], key=lambda found: list(TRACKS).index(found.track))
+        _console.print(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}", highlight=False)
+    if times := describe_times(out):
+        _console.print(times, highlight=False)
+
+
+@click.command(
+    "results",
+    epilog=examples(
+        "icrl4aht-data results --out build/results",
+        "icrl4aht-data results runs/ad-results --about 'AD on noise histories' --out build/results",
+    ),
+)
+@click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
+@click.option(
+    "--ablation",
+    "ablations",
+    type=(ABLATION_NAME, Folder()),
+    metavar="NAME FOLDER",
+    multiple=True,
+    help="Also add the results of `ablate NAME`, windows or contexts, from FOLDER.",
+)
+@click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
+@click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
+@overwrite_option
+def results_command(
+    runs: tuple[Path, ...], ablations: tuple[tuple[str, Path], ...], about: str, out: Path, store: bool, overwrite: bool
+) -> None:
+    """Compare reference models with the paper's numbers.
+
+    Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
+    `evaluate` made, are added.
+    """
+    from icrl4aht_baselines.report.comparison import RESULTS_BEGINS, write_comparison
+    from icrl4aht_baselines.report.stored_results import (
+        add_ablation,
+        add_results,
+        read_stored,
+        results_file,
+        write_stored,
+    )
+
+    check_new_files(out, overwrite, RESULTS_BEGINS)
+    stored = read_stored(results_file())
+    for folder in runs:
+        stored = add_results(stored, folder, about)
+    for name, folder in ablations:
+        stored = add_ablation(stored, f"ablate {name}", folder)
+    if store:
+        write_stored(results_file(), stored)
+    for path in write_comparison(stored, out):
+        _console.print(f"wrote {path}")
+
+
+@click.command("models")
+def models_command() -> None:
+    """List the bundled models.
+
+    Their names are agents of `evaluate`, `watch` and `collect`. One line per model and track: method, parameters,
+    context, training layouts and sources, and whether it draws its actions unless --greedy is given.
+    """
+    from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
+
+    for model in bundled_models().values():
+        for line in describe_model(model):
+            click.echo(line)
+
+
+MODEL_COMMANDS = (collect_command, reference_command, results_command, models_command)
+"""Commands of this module."""

@@ -1,0 +1,460 @@
+"""Argument types and options that several commands of `icrl4aht-data` share."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
+from icrl4aht_baselines.training.ablations import ABLATIONS
+from icrl4aht_baselines.training.options import (
+    ALL_LAYOUTS,
+    FILTERS,
+    SAVE_MINUTES,
+    HistoryOptions,
+    PlayOptions,
+    TrainOptions,
+)
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
+from icrl4aht_data.benchmark.tasks import read_tasks
+from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
+from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
+from icrl4aht_data.errors import unknown
+
+
+def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
+    """Returns a function that imports a module and returns one of its attributes, since importing JAX takes seconds."""
+    return lambda: getattr(import_module(module), name)
+
+
+class EgoName(Names):
+    """Name of a reference ego, or folder of a run; checked by `find_ego`."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return value
+
+
+def find_ego(option: str, value: str, **mode: Any) -> Any:
+    """Returns the ego that an option names, a `icrl4aht_baselines.agents.egos.NamedEgo`.
+
+    Args:
+        option: name of the option, for messages.
+        value: the ego's name or folder.
+        mode: values of `icrl4aht_baselines.agents.egos.PlayMode`; for None and those left out the agent's own default.
+
+    Raises:
+        click.UsageError: if the value is neither a reference ego, nor a bundled model, nor a run folder.
+    """
+    from icrl4aht_baselines.agents.bundled import bundled_models
+    from icrl4aht_baselines.agents.egos import AGENTS, default_mode, find_agent
+    from icrl4aht_baselines.training.run_folder import CONFIG
+
+    names = [*AGENTS, *bundled_models()]
+    if value not in names and not Path(value).is_dir():
+        hint = "A trained model is named by its folder, which `icrl4aht-data train` makes."
+        raise click.UsageError(f"{option}: {unknown('agent', value, names)} {hint}")
+    if value not in names and not (Path(value) / CONFIG).is_file():
+        raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `icrl4aht-data train` makes one")
+    given = {name: chosen for name, chosen in mode.items() if chosen is not None}
+    return find_agent(value, default_mode(value)._replace(**given))
+
+
+class HostPort(click.ParamType):
+    """Address that a process listens on."""
+
+    name = "host:port"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        host, _, port = value.rpartition(":")
+        if not (host and port.isdecimal() and int(port) < 2**16):
+            self.fail(f"{value}: expected HOST:PORT, such as 10.0.0.1:6000", param, ctx)
+        return value
+
+
+def _ego_names() -> list[str]:
+    from icrl4aht_baselines.agents.bundled import bundled_models
+    from icrl4aht_baselines.agents.egos import AGENTS
+
+    return [*AGENTS, *bundled_models()]
+
+
+EGO_NAME = EgoName("agent", _ego_names)
+TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()])
+_EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
+METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
+_HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
+_playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")
+ABLATION_NAME = Names("ablation", lambda: [name.removeprefix("ablate ") for name in ABLATIONS])
+REFERENCE_NAME = Names("reference model", lazy_attribute("icrl4aht_baselines.reference", "RECIPES"))
+HISTORIES_NAME = Names("kind of histories", lazy_attribute("icrl4aht_baselines.reference", "RL2_HISTORIES"))
+PROTOCOL_NAME = Names("protocol", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "PROTOCOLS"))
+
+protocol_option = click.option(
+    "--protocol",
+    type=PROTOCOL_NAME,
+    default="seeded",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
+)
+_ACTING = Names("acting", lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING"))
+_ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
+acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
+forget_option = click.option(
+    "--forget", is_flag=True, help="Clear the memory of a trained model at the start of each episode."
+)
+greedy_option = click.option(
+    "--greedy/--sampled",
+    default=None,
+    help="Take the most probable actions of a trained model, or draw its actions.",
+    show_default="greedy; a bundled model's own, see `models`",
+)
+experiment_acting_option = click.option(
+    "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
+)
+_SPLIT_HELP = "Which tasks: test, or validation and diverse, by which models are chosen."
+evaluation_split_option = click.option("--split", type=_EVALUATION_SPLIT, help=_SPLIT_HELP, show_default="test")
+_experiment_split_option = click.option(
+    "--split",
+    type=_EVALUATION_SPLIT,
+    help=_SPLIT_HELP,
+    show_default="test; diverse in `ablate windows` and `contexts`",
+)
+tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
+episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
+seeds_option = click.option("--seeds", type=COUNT, default=1, help="Times that every task is played.")
+suite_option = click.option(
+    "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
+)
+tensorboard_option = click.option(
+    "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
+)
+save_minutes_option = click.option(
+    "--save-minutes",
+    type=FiniteRange(min=0, min_open=True),
+    default=SAVE_MINUTES,
+    help="Most minutes between checkpoints, which are also written every --save-every steps.",
+)
+gifs_option = click.option(
+    "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
+)
+root_option = click.option(
+    "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
+)
+
+
+def history_filters(command: Any) -> Any:
+    """Add the options that filter the histories to train on; the command receives them as the dict `filters`."""
+    options = [
+        click.option(
+            "--teammate-family",
+            type=FAMILY,
+            multiple=True,
+            help="Only histories with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several.",
+        ),
+        click.option(
+            "--algorithm",
+            type=Names("algorithm", lambda: [*KIND_FAMILIES, *TEAMMATE_PLUGINS.names]),
+            multiple=True,
+            help="Only histories with teammates of this algorithm, such as fcp, or kind of heuristic; repeat.",
+        ),
+        click.option(
+            "--source",
+            metavar="NAME",
+            multiple=True,
+            help="Only histories of this source: ppo, noise or student; repeat for several.",
+        ),
+    ]
+
+    @functools.wraps(command)
+    def collect(*args: Any, **values: Any) -> Any:
+        filters = {name: chosen for name in FILTERS if (chosen := values.pop(name))}
+        return command(*args, filters=filters, **values)
+
+    decorated: Any = collect
+    for option in reversed(options):
+        decorated = option(decorated)
+    return decorated
+
+
+manifests_option = click.option(
+    "--manifest",
+    "manifests",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    multiple=True,
+    help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
+)
+hide_recipe_option = click.option(
+    "--hide-recipe",
+    type=LAYOUT,
+    multiple=True,
+    help="The model does not see the recipe indicators of this layout; repeat for several.",
+)
+_SIZE_NAME = Names("size", lambda: SIZES)
+size_option = click.option(
+    "--size",
+    type=_SIZE_NAME,
+    help="tiny, for a CPU, or the paper's small, medium or large: sets what has `the size's` as its default.",
+    show_default="tiny on a CPU, small elsewhere",
+)
+_experiment_size_option = click.option(
+    "--size",
+    type=_SIZE_NAME,
+    help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
+    show_default="small, as in the paper; `ablate windows` and `contexts` set tiny",
+)
+_PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
+_BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
+training_options = dataclass_options(TrainOptions, "train", default_text={**_BY_SIZE, "batch_size": _PAPER_OR_CPU})
+play_options = dataclass_options(PlayOptions, "play")
+model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
+
+
+def training_summary(histories: dict[str, Any]) -> str:
+    """Returns layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
+    shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
+    parts = [
+        f"training on {', '.join(histories['layouts'])}",
+        f"{histories['channels']} channels, observations of {shape}",
+        f"{sizes['train']} histories",
+        f"held out {sizes['histories']} with the same teammates"
+        + (f" and {sizes['teammates']} with others (split {split})" if split else ""),
+    ]
+    parts += [f"windows of every {histories['every']}-th episode"] if histories["every"] > 1 else []
+    return "; ".join(parts + ([f"{histories['labels']} labels"] if histories["labels"] else []))
+
+
+def default_batch_size(size: str = "small") -> int:
+    """Returns the paper's batch size, or on a CPU one that makes a step take a second or less."""
+    import jax
+
+    return SIZES[size].cpu_batch if jax.default_backend() == "cpu" else TrainOptions.batch_size
+
+
+def sized_settings(
+    size: str | None, model: Mapping[str, Any], train: Mapping[str, Any]
+) -> tuple[ModelOptions, TrainOptions, str]:
+    """Returns the settings of a size, in which given values take precedence, and a line that describes them.
+
+    Args:
+        size: name of the size; None for tiny on a CPU and small elsewhere.
+        model: given values of `ModelOptions`.
+        train: given values of `TrainOptions`.
+    """
+    import jax
+
+    default = "tiny" if jax.default_backend() == "cpu" else "small"
+    name = size or default
+    options = ModelOptions(**SIZES[name].model | dict(model))
+    training = TrainOptions(**SIZES[name].train | {"batch_size": default_batch_size(name)} | dict(train))
+    reason = "" if size else f", the default {'on a CPU' if default == 'tiny' else 'on this device'}"
+    text = (
+        f"size {name}{reason}: layers {options.layers}, width {options.width}, encoder {options.encoder}, positions "
+        f"{options.positions}, K = {training.context}, steps {training.steps}, batch size {training.batch_size}"
+    )
+    return options, training, text
+
+
+def prepare_method(
+    method: str,
+    size: str | None,
+    model: Mapping[str, Any],
+    train: Mapping[str, Any],
+    play: Mapping[str, Any],
+    histories: HistoryOptions,
+    manifests: Sequence[Path] = (),
+) -> tuple[Any, TrainOptions, str]:
+    """Returns the training of a method on histories, its options, and text that describes it.
+
+    Args:
+        method: its name.
+        size: name of the model's size, see `sized_settings`.
+        model: given values of `ModelOptions`.
+        train: given values of `TrainOptions`.
+        play: given values of `PlayOptions`; expected to be empty.
+        histories: to train on.
+        manifests: files of tasks to play; expected to be empty.
+
+    Raises:
+        click.UsageError: for options of methods that learn by playing.
+    """
+    from icrl4aht_baselines.training.histories import prepare
+
+    if manifests:
+        raise click.UsageError(f"--manifest: not with {method}, only with rl2, which learns by playing")
+    if play:
+        raise click.UsageError(f"{_flags(play)}: not with {method}, only with rl2, which learns by playing")
+    sized, options, description = sized_settings(size, model, train)
+    job = prepare(method, sized, options, histories)
+    return job, options, f"{description}\n{training_summary(job.about['histories'])}"
+
+
+def prepare_rl2(
+    size: str | None,
+    model: Mapping[str, Any],
+    train: Mapping[str, Any],
+    play: Mapping[str, Any],
+    histories: HistoryOptions,
+    manifests: Sequence[Path] = (),
+) -> tuple[Any, TrainOptions, str]:
+    """Returns the training of RL^2, its options, and text that describes it.
+
+    Args:
+        size: expected to be None.
+        model: given values of `ModelOptions`.
+        train: given values of `TrainOptions`.
+        play: given values of `PlayOptions`.
+        histories: with whose teammates to play.
+        manifests: files of tasks with whose teammates to play as well.
+
+    Raises:
+        click.UsageError: for options that only methods trained on histories have.
+    """
+    from icrl4aht_baselines.online.prepare import prepare_play
+
+    unused = UNUSED_OPTIONS["rl2"] & (train.keys() | model.keys())
+    if size or unused:
+        raise click.UsageError(f"{_flags(unused or ['size'])}: not with rl2, which learns by playing")
+    sized = ModelOptions(**RL2_SETTINGS["model"] | dict(model))
+    tasks = [task for manifest in manifests for task in read_tasks(manifest)]
+    options = TrainOptions(**RL2_SETTINGS["train"] | dict(train))
+    job = prepare_play("rl2", sized, options, PlayOptions(**dict(play)), histories, tasks)
+    played = job.about["histories"]
+    text = (
+        f"rl2: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps {options.steps}, "
+        f"each an episode of {job.trainer.tasks} tasks\nplaying on {', '.join(played['layouts'])}, canonical channels, "
+        f"with the teammates of {len(played['groups'])} families and layouts"
+    )
+    return job, options, text
+
+
+def check_alone(option: str, *others: str) -> None:
+    """Check that parameters which an option replaces were not given beside it.
+
+    Raises:
+        click.UsageError: if one was; names all of these.
+    """
+    context = click.get_current_context()
+    given = [name for name in others if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
+    if given:
+        raise click.UsageError(f"{option}: not with {_flags(given)}, which it sets; leave one of them out")
+
+
+def _flags(names: Iterable[str]) -> str:
+    return ", ".join("--" + name.replace("_", "-") for name in sorted(names))
+
+
+def process_options(command: Any) -> Any:
+    """Add the options of training on several machines; `join_processes` takes their values."""
+    options = [
+        click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
+        click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
+        click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def join_processes(coordinator: str | None, processes: int, process: int) -> None:
+    """Connect this process with the others of a training; nothing to do without a coordinator.
+
+    Raises:
+        click.UsageError: if the options do not agree.
+    """
+    import jax
+
+    if not coordinator and (processes, process) != (1, 0):
+        raise click.UsageError(
+            "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"
+        )
+    if process >= processes:
+        raise click.UsageError(f"--process {process}: expected a number below {processes}")
+    if coordinator:
+        jax.distributed.initialize(coordinator, processes, process)
+
+
+def variant_names(command: str) -> Names:
+    """Returns the type of an experiment's second word, such as `size` in `sweep size`."""
+    experiments = lazy_attribute("icrl4aht_baselines.experiments", "EXPERIMENTS")
+    prefix = f"{command} "
+    return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
+
+
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "obs", "labels", "every", "weights", "curriculum", "mirror")
+
+
+def experiment_options(out: str) -> Callable[[Any], Any]:
+    """Returns a decorator with the options of all experiments; `out` is shown as the default folder."""
+    options = [
+        click.option(
+            "--method",
+            "methods",
+            type=_HISTORY_METHOD,
+            multiple=True,
+            help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",
+            show_default="ad and dpt; ad for `ablate windows`, dpt for `ablate contexts`",
+        ),
+        click.option(
+            "--layout",
+            "layouts",
+            type=TRAINING_LAYOUT,
+            multiple=True,
+            help="Training layout, such as demo_wide; repeat for several models, or all: one model of all layouts.",
+            show_default="the paper's that the release has",
+        ),
+        root_option,
+        click.option(
+            "--only",
+            "values",
+            metavar="SETTING",
+            multiple=True,
+            help="Only this setting, such as K250, medium or ta; repeat for several.",
+        ),
+        click.option(
+            "--family",
+            "families",
+            type=FAMILY,
+            multiple=True,
+            help="Evaluate only with teammates of this family, such as H4; repeat for several.",
+        ),
+        _experiment_size_option,
+        history_filters,
+        dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
+        _experiment_split_option,
+        tasks_option,
+        episodes_option,
+        seeds_option,
+        protocol_option,
+        experiment_acting_option,
+        gifs_option,
+        save_minutes_option,
+        tensorboard_option,
+        click.option("--out", type=Folder(), metavar="FOLDER", help="Write runs and report here.", show_default=out),
+        dataclass_options(
+            TrainOptions,
+            "train",
+            default_text={
+                "steps": "the paper's",
+                "batch_size": _PAPER_OR_CPU,
+                "context": "500; varied by `sweep context`, set by `ablate windows` and `contexts`",
+            },
+        ),
+        dataclass_options(
+            ModelOptions,
+            "model",
+            default_text={"layers": "4; varied by `sweep size`", "width": "256; varied by `sweep size`"},
+        ),
+    ]
+
+    def decorate(command: Any) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate

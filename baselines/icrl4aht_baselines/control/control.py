@@ -1,0 +1,214 @@
+"""The positive control: in two small worlds where adaptation in context is possible, these models adapt.
+
+Methods, tokens, trainer and acting are those of the benchmark. DPT is compared with Thompson sampling and AD with the
+algorithm that it distils on Bernoulli bandits; AD also plays Dark Room with goals that it was not trained on. Each
+model must fail with its context cut off, which shows that the world requires adaptation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from icrl4aht_baselines.agents.egos import PlayMode, learned
+from icrl4aht_baselines.control import worlds
+from icrl4aht_baselines.methods.ad import ad
+from icrl4aht_baselines.methods.dpt import dpt
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_baselines.training.trainer import StepProgress, TrainingData, TrainState, train
+
+BANDIT_MODEL = ModelOptions(layers=2, width=32, heads=2, dropout=0.0)
+DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
+
+
+@dataclass(frozen=True)
+class ControlSize:
+    """Size of a control; the defaults take about ten minutes on two cores.
+
+    Attributes:
+        bandit_steps: steps of a bandit task, and of a context.
+        room_episodes: episodes of a Dark Room task.
+        rows: histories to train on, or tasks of DPT.
+        tasks: tasks to play.
+        updates: training steps of DPT on bandits, AD on bandits, AD in Dark Room.
+        learning_rates: learning rates of these three trainings.
+        batch_size: batch size of all three trainings.
+    """
+
+    bandit_steps: int = 100
+    room_episodes: int = 20
+    rows: int = 20_000
+    tasks: int = 200
+    updates: tuple[int, int, int] = (1500, 1500, 800)
+    learning_rates: tuple[float, float, float] = (1e-3, 1e-3, 2e-3)
+    batch_size: int = 32
+
+
+class ControlCheck(NamedTuple):
+    """One check of the control.
+
+    Attributes:
+        world, method: what was trained where.
+        quantity: what is measured, with the direction of the limit.
+        value: measured.
+        limit: bound of the value.
+        passed: whether the value satisfies the bound.
+        note: values for comparison.
+    """
+
+    world: str
+    method: str
+    quantity: str
+    value: float
+    limit: float
+    passed: bool
+    note: str
+
+
+ControlProgress = Callable[[str, int, int, float | None], None]
+"""Called with (part, its updates, updates so far, the loss last logged or None)."""
+
+
+def run_control(
+    folder: Path, size: ControlSize | None = None, done: ControlProgress = lambda name, of, step, loss: None
+) -> list[ControlCheck]:
+    """Train and play all three parts, or resume a stopped run of the same size. Returns the checks."""
+    size = size or ControlSize()
+    parts = (dpt_on_bandits, ad_on_bandits, ad_in_dark_room)
+    return [
+        check
+        for part, updates in zip(parts, size.updates, strict=True)
+        for check in part(folder / part.__name__, size, partial(done, part.__name__, updates))
+    ]
+
+
+def format_checks(checks: list[ControlCheck]) -> str:
+    """Returns text with one line per check."""
+    lines = [f"{'':4}  {'world':9}  {'method':20}  {'quantity':24}  {'value':>6}  {'limit':>6}"]
+    for world, method, quantity, value, limit, passed, note in checks:
+        verdict = "pass" if passed else "FAIL"
+        lines.append(f"{verdict}  {world:9}  {method:20}  {quantity:24}  {value:6.2f}  {limit:6.2f}  {note}")
+    return "\n".join(lines)
+
+
+def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
+    """Compare DPT's regret with that of Thompson sampling, whose posterior it approximates (Lee et al. 2023)."""
+    rng, small = np.random.default_rng(0), worlds.bandit()
+    method = dpt(BANDIT_MODEL, small.world, finished_episodes_only=False)
+    rows = [worlds.dpt_rows(count, size.bandit_steps, rng) for count in (size.rows, 256)]
+    state = _train(method, BANDIT_MODEL, rows, size, 0, folder, done)
+    return _bandit_checks("DPT", "Thompson sampling", worlds.thompson, method, state, size, rng)
+
+
+def ad_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
+    """Compare AD's regret with that of its source, upper confidence bounds."""
+    rng, small = np.random.default_rng(1), worlds.bandit()
+    method = ad(BANDIT_MODEL, small.world)
+
+    def histories(count: int) -> Any:
+        played = worlds.play_bandits(worlds.ucb, rng.random((count, worlds.ARMS)), size.bandit_steps, rng)
+        return worlds.ad_rows(np.ones((*played[0].shape, 1), np.uint8), *played, small.episode)
+
+    state = _train(method, BANDIT_MODEL, [histories(size.rows), histories(256)], size, 1, folder, done)
+    return _bandit_checks("AD", "UCB", worlds.ucb, method, state, size, rng)
+
+
+def _bandit_checks(
+    name: str,
+    rival: str,
+    choose: worlds.BanditAlgorithm,
+    method: Method,
+    state: TrainState,
+    size: ControlSize,
+    rng: np.random.Generator,
+) -> list[ControlCheck]:
+    means = rng.random((size.tasks, worlds.ARMS))
+
+    def regret(actions: Any) -> float:
+        got = np.take_along_axis(means, np.asarray(actions), axis=1)
+        return float((means.max(axis=1, keepdims=True) - got).sum(axis=1).mean())
+
+    def model_regret(context: int) -> float:
+        policy = learned(method, state.params, context, PlayMode(greedy=False))
+        return regret(worlds.play_world(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
+
+    rival_regret = regret(worlds.play_bandits(choose, means, size.bandit_steps, rng)[0])
+    uniform = float((means.max(axis=1) - means.mean(axis=1)).mean()) * size.bandit_steps
+    limit, fails = 1.25 * rival_regret, 2.0 * rival_regret
+    full, cut = model_regret(size.bandit_steps), model_regret(int(name == "AD"))
+    note = f"{rival} {rival_regret:.1f}, uniform {uniform:.1f}"
+    return [
+        ControlCheck("bandits", name, "regret, at most", full, limit, full <= limit, note),
+        ControlCheck("bandits", f"{name}, context cut off", "regret, at least", cut, fails, cut >= fails, note),
+    ]
+
+
+def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
+    """Measure AD's return over the episodes of a task, on goals held out from training."""
+    rng, small = np.random.default_rng(2), worlds.dark_room()
+    goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
+    held_out, known = goals[2::5], np.delete(goals, np.s_[2::5])  # every fifth cell, spread over the room
+    method = ad(DARK_ROOM_MODEL, small.world)
+
+    def histories(count: int, some: np.ndarray) -> Any:
+        cells, actions, rewards = worlds.search(rng.choice(some, count), size.room_episodes, rng)
+        return worlds.ad_rows(worlds.CELL_OBS[cells], actions, rewards, small.episode)
+
+    rows = [histories(size.rows, known), histories(512, held_out)]
+    state = _train(method, DARK_ROOM_MODEL, rows, size, 2, folder, done)
+    tasks = np.resize(held_out, size.tasks)
+    best = worlds.best_return(tasks)
+    steps = size.room_episodes * small.episode
+
+    def share_of_best(context: int) -> np.ndarray:
+        """Returns the mean share of the best return in each episode, (episodes,)."""
+        policy = learned(method, state.params, context, PlayMode(greedy=False))
+        _, rewards = worlds.play_world(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
+        returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)
+        return (returns / best[:, None]).mean(axis=0)
+
+    full, cut = share_of_best(steps), share_of_best(1)
+    few = max(1, size.room_episodes // 5)
+    early, late, without = float(full[:few].mean()), float(full[-few:].mean()), float(cut[-few:].mean())
+    note = f"share of the best return; first {few} episodes {early:.2f}"
+    np.savetxt(folder / "returns.csv", np.stack([full, cut], axis=1), "%.4f", ",", header="full,cut")
+    return [
+        ControlCheck("dark room", "AD", f"last {few} episodes, at least", late, 0.8, late >= 0.8, note),
+        ControlCheck("dark room", "AD", "gain, at least", late - early, 0.4, late - early >= 0.4, note),
+        ControlCheck(
+            "dark room", "AD, context cut off", f"last {few} episodes, at most", without, 0.4, without <= 0.4, note
+        ),
+    ]
+
+
+def _train(
+    method: Method,
+    model: ModelOptions,
+    rows: list[Any],
+    size: ControlSize,
+    number: int,
+    folder: Path,
+    done: StepProgress,
+) -> TrainState:
+    """Train on the first set of rows and validate on the second."""
+    updates = size.updates[number]
+    options = TrainOptions(
+        steps=updates,
+        batch_size=size.batch_size,
+        context=rows[0][3].shape[1],
+        learning_rate=size.learning_rates[number],
+        log_every=100,
+        validate_every=max(1, updates // 4),
+        save_every=updates,
+    )
+    samplers = [worlds.RowSampler(part, size.batch_size, seed) for seed, part in enumerate(rows)]
+    about = {"control": asdict(size), "model": asdict(model)}
+    return train(method, TrainingData(samplers[0], {"held out": samplers[1]}), options, folder, about, done=done)

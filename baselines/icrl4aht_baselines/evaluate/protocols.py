@@ -1,0 +1,100 @@
+"""Evaluation protocols, and smaller versions of the benchmark: fewer tasks, fewer episodes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from icrl4aht_generation.policy import Noise
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
+from icrl4aht_data.errors import OptionError, unknown
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Rules of an evaluation.
+
+    Attributes:
+        name: name of the protocol, "published" or "seeded".
+        noise: source of the randomness of heuristic teammates: "fixed" or "seeded", see `icrl4aht_generation.policy.Noise`.
+        four_recipes: whether the layouts of the layout track draw from four recipes, as for the published numbers, and
+            not from their own two.
+        episodes: number of episodes of each task.
+        steps: number of steps of each episode.
+    """
+
+    name: str
+    noise: Noise
+    four_recipes: bool
+    episodes: int = 100
+    steps: int = KEPT_STEPS
+
+
+FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
+"""Recipes of the published numbers on the layout track; a layout's own are the first and the last."""
+
+EVALUATION_SPLITS = ("test", "validation", "diverse")
+"""Tasks in the package: the published test tasks, and two sets of validation tasks, by which models are chosen. Their
+teammates are of the published training ranges, or diverse, see `icrl4aht_generation.teammates.draws`."""
+
+
+def bundled_tasks(track: str, split: str) -> list[Task]:
+    """Returns the tasks of a track that are in the package.
+
+    Args:
+        track: the track.
+        split: one of `EVALUATION_SPLITS`.
+
+    Raises:
+        UnknownNameError: for an unknown track or split.
+    """
+    if split not in EVALUATION_SPLITS:
+        raise unknown("split to evaluate on", split, EVALUATION_SPLITS)
+    diverse = split == "diverse"
+    return read_tasks(manifest_path(track, "validation", "diverse") if diverse else manifest_path(track, split))
+
+
+PROTOCOLS = {
+    "published": Protocol("published", noise="fixed", four_recipes=True),
+    "seeded": Protocol("seeded", noise="seeded", four_recipes=False),
+}
+"""Protocols by name: `published`, to compare with the paper's numbers, and `seeded`, the default, to report."""
+
+
+def get_protocol(name: str, episodes: int | None = None) -> Protocol:
+    """Returns the protocol with a name, with another number of episodes per task if one is given.
+
+    Raises:
+        UnknownNameError: if there is no such protocol; lists the valid names and the nearest.
+        OptionError: if the number of episodes is not positive.
+    """
+    if name not in PROTOCOLS:
+        raise unknown("protocol", name, PROTOCOLS)
+    if episodes is None:
+        return PROTOCOLS[name]
+    if episodes < 1:
+        raise OptionError(f"episodes = {episodes}: expected at least 1")
+    return replace(PROTOCOLS[name], episodes=episodes)
+
+
+def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
+    """Returns the first `count` tasks of each layout and teammate kind, in order; all tasks for None.
+
+    Raises:
+        OptionError: if `count` is not positive.
+    """
+    if count is None:
+        return list(tasks)
+    if count < 1:
+        raise OptionError(f"tasks = {count}: expected at least 1 of each family and layout")
+    taken: dict[tuple[str, str], int] = defaultdict(int)
+    chosen = []
+    for task in tasks:
+        group = task.layout.name, task.teammate_kind
+        if taken[group] < count:
+            chosen.append(task)
+        taken[group] += 1
+    return chosen

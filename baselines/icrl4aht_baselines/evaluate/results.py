@@ -1,0 +1,79 @@
+"""Results of evaluation: one JSON file per task, with the settings that it was made under."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_generation.learners.resume import differing_settings
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import atomic_write, json_hash
+
+
+@dataclass(frozen=True)
+class Result:
+    """Result of an ego on one task.
+
+    Attributes:
+        task_id: id of the task.
+        settings: agent, seeds, protocol, version and details that the result depends on.
+        returns: return of the team in each episode: one list per seed with one number per episode.
+    """
+
+    task_id: str
+    settings: dict[str, Any]
+    returns: list[list[float]]
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the content of the result's JSON file."""
+        return {"settings_hash": json_hash(self.settings), **asdict(self)}
+
+
+def result_path(out: Path, task_id: str) -> Path:
+    """Returns the path of a task's result in a folder of results."""
+    return out / "tasks" / f"{task_id}.json"
+
+
+def find_result(out: Path, task_id: str, settings: dict[str, Any]) -> Result | None:
+    """Returns a task's result from a folder of results, or None if there is none yet.
+
+    Raises:
+        OptionError: if the result was made under other settings, or its file is damaged.
+    """
+    path = result_path(out, task_id)
+    if not path.exists():
+        return None
+    result = read_result(path)
+    different = differing_settings(result.settings, settings)
+    if different:
+        listed = "; ".join(f"{name}: it has {one!r}, expected {two!r}" for name, (one, two) in different.items())
+        raise OptionError(f"{path}: holds a result of other settings ({listed}); give another --out")
+    return result
+
+
+def read_result(path: Path) -> Result:
+    """Returns the result in a file.
+
+    Raises:
+        OptionError: if the file is not a result, or its settings do not match their hash.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        digest = content.pop("settings_hash")
+        result = Result(**content)
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise OptionError(f"{path}: not a result: {error!r}; remove it and evaluate again") from error
+    if digest != json_hash(result.settings):
+        raise OptionError(f"{path}: its settings do not match their hash; remove it and evaluate again")
+    return result
+
+
+def write_result(out: Path, result: Result) -> None:
+    """Write a task's result into a folder of results."""
+    path = result_path(out, result.task_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as partial:
+        partial.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")

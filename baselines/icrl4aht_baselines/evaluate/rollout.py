@@ -1,0 +1,152 @@
+"""Evaluation episodes of an ego and teammates, as pure JAX functions.
+
+Shapes: `B` tasks (times seeds) of one layout and teammate family, `T` steps of an episode, `S` bytes of a state record.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.policy import Policy, stacked
+from jaxtyping import Array, Float, Int, UInt8
+
+from icrl4aht_baselines.agents.host import HostPolicy, Percept
+from icrl4aht_baselines.evaluate.protocols import FOUR_RECIPES, Protocol
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+
+_EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # streams of keys within an episode, next to those of the agents' slots
+
+
+class RolloutState(NamedTuple):
+    """State of B tasks between two steps.
+
+    Attributes:
+        env: states of the B environments.
+        ego: memories of the egos, a pytree of arrays (B, ...).
+        before: outcome of the previous step, arrays (B,); its `obs` is not used.
+    """
+
+    env: EnvState
+    ego: Any
+    before: Percept
+
+
+class EpisodeBatch(NamedTuple):
+    """One episode of B tasks.
+
+    Attributes:
+        record: uint8 (B, T, S), state record before each step.
+        actions: int32 (B, T, 2), actions of ego and teammate, 0..5.
+        reward: float32 (B, T), reward of the team.
+        end: uint8 (B, S), state record after the last step.
+    """
+
+    record: UInt8[Array, "B T S"]
+    actions: Int[Array, "B T 2"]
+    reward: Float[Array, "B T"]
+    end: UInt8[Array, "B S"]
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationRollout:
+    """Episodes of B tasks that share a layout and a teammate family.
+
+    Attributes:
+        layout: the layout of all tasks.
+        ego: the ego, which plays all tasks.
+        teammates: the B teammates, policies of one family.
+        protocol: rules of the evaluation.
+    """
+
+    layout: Layout
+    ego: Policy | HostPolicy
+    teammates: Sequence[Policy]
+    protocol: Protocol
+
+    @cached_property
+    def env(self) -> Environment:
+        """The environment of the layout under the protocol."""
+        four = self.protocol.four_recipes and any(self.layout.name in names for names in TRACKS["layout"].values())
+        recipes = np.array([self.layout.recipe_item(r) for r in FOUR_RECIPES], np.uint8) if four else None
+        return Environment(self.layout, self.protocol.steps, recipes)
+
+    @property
+    def teammate_params(self) -> Any:
+        """Parameters of all teammates, with a leading axis (B,)."""
+        return stacked(mate.params for mate in self.teammates)
+
+    @cached_property
+    def batched_ego(self) -> HostPolicy:
+        """The ego with functions that take a batch of B tasks."""
+        if isinstance(self.ego, HostPolicy):
+            return self.ego
+        init, act = jax.vmap(self.ego.init, in_axes=(None, 0)), jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))
+        return HostPolicy(self.ego.params, init, act, self.ego.sees)
+
+    def start(self, keys: jax.Array) -> RolloutState:
+        """Returns the state before the first episode from task keys (B,)."""
+        batch = keys.shape[0]
+        egos = self.batched_ego.init(self.ego.params, _fold_all(keys, EGO))
+        return RolloutState(self.env.init(keys), egos, no_outcome(batch))
+
+    def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
+        """Returns the state after one episode of every task, and the episode. To be jitted by the caller."""
+        mate = self.teammates[0]
+        # Teammates start each episode afresh from its key; egos keep their memory, and only their keys are new.
+        keys = self.env.episode_key(state.env)
+        memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
+        ego_keys, mate_keys = _fold_all(keys, _EGO_STEPS), _fold_all(keys, _TEAMMATE_STEPS)
+
+        def step(carry: Any, t: Array) -> tuple[Any, Any]:
+            state, memories, _ = carry
+            now = state.env
+            mine, egos = self.batched_ego.act(ego_params, state.ego, self.ego_view(state), _fold_all(ego_keys, t))
+            theirs, memories = jax.vmap(mate.act)(
+                mate_params, memories, self._view(mate.sees, now, TEAMMATE), _fold_all(mate_keys, t)
+            )
+            after = self.env.step(now, jnp.stack([mine, theirs], axis=-1))
+            before = state.before._replace(
+                prev_action=mine, prev_reward=after.reward, prev_teammate_action=theirs, prev_done=after.done
+            )
+            played = now.record, jnp.stack([mine, theirs], axis=-1), after.reward
+            return (RolloutState(after.state, egos, before), memories, after.final), played
+
+        start = (state, memories, state.env.record)
+        (state, _, end), played = jax.lax.scan(step, start, jnp.arange(self.protocol.steps))
+        record, actions, reward = (jnp.swapaxes(leaf, 0, 1) for leaf in played)
+        return state, EpisodeBatch(record, actions, reward, end)
+
+    def ego_view(self, state: RolloutState) -> Any:
+        """Returns the input of the egos, with a leading axis (B,): state records, observations or percepts."""
+        if self.ego.sees == "percept":
+            return state.before._replace(obs=self._view("observation", state.env, EGO))
+        return self._view(self.ego.sees, state.env, EGO)
+
+    def _view(self, sees: str, state: EnvState, slot: int) -> jax.Array:
+        return state.record if sees == "state" else self.env.observe_one(state, slot)
+
+
+def no_outcome(batch: int) -> Percept:
+    """Returns the outcome of the previous step before the first step of B tasks."""
+    zero = jnp.zeros(batch, jnp.int32)
+    return Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
+
+
+def _fold_all(keys: jax.Array, data: Any) -> jax.Array:
+    return jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, data)
+
+
+def task_key(seed: int, task_id: str) -> jax.Array:
+    """Returns the key from which all randomness of a task's episodes is derived."""
+    digest = hashlib.sha256(task_id.encode()).digest()
+    return jax.random.fold_in(jax.random.key(seed), int.from_bytes(digest[:4], "big"))

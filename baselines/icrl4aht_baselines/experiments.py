@@ -1,0 +1,448 @@
+"""The paper's experiments: sweeps, ablations, held-out learned teammates (Sec. 5.3 and 5.4, App. F).
+
+An experiment is a list of entries; each entry is trained on each layout, or once on all of them, and evaluated on its
+layouts' tasks:
+
+    OUT/<method>-<entry>/<layout>/run          run folder, as of `train`; <layout> is "all" for a model of all layouts
+    OUT/<method>-<entry>/<layout>/results      results, as of `evaluate`
+    OUT/report/                                report of all entries, with report.html and a card of each model
+
+Everything resumes: finished parts are kept, stopped ones continue, and folders of other settings are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from icrl4aht_baselines.agents.egos import Acting, PlayMode, find_agent
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
+from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
+from icrl4aht_baselines.methods.registry import get_method
+from icrl4aht_baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
+from icrl4aht_baselines.report.page import write_page_with_episodes
+from icrl4aht_baselines.report.rendering import check_can_render
+from icrl4aht_baselines.report.results import merge, note_results, read_run
+from icrl4aht_baselines.report.summary import report_begins, write_report
+from icrl4aht_baselines.training.ablations import ABLATIONS, ExperimentEntry
+from icrl4aht_baselines.training.histories import TrainingTask, filter_histories, prepare
+from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.trainer import train
+from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.commands.options import counted
+from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
+from icrl4aht_data.format.schema import TASKS
+from icrl4aht_data.overcooked.channels import Channels
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import check_can_draw
+from icrl4aht_data.utils.new_file import check_new_files
+
+CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
+"""K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""
+
+
+class Experiment(NamedTuple):
+    """Entries of an experiment, and the layouts that the paper runs them on.
+
+    Attributes:
+        title: for the report.
+        entries: one per model.
+        layouts: to train on.
+        varies: options that the entries set and that can therefore not be set for all of them.
+        held_out: whether to evaluate with learned teammates held out of training, on the training layouts.
+        acting: way of acting of the trained models; see `agents.egos.ACTING`.
+        methods: the methods that it is about.
+        split: which tasks its models are evaluated on, see `EVALUATION_SPLITS`.
+    """
+
+    title: str
+    entries: tuple[ExperimentEntry, ...]
+    layouts: tuple[str, ...]
+    varies: tuple[str, ...] = ()
+    held_out: bool = False
+    acting: Acting = "cached"
+    methods: tuple[str, ...] = ("ad", "dpt")
+    split: str = "test"
+
+
+def _size_entry(name: str) -> ExperimentEntry:
+    size = SIZES[name]
+    return ExperimentEntry(name, {"layers": size.layers, "width": size.width}, {"steps": size.steps}, {"size": name})
+
+
+EXPERIMENTS = {
+    "tracks": Experiment("Teammate and layout generalization", (ExperimentEntry("plain"),), tuple(TESTED_ON)),
+    "sweep context": Experiment(
+        "Context length",
+        tuple(ExperimentEntry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
+        ("test_wide", "demo_wide"),
+        varies=("context",),
+        acting="exact",  # K is what is compared, and a cached window has down to 4/5 K steps
+    ),
+    "sweep size": Experiment(
+        "Model scale and training budget",
+        tuple(map(_size_entry, PAPER_SIZES)),
+        tuple(TESTED_ON),
+        varies=("layers", "width"),
+    ),
+    "ablate ta": Experiment(
+        "Teammate actions and auxiliary losses",
+        (
+            ExperimentEntry("none"),
+            ExperimentEntry("ta", {"teammate_actions": True}),
+            ExperimentEntry("next_obs", {"next_obs": True}),
+            ExperimentEntry("ta-next_obs", {"teammate_actions": True, "next_obs": True}),
+        ),
+        ("test_wide", "demo_wide", "cramped_up"),
+        varies=("teammate_actions", "next_obs"),
+    ),
+    **{
+        name: Experiment(
+            ablation.title,
+            ablation.entries,
+            ("demo_wide",),
+            varies=ablation.sets,
+            methods=(ablation.method,),
+            split="diverse",
+        )
+        for name, ablation in ABLATIONS.items()
+    },
+    "heldout-rl": Experiment(
+        "Held-out learned teammates", (ExperimentEntry("plain"),), tuple(TESTED_ON), held_out=True
+    ),
+}
+"""Command -> experiment; settings and layouts are the paper's."""
+
+
+@dataclass(frozen=True)
+class ExperimentPlan:
+    """Settings of an experiment's run; the defaults are the paper's.
+
+    Attributes:
+        methods: to train; those of the experiment by default.
+        layouts: to train on, one model each; by default those of the experiment that the release has. `ALL_LAYOUTS`
+            alone for one model of all layouts that the release has, which is tested on the layouts of all of them.
+        channels: channels of the models' observations, see `HistoryOptions`.
+        root: folder or address of a release; None for the bundled mini release.
+        suite: folder of learned teammates; required for "heldout-rl".
+        size: name of the models' size; "sweep size" varies it.
+        batch_size: rows of a batch, where an entry has no value; the paper's by default.
+        train: values of `TrainOptions` for all entries, such as steps.
+        model: values of `ModelOptions` for all entries.
+        filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
+        values: names of the entries to run; all by default.
+        split: which tasks to evaluate on, see `EVALUATION_SPLITS`: the experiment's by default; all but "test" are
+            on the training layouts.
+        families: teammate families to evaluate with; all by default.
+        tasks: tasks of each teammate kind and layout, at most.
+        episodes: of a task; the protocol's by default.
+        seeds: number of times that every task is played.
+        protocol: name of the evaluation protocol.
+        acting: see `agents.egos.ACTING`; the experiment's by default.
+        gifs: whether the page shows an episode per family.
+        tensorboard: whether training also writes a log for TensorBoard.
+        save_minutes: most minutes between checkpoints of a training.
+    """
+
+    methods: tuple[str, ...] = ()
+    layouts: tuple[str, ...] = ()
+    channels: Channels | None = None
+    root: str | None = None
+    suite: Path | None = None
+    size: str = "small"
+    batch_size: int = TrainOptions.batch_size
+    train: dict[str, Any] = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
+    filters: dict[str, Any] = field(default_factory=dict)
+    values: tuple[str, ...] = ()
+    split: str | None = None
+    families: tuple[str, ...] = ()
+    tasks: int | None = None
+    episodes: int | None = None
+    seeds: int = 1
+    protocol: str = "seeded"
+    acting: Acting | None = None
+    gifs: bool = True
+    tensorboard: bool = False
+    save_minutes: float = SAVE_MINUTES
+
+
+class ExperimentOutcome(NamedTuple):
+    """Outcome of an experiment.
+
+    Attributes:
+        report: paths of the files written.
+        notes: facts for the reader, such as layouts that were left out.
+    """
+
+    report: list[Path]
+    notes: list[str]
+
+
+ExperimentProgress = Callable[[str, int, int], None]
+"""Called with (description, units done, units)."""
+
+
+def run_experiment(
+    name: str, plan: ExperimentPlan, out: Path, progress: ExperimentProgress = lambda what, done, total: None
+) -> ExperimentOutcome:
+    """Train, evaluate and report all entries of an experiment, or resume it.
+
+    Args:
+        name: one of `EXPERIMENTS`.
+        plan: how.
+        out: folder, see this module's docstring.
+        progress: called now and then.
+
+    Raises:
+        UnknownNameError: for an unknown experiment, method, entry, layout or split.
+        EmptySelectionError: if the release has histories of none of the layouts, or no task is left.
+        LabelsMissingError: for DPT on histories without expert actions.
+        OptionError: if a context is longer than a history, the plan sets what the experiment varies, or a folder holds
+            a run of other settings; for "heldout-rl", if the suite has no held-out teammates, or one of them is in
+            training; if matplotlib is not installed.
+        TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
+    """
+    check_can_draw()  # before the long work, not after it
+    check_can_render()
+    if name not in EXPERIMENTS:
+        raise unknown("experiment", name, EXPERIMENTS)
+    experiment = EXPERIMENTS[name]
+    entries = _chosen_entries(name, plan)
+    layouts, notes = _training_layouts(experiment, plan)
+    tasks = {layout: _test_tasks(experiment, plan, layout) for layout in layouts}
+    models = list(product(plan.methods or experiment.methods, entries, layouts))
+    chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
+    if any(histories["channels"] == "canonical" for histories in chosen):
+        notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
+    check_new_files(out / "report", overwrite=True, begins={**report_begins(), "report.html": None})  # of a stopped run
+    results = []
+    for method, entry, layout in models:
+        folder = out / f"{method}-{entry.name}" / layout
+        run = out / f"{method}-{entry.run_of or entry.name}" / layout / "run"
+        _train_entry(method, entry, layout, plan, run, progress)
+        _evaluate_entry(experiment, entry, tasks[layout], plan, run, folder / "results", progress)
+        results.append(folder / "results")
+    runs = merge([read_run(folder) for folder in results])
+    check_new_files(
+        out / "report", overwrite=True, begins=report_begins(runs) | {card_name(run): CARD_BEGINS for run in runs}
+    )
+    notes = [f"{experiment.title} (`{name}`)", *notes]
+    report = write_report(runs, out / "report")
+    page = out / "report" / "report.html"
+    options: dict[str, Any] = {"episodes": plan.gifs, "notes": notes, "suite": plan.suite, "progress": progress}
+    report.append(write_page_with_episodes(runs, page, **options))
+    report += write_model_cards(runs, out / "report")
+    return ExperimentOutcome(report, notes)
+
+
+def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
+    experiment = EXPERIMENTS[name]
+    for method in plan.methods:
+        get_method(method)
+        if method not in EXPERIMENTS[name].methods and len(EXPERIMENTS[name].methods) == 1:
+            raise unknown(f"method of {name}", method, EXPERIMENTS[name].methods)
+    names = [entry.name for entry in experiment.entries]
+    for value in plan.values:
+        if value not in names:
+            raise unknown(f"setting of {name}", value, names)
+    if plan.size not in SIZES:
+        raise unknown("size", plan.size, SIZES)
+    if "layers" in experiment.varies and plan.size != ExperimentPlan.size:
+        raise OptionError(f"size = {plan.size}: `{name}` sets it; choose by --only, such as {names[0]}")
+    for option, value in (plan.train | plan.model).items():
+        if option in experiment.varies:
+            raise OptionError(f"{option} = {value}: `{name}` sets it; choose by --only, such as {names[0]}")
+    return [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
+
+
+def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
+    """Returns the layouts to train on, or `ALL_LAYOUTS` for one model of all, and a note on those left out."""
+    dataset = load_icrl4aht(plan.root, split="train")
+    filters = HistoryOptions((), **plan.filters).filters
+    if filters:
+        filter_histories(dataset, filters)  # a value that no history has is an error that names it
+    by_layout = {layout.name: dataset.filter(layout=layout.name) for layout in dataset.layouts}
+    available = {name for name, histories in by_layout.items() if _pass_all(histories, filters)}
+    release = plan.root or "the bundled mini release"
+    kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
+    if ALL_LAYOUTS in plan.layouts:
+        return list(HistoryOptions(plan.layouts).layouts), []
+    if plan.layouts:
+        names = [get_layout(name).name for name in plan.layouts]
+        for name in names:
+            if name not in TESTED_ON:
+                raise unknown("training layout", name, TESTED_ON)
+        missing = [name for name in names if name not in available]
+        if missing:
+            raise EmptySelectionError(
+                f"{release}: no {kind} on {', '.join(missing)}; it has {', '.join(sorted(available)) or 'none'}: "
+                f"choose among them, or give a --root that has the others"
+            )
+        return names, []
+    names = [name for name in experiment.layouts if name in available]
+    if not names:
+        raise EmptySelectionError(
+            f"{release}: no {kind} on {', '.join(experiment.layouts)}, where the paper runs this; it has "
+            f"{', '.join(sorted(available)) or 'none'}: give --layout, or another --root"
+        )
+    left = [name for name in experiment.layouts if name not in available]
+    return names, [f"left out, the release has no {kind} of them: {', '.join(left)}"] if left else []
+
+
+def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
+    """Returns whether every value of the filters has histories."""
+    try:
+        return bool(filter_histories(histories, filters))
+    except EmptySelectionError:
+        return False
+
+
+def _all_layouts(plan: ExperimentPlan) -> list[str]:
+    """Returns the layouts of a model of all layouts, in the order of `TESTED_ON`."""
+    filters = HistoryOptions((), **plan.filters).filters
+    dataset = filter_histories(load_icrl4aht(plan.root, split="train"), filters)
+    names = [name for name in TESTED_ON if name in {layout.name for layout in dataset.layouts}]
+    if not names:
+        raise EmptySelectionError(f"{dataset!r}: none of its layouts is a training layout of the benchmark")
+    return names
+
+
+def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
+    """Returns the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is evaluated on."""
+    if layout == ALL_LAYOUTS:
+        return [task for name in _all_layouts(plan) for task in _test_tasks(experiment, plan, name)]
+    if experiment.held_out:
+        if plan.split:
+            raise OptionError(f"split = {plan.split}: this experiment has tasks of its own, those of the suite's "
+                              f"held-out teammates; leave --split out")  # fmt: skip
+        tasks = held_out_tasks(plan.suite, layout, plan.root)
+    else:
+        split = plan.split or experiment.split
+        played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
+        tasks = [task for task in bundled_tasks(track_of(played_on), split) if task.layout.name == played_on]
+        if not tasks:
+            raise EmptySelectionError(f"no {split} tasks on {played_on}: choose another --layout, or --split test")
+    available = dict.fromkeys(task.teammate_family for task in tasks)
+    for family in plan.families:
+        if family not in available:
+            raise unknown("teammate family of these tasks", family, available)
+    return limit_tasks(
+        [task for task in tasks if not plan.families or task.teammate_family in plan.families], plan.tasks
+    )
+
+
+def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> list[Task]:
+    """Returns the tasks of a suite's held-out manifest on a training layout (paper, App. F, "Held-Out RL Teammates").
+
+    Args:
+        suite: folder that `icrl4aht-data teammates` made.
+        layout: short name.
+        root: the release that models are trained on, which must not have these teammates.
+
+    Raises:
+        OptionError: if the suite has no held-out teammates there, or one of them is in the release.
+    """
+    if suite is None:
+        raise OptionError("held-out teammates: expected a suite, found none; give --suite, a folder that `python -m "
+                          "generation teammates` made")  # fmt: skip
+    path = suite / "manifests" / f"{track_of(layout)}_heldout.jsonl"
+    if not path.is_file():
+        raise OptionError(
+            f"{path}: missing: the suite has no held-out teammates for track {track_of(layout)}; train more with "
+            f"`icrl4aht-data teammates --suite {suite}` under a profile with [teammates] heldout of 1 or more"
+        )
+    tasks = [task for task in read_tasks(path) if task.layout.name == layout]
+    if not tasks:
+        raise OptionError(
+            f"{path}: no held-out teammate on {layout}; train that layout's populations with `icrl4aht-data "
+            f"teammates --suite {suite} --layout {layout}`, or choose another --layout"
+        )
+    release = load_icrl4aht(root, layout=layout).root
+    trained_with = {
+        task.teammate["theta"]["sha256"]: task.task_id
+        for task in read_tasks(release / TASKS)
+        if task.teammate["kind"] == "rl" and task.split == "train"
+    }
+    for task in tasks:
+        digest = task.teammate["theta"]["sha256"]
+        if digest in trained_with:
+            raise OptionError(
+                f"{path}: {task.task_id} has the teammate of {trained_with[digest]} in {release}, which models are "
+                f"trained on; expected teammates that are not in training: give the suite that the release was made "
+                f"from"
+            )
+    return tasks
+
+
+def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: ExperimentPlan) -> TrainingTask:
+    size = SIZES[plan.size]
+    options = TrainOptions(**{**size.train, "batch_size": plan.batch_size, **entry.train, **plan.train})
+    model = ModelOptions(**{**size.model, **entry.model, **plan.model})
+    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters, **entry.histories)
+    try:
+        return prepare(method, model, options, histories)
+    except (EmptySelectionError, LabelsMissingError, OptionError) as error:
+        hint = "or leave it out, by --method, --only and --layout"
+        error.args = (f"{method} {entry.name} on {layout}: {error}; {hint}",)
+        raise
+
+
+def _train_entry(
+    method: str,
+    entry: ExperimentEntry,
+    layout: str,
+    plan: ExperimentPlan,
+    folder: Path,
+    progress: ExperimentProgress,
+) -> None:
+    job = _prepare_entry(method, entry, layout, plan)
+    steps = job.options.steps
+    what = f"{job.method.label} {entry.name} on {layout}: training steps"
+    progress(what, 0, steps)
+    train(
+        job.method,
+        job.data,
+        job.options,
+        folder,
+        job.about,
+        tensorboard=plan.tensorboard,
+        save_minutes=plan.save_minutes,
+        done=lambda step, loss: progress(what, step, steps),
+    )
+    progress(what, steps, steps)
+
+
+def _evaluate_entry(
+    experiment: Experiment,
+    entry: ExperimentEntry,
+    tasks: Sequence[Task],
+    plan: ExperimentPlan,
+    run: Path,
+    folder: Path,
+    progress: ExperimentProgress,
+) -> None:
+    agent = find_agent(str(run), PlayMode(plan.acting or experiment.acting, greedy=not entry.sampled))
+    details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
+    names = list(dict.fromkeys(task.layout.name for task in tasks))
+    what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"
+    protocol = get_protocol(plan.protocol, plan.episodes)
+    evaluate(
+        agent.name,
+        agent.make,
+        tasks,
+        protocol,
+        seeds=range(plan.seeds),
+        suite=plan.suite,
+        out=folder,
+        details=details,
+        played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
+    )
+    own = experiment.held_out or (plan.split or experiment.split) != "test"
+    note_results(folder, run, tasks if own else ())

@@ -1,0 +1,220 @@
+"""Algorithm Distillation (paper, App. E.2): predict the source algorithm's next action from everything before it.
+
+Shapes: `B` batch size, `L` length of a window, `D` width, `N` entries of an observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+from icrl4aht_generation.learners.encoder import encoding_log
+from jaxtyping import Array, Bool, Float, Int, Num
+
+from icrl4aht_baselines.methods.conditional import change_if
+from icrl4aht_baselines.methods.method import (
+    Loss,
+    Method,
+    World,
+    cross_entropy,
+    make_next_obs_head,
+    make_tokens,
+    make_transformer,
+    mean_of_rows,
+    run_model,
+    squared_error,
+)
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.tokens import RingBuffer, StepInput, StepTokens, batch_steps
+from icrl4aht_data.benchmark.facts import all_families
+from icrl4aht_data.sampling.ad import ADBatch
+
+
+class StepOutput(NamedTuple):
+    """Output of a `StepModel`.
+
+    Attributes:
+        head: the head's output, float (B, L, ..).
+        next_obs: float (B, L, N), predicted observation after taking the action; None without +next_obs.
+        teammate: float (B, L, A), logits of the teammate's action at the same step; None if they are not predicted.
+        family: float (B, L, F), logits of the teammate's family; None if it is not predicted.
+    """
+
+    head: Any
+    next_obs: Float[Array, "B L N"] | None
+    teammate: Float[Array, "B L A"] | None = None
+    family: Float[Array, "B L F"] | None = None
+
+
+class WindowMemory(NamedTuple):
+    """Memory of an acting ego: the steps of its window, and what the trunk computed from them alone.
+
+    Attributes:
+        tokens: float32 (K, D), the window's steps in order, at the front.
+        steps: int32 (), number of steps in the window.
+        trunk: the trunk's memory of these steps.
+    """
+
+    tokens: Float[Array, "K D"]
+    steps: Int[Array, ""]
+    trunk: Any
+
+
+class StepModel(nn.Module):
+    """Model of AD, Hybrid-AD and AMAGO-Offline: steps to tokens, a trunk, a head.
+
+    A trunk takes complete sequences of tokens (B, L, D), and one token at a time through `start(context)` or
+    `start_after(tokens, context)` and `advance(token, memory)`. Its features at a position depend on the tokens up to
+    there, so padding, which comes last, needs no mask before the loss.
+    """
+
+    tokens: StepTokens
+    trunk: nn.Module
+    head: nn.Module
+    next_obs: nn.Module | None = None
+    teammate: nn.Module | None = None
+    family: nn.Module | None = None
+
+    def __call__(
+        self,
+        steps: StepInput,
+        actions: Int[Array, "B L"] | None = None,
+        deterministic: bool = True,
+    ) -> StepOutput:
+        """Returns the output for windows of steps, with the auxiliary predictions if actions are given."""
+        trunk: Any = self.trunk
+        tokens_BxLxD = self.tokens(steps, deterministic)
+        features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
+        predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
+        mate = None if self.teammate is None or actions is None else self.teammate(features_BxLxD)
+        family = None if self.family is None or actions is None else self.family(features_BxLxD)
+        return StepOutput(self.head(features_BxLxD), predicted, mate, family)
+
+    def start(self, context: int, cached: bool) -> Any:
+        """Returns the memory of an ego before its first step."""
+        if not cached:
+            return RingBuffer.empty(context, self.tokens.width)
+        trunk: Any = self.trunk
+        return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), trunk.start(context))
+
+    def act(self, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Any, Any]:
+        """Returns the head's output for one step of an ego, and the memory with the step."""
+        trunk: Any = self.trunk
+        token = self.tokens(step)
+        if isinstance(memory, RingBuffer):
+            memory = memory.add(token)
+            window, valid = memory.last(len(memory.tokens), memory.written)
+            return self.head(trunk(window[None])[0, valid - 1]), memory
+        tokens, steps, states = self._with_room(memory)
+        feature, states = trunk.advance(token, states)
+        return self.head(feature), WindowMemory(tokens.at[steps].set(token), steps + 1, states)
+
+    def _with_room(self, memory: WindowMemory) -> WindowMemory:
+        """Returns the memory, in which a full window has lost its oldest steps and their part in what was computed.
+
+        A kept step's keys and values were computed when it could still see the steps that go, so all are computed
+        again, as if the kept steps were all that ever happened.
+        """
+        trunk, variables = self.trunk.unbind()
+        context = len(memory.tokens)
+        kept = context - dropped_steps(context)
+
+        def drop_oldest(variables: Any, memory: WindowMemory) -> WindowMemory:
+            tokens = jnp.roll(memory.tokens, kept - context, axis=0)
+            states = trunk.start(context)
+            if kept:
+                states = trunk.apply(variables, tokens[:kept], context, method="start_after")
+            return WindowMemory(tokens, jnp.int32(kept), states)
+
+        return change_if(memory.steps == context, drop_oldest, variables, memory)
+
+
+def dropped_steps(context: int) -> int:
+    """Returns how many steps a full window of `context` steps loses at once in cached acting: a fifth.
+
+    So the window has 4/5 of the context or more, and 4 tokens are computed again for every step.
+    """
+    return max(1, context // 5)
+
+
+def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
+    """Returns a model of steps with the given trunk and head."""
+    teammate = nn.Dense(world.actions) if options.teammate_loss else None
+    family = nn.Dense(len(all_families())) if options.family_loss else None
+    next_obs = make_next_obs_head(options, world)
+    return StepModel(make_tokens(StepTokens, options, world), trunk, head, next_obs, teammate, family)
+
+
+def example_step(world: World) -> StepInput:
+    """Returns a step of zeros, (1, 1)."""
+    zero = jnp.zeros((1, 1), jnp.int32)
+    return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
+
+
+def next_obs_loss(predicted: Float[Array, "B L N"], obs: Num[Array, "B L ..."], batch: ADBatch) -> Float[Array, ""]:
+    """Returns the auxiliary loss over steps whose successor is in the window and in the same episode."""
+    errors = squared_error(predicted[:, :-1], obs[:, 1:])
+    return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
+
+
+def teammate_loss(predicted: Float[Array, "B L A"], batch: ADBatch) -> Float[Array, ""]:
+    """Returns the auxiliary loss over steps whose successor, which shows the teammate's action, is in the window."""
+    assert batch.prev_teammate_actions is not None
+    errors = cross_entropy(predicted[:, :-1], jnp.asarray(batch.prev_teammate_actions)[:, 1:], 0.0)
+    return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:])
+
+
+def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
+    """Returns AD's loss: cross-entropy of the target actions, over valid positions (paper, App. E.2).
+
+    The targets are the actions taken, or labels.
+    """
+
+    def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
+        steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
+        targets = jnp.asarray(batch.target_actions)
+        # What was taken is the next step's previous action; after the last step `next_obs_loss` predicts nothing.
+        taken = jnp.roll(steps.prev_action, -1, axis=1)
+        output: StepOutput = run_model(model, options, params, key, steps, taken)
+        total = mean_of_rows(cross_entropy(output.head, targets, options.label_smoothing), mask)
+        log = {"action_loss": total, "accuracy": mean_of_rows(1.0 * (output.head.argmax(axis=-1) == targets), mask)}
+        if output.next_obs is not None:
+            log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
+            total += log["next_obs_loss"]
+        if output.teammate is not None:
+            log["teammate_loss"] = teammate_loss(output.teammate, batch)
+            total += log["teammate_loss"]
+        if output.family is not None:
+            families = jnp.broadcast_to(jnp.asarray(batch.families)[:, None], mask.shape)
+            log["family_loss"] = mean_of_rows(cross_entropy(output.family, families, 0.0), mask)
+            total += log["family_loss"]
+        return total, {"loss": total, **log, **encoding_log(steps.obs)}
+
+    return loss
+
+
+def action_method(
+    name: str, label: str, make_trunk: Callable[[ModelOptions], nn.Module]
+) -> Callable[[ModelOptions, World], Method]:
+    """Returns the maker of Algorithm Distillation on a trunk."""
+
+    def make(options: ModelOptions, world: World) -> Method:
+        model = make_step_model(options, world, make_trunk(options), nn.Dense(world.actions))
+        example = example_step(world)
+        return Method(
+            name=name,
+            label=label,
+            data="ad",
+            model=model,
+            example=(example, example.prev_action),
+            loss=action_loss(model, options, world),
+            logits=lambda head: head,
+        )
+
+    return make
+
+
+ad = action_method("ad", "AD", make_transformer)
+"""Maker of AD; 3,283,870 parameters at C = 40 channels."""

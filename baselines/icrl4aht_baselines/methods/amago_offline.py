@@ -1,0 +1,129 @@
+"""AMAGO-Offline (paper, Sec. 5.4): an actor-critic on the sequence encoder that maximises return, offline.
+
+As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder and exist once for each of several discount
+factors; the ego acts by the longest. Returns continue over episodes, as an in-context learner's do, so that what an
+episode reveals is worth what later episodes gain by it. The actor's loss imitates the actions whose estimated advantage
+is positive (filtered behaviour cloning) and raises the expected value of its own actions (the Q term). The critics
+learn by one-step bootstrapping from a slow copy of the parameters. No input says how far training had come.
+
+Shapes: `B` batch size, `L` length of a window, `G` discount factors, `A` actions, `D` width.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from icrl4aht_generation.learners.encoder import encoding_log
+from jaxtyping import Array, Float
+
+from icrl4aht_baselines.methods.ad import StepOutput, example_step, make_step_model, next_obs_loss
+from icrl4aht_baselines.methods.method import (
+    Method,
+    World,
+    check_no_teammate_loss,
+    cross_entropy,
+    make_transformer,
+    mean_of_rows,
+    run_model,
+)
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.tokens import batch_steps
+from icrl4aht_data.sampling.ad import ADBatch
+
+CRITICS = 2
+"""Number of critics; the lowest estimate counts (clipped double Q)."""
+
+REWARD_SCALE = 0.05
+"""Scale of rewards: values are in deliveries, which earn 20 points each."""
+
+Q_WEIGHT, CRITIC_WEIGHT, SLOW = 0.1, 1.0, 0.005
+"""Weights of the Q term and of the critics' loss; share of the parameters that enters the slow copy each step."""
+
+
+class ActorCriticOutput(NamedTuple):
+    """Policies and action values, one for each of G discount factors.
+
+    Attributes:
+        logits: float32 (*B, G, A).
+        values: float32 (CRITICS, *B, G, A).
+    """
+
+    logits: Float[Array, "*B G A"]
+    values: Float[Array, "critics *B G A"]
+
+
+class ActorCriticHead(nn.Module):
+    """Actor and critics on shared features, each with one hidden layer."""
+
+    width: int
+    discounts: int
+    actions: int
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "*B D"]) -> ActorCriticOutput:
+        def head(name: str) -> Array:
+            hidden = nn.gelu(nn.Dense(self.width, name=f"{name}_hidden")(features))
+            out = nn.Dense(self.discounts * self.actions, name=name)(hidden).astype(jnp.float32)
+            return out.reshape(*features.shape[:-1], self.discounts, self.actions)
+
+        return ActorCriticOutput(head("actor"), jnp.stack([head(f"critic_{number}") for number in range(CRITICS)]))
+
+
+def amago_offline(options: ModelOptions, world: World) -> Method:
+    """Returns an offline actor-critic on AD's tokens and transformer."""
+    check_no_teammate_loss("amago_offline", options)
+    head = ActorCriticHead(options.width, len(options.discounts), world.actions)
+    model = make_step_model(options, world, make_transformer(options), head)
+    discounts_G = jnp.asarray(options.discounts)
+
+    def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
+        steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
+        actions = jnp.asarray(batch.target_actions)
+        output: StepOutput = run_model(model, options, params, key, steps, actions)
+        online: ActorCriticOutput = output.head
+        target: ActorCriticOutput = run_model(model, options, slow, None, steps).head
+        policy_BxLxGxA = jax.nn.softmax(online.logits)
+        taken_BxLx1xA = jax.nn.one_hot(actions, world.actions)[:, :, None]
+
+        # Critics: r + discount * E[Q_slow(next)] under the policy; a step's reward is an input of the step after it.
+        next_value = jnp.sum(jax.lax.stop_gradient(policy_BxLxGxA) * target.values.min(axis=0), axis=-1)[:, 1:]
+        reward = REWARD_SCALE * jnp.asarray(batch.prev_rewards)[:, 1:, None]
+        bootstrap = jax.lax.stop_gradient(reward + discounts_G * next_value)  # (B, L - 1, G)
+        error = jnp.square(jnp.sum(online.values * taken_BxLx1xA, axis=-1)[:, :, :-1] - bootstrap)
+        critic = mean_of_rows(error.mean(axis=(0, -1)), mask[:, 1:])
+
+        # Actor: imitate what the critics estimate to be better than the policy's mean, and raise that mean.
+        values_BxLxGxA = jax.lax.stop_gradient(online.values.min(axis=0))
+        baseline_BxLxG = jnp.sum(policy_BxLxGxA * values_BxLxGxA, axis=-1)
+        better = jnp.sum(values_BxLxGxA * taken_BxLx1xA, axis=-1) > jax.lax.stop_gradient(baseline_BxLxG)
+        repeated = jnp.broadcast_to(actions[..., None], better.shape)
+        imitation = better * cross_entropy(online.logits, repeated, options.label_smoothing)
+        actor = mean_of_rows((imitation - Q_WEIGHT * baseline_BxLxG).mean(axis=-1), mask)
+
+        total = actor + CRITIC_WEIGHT * critic
+        log = {
+            "actor_loss": actor,
+            "critic_loss": critic,
+            "value": mean_of_rows(baseline_BxLxG[..., -1], mask),
+            "imitated": mean_of_rows(better.mean(axis=-1), mask),
+        }
+        if output.next_obs is not None:
+            log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
+            total += log["next_obs_loss"]
+        return total, {"loss": total, **log, **encoding_log(steps.obs)}
+
+    example = example_step(world)
+    return Method(
+        name="amago_offline",
+        label="AMAGO-Offline",
+        data="ad",
+        model=model,
+        example=(example, example.prev_action),
+        loss=loss,
+        logits=lambda output: output.logits[..., -1, :],
+        slow=SLOW,
+        takes_labels=False,
+    )

@@ -1,0 +1,132 @@
+"""Hyper-parameters of the models, without JAX, so that the command line can show them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from icrl4aht_generation.learners.config import EncoderKind
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.option_fields import check_fields, option_field
+
+Positions = Literal["none", "rope"]
+"""Position embedding of tokens: none, as published, or rotary (Su et al. 2021)."""
+
+
+class ModelSize(NamedTuple):
+    """Values of `ModelOptions`, and of a training, that make up a size.
+
+    Attributes:
+        steps: training steps.
+        context: K, steps of a window or transitions of a context.
+        cpu_batch: rows of a batch on a CPU.
+        layers, width, heads, positions, encoder: see `ModelOptions`.
+    """
+
+    layers: int
+    width: int
+    steps: int
+    heads: int = 4
+    context: int = 500
+    positions: Positions = "none"
+    encoder: EncoderKind = "paper"
+    cpu_batch: int = 8
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """Values of `ModelOptions`."""
+        return {name: getattr(self, name) for name in ("layers", "width", "heads", "positions", "encoder")}
+
+    @property
+    def train(self) -> dict[str, Any]:
+        """Values of `TrainOptions`, without the batch size, which depends on the device."""
+        return {"steps": self.steps, "context": self.context}
+
+
+SIZES = {
+    "tiny": ModelSize(2, 64, 20_000, heads=2, context=200, positions="rope", encoder="mlp", cpu_batch=16),
+    "small": ModelSize(4, 256, 20_000),
+    "medium": ModelSize(8, 512, 50_000),
+    "large": ModelSize(12, 768, 100_000),
+}
+"""Sizes by name: one for two cores of a CPU, and the paper's (Sec. 5.3, "Model Scale and Training Budget")."""
+
+RL2_SETTINGS: dict[str, dict[str, Any]] = {
+    "model": {
+        "width": 128,
+        "recurrent_layers": 1,
+        "dropout": 0.0,
+        "encoder": "mlp",
+        "teammate_actions": True,
+        "reward_scale": 0.05,
+    },
+    "train": {
+        "steps": 2000,
+        "batch_size": 256,
+        "learning_rate": 1e-3,
+        "warmup": 0.02,
+        "clip": 0.5,
+        "log_every": 20,
+        "save_every": 200,
+    },
+}
+"""Defaults of RL^2: values of `ModelOptions` and of `TrainOptions`, for two cores of a CPU."""
+
+PAPER_SIZES = ("small", "medium", "large")
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Architecture of a model; the defaults are the paper's (App. E.5).
+
+    Raises:
+        OptionError: if a value is out of bounds, or the width is not a multiple of twice the heads.
+    """
+
+    layers: int = option_field(4, "Layers of the transformer.", at_least=1)
+    width: int = option_field(256, "Width of tokens and features.", at_least=1)
+    heads: int = option_field(4, "Attention heads.", at_least=1)
+    recurrent_layers: int = option_field(2, "GRU layers of Hybrid-AD, in place of the transformer.", at_least=1)
+    dropout: float = option_field(0.1, "Dropout rate in training.", at_least=0, below=1)
+    encoder: EncoderKind = option_field(
+        "paper", "Encoder of observations: paper, words (the same, faster) or mlp (one dense layer)."
+    )
+    positions: Positions = option_field("none", "Position embedding: none, as published, or rope.")
+    teammate_actions: bool = option_field(False, "+TA: input the teammate's previous action, too.", flags=["--ta"])
+    reward_scale: float = option_field(1.0, "Factor of the rewards in tokens; a delivery earns 20.", above=0)
+    next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")
+    teammate_loss: bool = option_field(False, "With --ta: also learn to predict the teammate's action (ad, hybrid_ad).")
+    family_loss: bool = option_field(False, "Also learn to predict the teammate's family (ad, hybrid_ad).")
+    label_smoothing: float = option_field(0.0, "Label smoothing of the action loss.", at_least=0, below=1)
+    discounts: tuple[float, ...] = option_field(
+        (0.9, 0.95, 0.99, 0.995),
+        "Discount factor of AMAGO-Offline, which acts by the last one; repeat for several.",
+        at_least=0,
+        below=1,
+    )
+    bfloat16: bool = option_field(False, "Compute in bfloat16; parameters stay float32.")
+    remat: bool = option_field(False, "Recompute activations in the backward pass: less memory, more time.")
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.teammate_loss and not self.teammate_actions:
+            raise OptionError("teammate_loss = True: expected teammate_actions as well; give --ta, or leave it out")
+        if self.width % (2 * self.heads):
+            raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")
+
+
+_UNUSED_WITHOUT_TRANSFORMER = {"layers", "heads", "positions", "remat"}
+
+UNUSED_OPTIONS: dict[str, set[str]] = {
+    "ad": {"recurrent_layers", "discounts"},
+    "dpt": {"recurrent_layers", "discounts", "teammate_loss", "family_loss"},
+    "hybrid_ad": {"discounts", *_UNUSED_WITHOUT_TRANSFORMER},
+    "amago_offline": {"recurrent_layers", "teammate_loss", "family_loss"},
+    "rl2": {
+        *_UNUSED_WITHOUT_TRANSFORMER,
+        *("discounts", "dropout", "next_obs", "teammate_loss", "family_loss", "label_smoothing", "bfloat16"),
+        *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
+    },
+}
+"""Method -> options of models and of trainings that it does not use."""

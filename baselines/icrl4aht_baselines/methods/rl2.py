@@ -1,0 +1,95 @@
+"""RL^2 (Duan et al. 2016): a recurrent policy whose state lives through all episodes of a task, trained by PPO.
+
+The model reads AD's tokens and acts as all other models do. It is trained by playing, see `icrl4aht_baselines.online.rl2`.
+
+Shapes: `B` batch size, `T` steps, `A` actions, `D` width, `S` size of the recurrent state.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+from icrl4aht_generation.learners.encoder import orthogonal_dense
+from jaxtyping import Array, Bool, Float
+
+from icrl4aht_baselines.methods.ad import example_step
+from icrl4aht_baselines.methods.hybrid_ad import RecurrentTrunk
+from icrl4aht_baselines.methods.method import Method, World, check_no_teammate_loss, make_tokens
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.tokens import StepInput, StepTokens
+
+
+class PolicyValue(NamedTuple):
+    """Output of the model.
+
+    Attributes:
+        logits: float32 (*B, A), of the policy.
+        value: float32 (*B,), estimated discounted reward to come, in the unit of the training's rewards.
+    """
+
+    logits: Float[Array, "*B A"]
+    value: Float[Array, "*B"]
+
+
+class PolicyValueHead(nn.Module):
+    """Actor and critic on shared features, each with one hidden layer."""
+
+    width: int
+    actions: int
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "*B D"]) -> PolicyValue:
+        actor = nn.relu(orthogonal_dense(self.width, name="actor_hidden")(features))
+        critic = nn.relu(orthogonal_dense(self.width, name="critic_hidden")(features))
+        logits = orthogonal_dense(self.actions, 0.01, "actor")(actor).astype(jnp.float32)
+        return PolicyValue(logits, orthogonal_dense(1, 1.0, "critic")(critic)[..., 0].astype(jnp.float32))
+
+
+class RL2Model(nn.Module):
+    """Tokens of steps, GRU layers, and the head. The states of all layers are one array of S = layers x D numbers."""
+
+    tokens: StepTokens
+    trunk: RecurrentTrunk
+    head: PolicyValueHead
+
+    def __call__(self, steps: StepInput, state: Float[Array, "B S"]) -> tuple[PolicyValue, Float[Array, "B S"]]:
+        """Returns the output at T steps of B tasks, inputs (T, B, ..), and the state after the last one."""
+        layers = tuple(jnp.split(state, self.trunk.layers, axis=-1))
+        features, layers = self.trunk.follow(self.tokens(steps), layers)
+        return self.head(features), jnp.concatenate(layers, axis=-1)
+
+    def start(self, context: int, cached: bool) -> Float[Array, " S"]:
+        """Returns the state before a task, whatever the context: it forgets nothing at once."""
+        return jnp.zeros(self.trunk.layers * self.trunk.width)
+
+    def act(
+        self, step: StepInput, done: Bool[Array, ""], state: Float[Array, " S"]
+    ) -> tuple[PolicyValue, Float[Array, " S"]]:
+        """Returns the output for one step of one task, and the state after it."""
+        layers = tuple(jnp.split(state, self.trunk.layers))
+        feature, layers = self.trunk.advance(self.tokens(step), layers)
+        return self.head(feature), jnp.concatenate(layers)
+
+
+def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, dict[str, Array]]:
+    raise TypeError("rl2 has no loss of batches: it is trained by playing, see icrl4aht_baselines.online.rl2")
+
+
+def rl2(options: ModelOptions, world: World) -> Method:
+    """Returns the recurrent policy of RL^2."""
+    check_no_teammate_loss("rl2", options)
+    trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
+    model = RL2Model(make_tokens(StepTokens, options, world), trunk, PolicyValueHead(options.width, world.actions))
+    example = (example_step(world), jnp.zeros((1, options.recurrent_layers * options.width)))
+    return Method(
+        name="rl2",
+        label="RL2",
+        data="tasks",
+        model=model,
+        example=example,
+        loss=_no_batches,
+        logits=lambda output: output.logits,
+        takes_labels=False,
+    )

@@ -1,0 +1,170 @@
+"""Histories as tokens, for training and acting alike (paper, App. E.2 and E.3).
+
+AD's tokens are made of `StepInput`s, DPT's context of `Transition`s. Shapes: `*B` any leading axes (batch and time in
+training, none when acting), `D` width of a token, `K` length of a context, `S` slots of a ring buffer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from icrl4aht_generation.learners.encoder import group_equal
+from jaxtyping import Array, Float, Int
+
+from icrl4aht_baselines.methods.encoder import FEATURES
+from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.sampling.ad import ADBatch
+from icrl4aht_data.sampling.dpt import DPTBatch
+
+BatchView = Callable[[Any, Any], Any]
+"""Function (observations or state records of a batch, `layouts` of the batch or None) -> input of the encoder."""
+
+
+class StepInput(NamedTuple):
+    """Input of an ego before an action. Before a history's first step all `prev_*` fields are zero (paper, App. E.2).
+
+    Attributes:
+        obs: (*B, ..), the ego's observation, uint8 or float, or another input of the encoder made of it.
+        prev_action: int32 (*B,), the ego's action in the previous step.
+        prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
+        prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.
+    """
+
+    obs: Any
+    prev_action: Int[Array, "*B"]
+    prev_reward: Float[Array, "*B"]
+    prev_teammate_action: Int[Array, "*B"] | None
+
+
+class Transition(NamedTuple):
+    """An action and its outcome, within one episode.
+
+    Attributes:
+        obs: (*B, 2, ..), the ego's observations before and after the action, or another input of the encoder.
+        action: int32 (*B,), the ego's action.
+        reward: float32 (*B,), the team's reward, unscaled.
+        teammate_action: int32 (*B,), the teammate's action in the same step; None without +TA.
+    """
+
+    obs: Any
+    action: Int[Array, "*B"]
+    reward: Float[Array, "*B"]
+    teammate_action: Int[Array, "*B"] | None
+
+
+def plain_view(obs: Array, layouts: Array | None) -> Array:
+    """Returns the observations of batches that hold observations."""
+    return obs
+
+
+def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
+    """Returns the steps (B, L) of an AD batch."""
+    obs = group_equal(view(batch.obs, batch.layouts))
+    return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
+
+
+def percept_step(percept: Any) -> StepInput:
+    """Returns the input of an acting ego, converted from an `agents.Percept`."""
+    return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
+
+
+def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:
+    """Returns the context's transitions (B, K) and the queries' observations, (B, ..) or (B, Q, ..), of a DPT batch."""
+    both = jnp.stack([jnp.asarray(batch.context_obs), jnp.asarray(batch.context_next_obs)], axis=2)
+    obs, query = group_equal(view(both, batch.layouts)), view(batch.query_obs, batch.layouts)
+    mate: Any = batch.context_teammate_actions
+    return Transition(obs, batch.context_actions, batch.context_rewards, mate), query  # type: ignore[arg-type]
+
+
+class Tokens(nn.Module):
+    """Base class of tokenizers.
+
+    Args:
+        encoder: module from observations to features.
+        width: width of a token.
+        actions: number of actions.
+        teammate_actions: whether tokens hold the teammate's actions (+TA).
+        dropout: rate in training.
+        dtype: of the tokens.
+        reward_scale: factor of the rewards in tokens.
+    """
+
+    encoder: nn.Module
+    width: int = 256
+    actions: int = len(ACTIONS)
+    teammate_actions: bool = False
+    dropout: float = 0.1
+    dtype: Any = jnp.float32
+    reward_scale: float = 1.0
+
+
+class StepTokens(Tokens):
+    """Tokens of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2)."""
+
+    @nn.compact
+    def __call__(self, step: StepInput, deterministic: bool = True) -> Float[Array, "*B D"]:
+        """Returns one token per step."""
+        parts = [nn.Embed(self.actions, FEATURES, name="action")(step.prev_action)]
+        if self.teammate_actions:
+            parts.append(nn.Embed(self.actions, FEATURES, name="teammate_action")(step.prev_teammate_action))
+        parts += [self.reward_scale * step.prev_reward[..., None], self.encoder(step.obs)]
+        token = nn.Dense(self.width, name="project")(jnp.concatenate(parts, -1, dtype=self.dtype))
+        return nn.Dropout(self.dropout)(token, deterministic=deterministic)
+
+
+class TransitionTokens(Tokens):
+    """Tokens of transitions: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected.
+
+    A query is [Enc(o); zeros] through the same projection (paper, App. E.3).
+    """
+
+    def setup(self) -> None:
+        self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)
+
+    def context(self, transition: Transition, deterministic: bool = True) -> tuple[Array, Float[Array, "*B F"]]:
+        """Returns one token (*B, D) per transition, and the encoded observations before the actions."""
+        seen = self.encoder(transition.obs)
+        before, after = seen[..., 0, :], seen[..., 1, :]
+        parts = [before, jax.nn.one_hot(transition.action, self.actions)]
+        if self.teammate_actions:
+            parts.append(jax.nn.one_hot(transition.teammate_action, self.actions))
+        return self._token([*parts, after, self.reward_scale * transition.reward[..., None]], deterministic), before
+
+    def query(self, obs: Any, deterministic: bool = True) -> Float[Array, "*B D"]:
+        """Returns one token per observation for which an action is predicted."""
+        seen = self.encoder(obs)
+        rest = self.actions * (1 + self.teammate_actions) + seen.shape[-1] + 1
+        return self._token([seen, jnp.zeros((*seen.shape[:-1], rest))], deterministic)
+
+    def _token(self, parts: list[Array], deterministic: bool) -> Array:
+        return self.drop(self.project(jnp.concatenate(parts, -1, dtype=self.dtype)), deterministic=deterministic)
+
+
+class RingBuffer(NamedTuple):
+    """Tokens that an acting ego keeps, as a ring: entry i is in slot i % S.
+
+    Attributes:
+        tokens: float32 (S, D).
+        written: int32 (), entries so far.
+    """
+
+    tokens: Float[Array, "S D"]
+    written: Int[Array, ""]
+
+    @classmethod
+    def empty(cls, slots: int, width: int) -> RingBuffer:
+        """Returns a buffer without entries."""
+        return cls(jnp.zeros((slots, width)), jnp.int32(0))
+
+    def add(self, token: Float[Array, " D"]) -> RingBuffer:
+        """Returns the buffer with one more entry, which replaces the oldest of a full buffer."""
+        return RingBuffer(self.tokens.at[self.written % len(self.tokens)].set(token), self.written + 1)
+
+    def last(self, context: int, stop: Int[Array, ""]) -> tuple[Float[Array, "K D"], Int[Array, ""]]:
+        """Returns the entries stop - K .. stop - 1 in order, at the front of the array, and their number."""
+        first = jnp.maximum(stop - context, 0)
+        return self.tokens[(first + jnp.arange(context)) % len(self.tokens)], stop - first

@@ -1,0 +1,227 @@
+"""Decoder-only, pre-norm transformer (paper, App. E.1): complete sequences in training, one token when acting.
+
+Shapes: `B` batch size, `N` tokens of a sequence, `D` width, `H` heads, `Dh` width of a head (D / H), `S` slots of a
+cache.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from icrl4aht_baselines.methods.attention import causal_attention, query_attention
+from icrl4aht_baselines.methods.options import Positions
+
+
+class AttentionCache(NamedTuple):
+    """Keys and values of earlier tokens in one layer, one slot per token.
+
+    Attributes:
+        keys: float32 (H, S, Dh); one head's slots are contiguous, which a matrix product per head reads fastest.
+        values: float32 (H, S, Dh).
+    """
+
+    keys: Float[Array, "H S Dh"]
+    values: Float[Array, "H S Dh"]
+
+    @property
+    def slots(self) -> int:
+        """Number of tokens that fit."""
+        return self.keys.shape[1]
+
+
+class TransformerMemory(NamedTuple):
+    """Memory of an acting ego for up to S tokens.
+
+    Attributes:
+        caches: one cache per layer.
+        written: int32 (), number of tokens; token i is in slot i.
+    """
+
+    caches: tuple[AttentionCache, ...]
+    written: Int[Array, ""]
+
+
+class TransformerBlock(nn.Module):
+    """Attention, then a feed-forward layer of width 4 D with GELU, each behind a layer norm and added to its input.
+
+    Dropout is where the paper has it, with one exception: it is applied to the outputs of the heads, not to the weights
+    of attention.
+    """
+
+    width: int
+    heads: int
+    dropout: float
+    rope: bool
+
+    def setup(self) -> None:
+        self.attention_norm, self.feed_norm = nn.LayerNorm(), nn.LayerNorm()
+        self.qkv, self.out = nn.Dense(3 * self.width), nn.Dense(self.width)
+        self.up, self.down = nn.Dense(4 * self.width), nn.Dense(self.width)
+        self.drop = nn.Dropout(self.dropout)
+
+    def __call__(
+        self,
+        x_BxNxD: Float[Array, "B N D"],
+        positions_N: Int[Array, " N"],
+        context: int,
+        deterministic: bool,
+    ) -> Float[Array, "B N D"]:
+        """Returns features of complete sequences; see `Transformer.__call__` for the arguments."""
+        q, k, v = self._project(x_BxNxD, positions_N)  # each (B, N, H, Dh)
+        attended = causal_attention(q[:, :context], k[:, :context], v[:, :context])
+        if context < x_BxNxD.shape[1]:
+            answers = query_attention(q[:, context:], k[:, context:], v[:, context:], k[:, :context], v[:, :context])
+            attended = jnp.concatenate([attended, answers], axis=1)
+        return self._add_residuals(x_BxNxD, attended, deterministic)
+
+    def step(
+        self,
+        x_D: Float[Array, " D"],
+        position: Int[Array, ""],
+        cache: AttentionCache,
+        slot: Int[Array, ""],
+        visible_S: Bool[Array, " S"],
+    ) -> tuple[Float[Array, " D"], AttentionCache]:
+        """Returns the features of one token, whose key and value are written into a slot before it attends."""
+        x_1x1xD = x_D[None, None]
+        q, k, v = (projected[0, 0] for projected in self._project(x_1x1xD, position[None]))  # each (H, Dh)
+        cache = AttentionCache(cache.keys.at[:, slot].set(k), cache.values.at[:, slot].set(v))
+        attended = _attend_to_cache(q, cache, visible_S)[None, None]
+        return self._add_residuals(x_1x1xD, attended, True)[0, 0], cache
+
+    def cache(
+        self, x_NxD: Float[Array, "N D"], positions_N: Int[Array, " N"]
+    ) -> tuple[Float[Array, "N D"], AttentionCache]:
+        """Returns the features of one sequence without padding, and its keys and values, N slots."""
+        q, k, v = self._project(x_NxD[None], positions_N)  # each (1, N, H, Dh)
+        features = self._add_residuals(x_NxD[None], causal_attention(q, k, v), True)[0]
+        return features, AttentionCache(*(part[0].swapaxes(0, 1) for part in (k, v)))
+
+    def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
+        """Returns queries, keys and values."""
+        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
+        q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
+        return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
+
+    def _add_residuals(self, x_BxNxD: Array, attended: Float[Array, "B N H Dh"], deterministic: bool) -> Array:
+        def drop(y: Array) -> Array:
+            return self.drop(y, deterministic=deterministic)
+
+        x_BxNxD = x_BxNxD + drop(self.out(drop(attended.reshape(x_BxNxD.shape))))
+        return x_BxNxD + drop(self.down(nn.gelu(self.up(self.feed_norm(x_BxNxD)))))
+
+
+def _attend_to_cache(
+    q_HxDh: Float[Array, "H Dh"], cache: AttentionCache, visible_S: Bool[Array, " S"]
+) -> Float[Array, "H Dh"]:
+    """Returns one token's attention. `jax.nn.dot_product_attention` takes ten times as long for it on a CPU."""
+    scores_HxS = jnp.einsum("hd,hsd->hs", q_HxDh, cache.keys) / q_HxDh.shape[-1] ** 0.5
+    return jnp.einsum("hs,hsd->hd", jax.nn.softmax(scores_HxS, where=visible_S), cache.values)
+
+
+def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"]) -> Float[Array, "B N H Dh"]:
+    """Rotates each pair of features by an angle in proportion to the position (Su et al. 2021)."""
+    half = x_BxNxHxDh.shape[-1] // 2
+    angle_NxF = positions_N[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
+    cos, sin = (f(angle_NxF)[:, None, :].astype(x_BxNxHxDh.dtype) for f in (jnp.cos, jnp.sin))
+    one, two = x_BxNxHxDh[..., :half], x_BxNxHxDh[..., half:]
+    return jnp.concatenate([one * cos - two * sin, two * cos + one * sin], axis=-1)
+
+
+class Transformer(nn.Module):
+    """Blocks and a last layer norm: tokens to features.
+
+    Args:
+        layers, width, heads: size of the model.
+        dropout: rate in training.
+        positions: see `options.Positions`.
+        remat: recompute the inside of a block in the backward pass instead of storing it.
+    """
+
+    layers: int = 4
+    width: int = 256
+    heads: int = 4
+    dropout: float = 0.1
+    positions: Positions = "none"
+    remat: bool = False
+
+    def setup(self) -> None:
+        block: Any = TransformerBlock
+        if self.remat:
+            block = nn.remat(TransformerBlock, static_argnums=(3, 4), methods=["__call__"])
+        rope = self.positions == "rope"
+        self.blocks = [block(self.width, self.heads, self.dropout, rope) for _ in range(self.layers)]
+        self.norm = nn.LayerNorm()
+
+    def __call__(
+        self,
+        x: Float[Array, "B N D"],
+        *,
+        context: int | None = None,
+        deterministic: bool = True,
+    ) -> Float[Array, "B N D"]:
+        """Returns features of complete sequences, in which every token sees those up to itself.
+
+        Args:
+            x: tokens.
+            context: if given, the first `context` tokens are a context and the `context + 1` tokens behind it are
+                queries: query j sees the first j tokens and itself, as if it followed them directly.
+            deterministic: False for dropout, under the rng `dropout`.
+        """
+        length = x.shape[1]
+        context = length if context is None else context
+        positions_N = jnp.concatenate([jnp.arange(context), jnp.arange(length - context)])
+        for block in self.blocks:
+            x = block(x, positions_N, context, deterministic)
+        return self.norm(x)
+
+    def step(
+        self,
+        x_D: Float[Array, " D"],
+        caches: tuple[AttentionCache, ...],
+        slot: Int[Array, ""],
+        position: Int[Array, ""],
+        visible_S: Bool[Array, " S"],
+    ) -> tuple[Float[Array, " D"], tuple[AttentionCache, ...]]:
+        """Returns the features of one token, written into `slot`; it sees the visible slots, its own among them."""
+        updated = []
+        for block, cache in zip(self.blocks, caches, strict=True):
+            x_D, cache = block.step(x_D, position, cache, slot, visible_S)
+            updated.append(cache)
+        return self.norm(x_D), tuple(updated)
+
+    def empty_caches(self, slots: int) -> tuple[AttentionCache, ...]:
+        """Returns zero caches of `slots` slots, one per layer."""
+        zeros = jnp.zeros((self.heads, slots, self.width // self.heads))
+        return (AttentionCache(zeros, zeros),) * self.layers
+
+    def caches_of(self, x_NxD: Float[Array, "N D"], slots: int) -> tuple[AttentionCache, ...]:
+        """Returns caches of `slots` slots, one per layer, of which the first N hold a sequence; N is not 0."""
+        behind = ((0, 0), (0, slots - len(x_NxD)), (0, 0))
+        caches = []
+        for block in self.blocks:
+            x_NxD, cache = block.cache(x_NxD, jnp.arange(len(x_NxD)))
+            caches.append(AttentionCache(*(jnp.pad(part, behind) for part in cache)))
+        return tuple(caches)
+
+    def start(self, context: int) -> TransformerMemory:
+        """Returns an empty memory for `context` tokens."""
+        return TransformerMemory(self.empty_caches(context), jnp.int32(0))
+
+    def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
+        """Returns a memory for `context` tokens that holds a sequence; N is not 0."""
+        return TransformerMemory(self.caches_of(x_NxD, context), jnp.int32(len(x_NxD)))
+
+    def advance(
+        self, x_D: Float[Array, " D"], memory: TransformerMemory
+    ) -> tuple[Float[Array, " D"], TransformerMemory]:
+        """Returns the features of one more token, and the memory with it, which must not be full before."""
+        caches, written = memory
+        visible_S = jnp.arange(caches[0].slots) <= written
+        feature_D, caches = self.step(x_D, caches, written, written, visible_S)
+        return feature_D, TransformerMemory(caches, written + 1)

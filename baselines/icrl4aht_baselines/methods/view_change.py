@@ -1,0 +1,121 @@
+"""Changes of what an ego sees, the same in all steps of a task: mirrored windows, and hidden recipe indicators.
+
+The game has no preferred direction, so a mirrored task is another task of the same kind, played on the mirrored layout.
+Models that are tested on other layouts than they are trained on learn from mirrored tasks, too. A hidden recipe
+indicator looks like a counter, as it is one on layouts whose ego cannot see the recipe.
+
+`B` denotes any leading axes. Observations have the canonical channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.learners.encoder import CompactView
+from jaxtyping import Array, Bool, Int, Num
+
+from icrl4aht_baselines.methods.tokens import BatchView
+from icrl4aht_data.overcooked.actions import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
+from icrl4aht_data.overcooked.layouts import Layout
+
+_INDICATOR, _WALL = (CANONICAL_CHANNELS.index(name) for name in ("recipe_indicator", "wall"))
+_RECIPE = np.array([name.startswith("recipe_") for name in CANONICAL_CHANNELS])
+_ROWS, _COLUMNS = -3, -2
+_MIRRORED_ACTIONS = {
+    _ROWS: (DOWN, UP, LEFT, RIGHT, STAY, INTERACT),
+    _COLUMNS: (UP, DOWN, RIGHT, LEFT, STAY, INTERACT),
+}
+
+
+class ViewChange(NamedTuple):
+    """Changes of the view in B tasks or windows.
+
+    Attributes:
+        hidden: bool (*B,), whether recipe indicators look like counters.
+        upside_down: bool (*B,), whether up and down are exchanged.
+        sideways: bool (*B,), whether left and right are exchanged.
+    """
+
+    hidden: Bool[Array, "*B"]
+    upside_down: Bool[Array, "*B"]
+    sideways: Bool[Array, "*B"]
+
+    def observations(self, obs: Num[Array, "*B 5 5 46"]) -> Num[Array, "*B 5 5 46"]:
+        """Returns the observations as the ego sees them."""
+        hidden, rows, columns = (flag[..., None, None, None] for flag in self)
+        counters = jnp.where(_RECIPE, 0, obs).at[..., _WALL].max(obs[..., _INDICATOR])
+        obs = jnp.where(hidden, counters, obs)
+        obs = jnp.where(rows, _exchanged(jnp.flip(obs, _ROWS), "up", "down"), obs)
+        return jnp.where(columns, _exchanged(jnp.flip(obs, _COLUMNS), "left", "right"), obs)
+
+    def actions(self, actions: Int[Array, "*B"]) -> Int[Array, "*B"]:
+        """Returns actions in the ego's view for actions in the environment, and the other way round."""
+        for mirrored, axis in ((self.upside_down, _ROWS), (self.sideways, _COLUMNS)):
+            actions = jnp.where(mirrored, jnp.asarray(_MIRRORED_ACTIONS[axis], actions.dtype)[actions], actions)
+        return actions
+
+    def at_each_step(self, steps: int, axis: int) -> ViewChange:
+        """Returns the changes with an axis of steps inserted."""
+        return ViewChange(*(jnp.repeat(jnp.expand_dims(flag, axis), steps, axis) for flag in self))
+
+
+def _exchanged(obs: Array, one: str, other: str) -> Array:
+    """Returns observations in which agents face one direction where they faced the other.
+
+    Slices are much faster than a gather of all channels.
+    """
+    exchanged = {
+        f"{who}_facing_{here}": f"{who}_facing_{there}"
+        for who in ("self", "other")
+        for here, there in ((one, other), (other, one))
+    }
+    source = [CANONICAL_CHANNELS.index(exchanged.get(name, name)) for name in CANONICAL_CHANNELS]
+    runs = np.split(source, np.flatnonzero(np.diff(source) != 1) + 1)
+    return jnp.concatenate([obs[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
+
+
+def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
+    """Returns the actions of mirrored rows.
+
+    Args:
+        actions: int (B, ..).
+        mirroring: int (B,), as in `changed_view`.
+    """
+    plain = np.arange(len(_MIRRORED_ACTIONS[_ROWS]))
+    rows, columns = (np.array(_MIRRORED_ACTIONS[axis]) for axis in (_ROWS, _COLUMNS))
+    mapped = np.stack([plain, rows, columns, rows[columns]]).astype(actions.dtype)
+    return mapped[mirroring.reshape(-1, *(1,) * (actions.ndim - 1)), actions]
+
+
+def no_change(*shape: int) -> ViewChange:
+    """Returns changes of shape (*B,) that change nothing."""
+    no: Any = jnp.zeros(shape, bool)
+    return ViewChange(no, no, no)
+
+
+def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> BatchView:
+    """Returns the view of batches of state records whose ego sees hidden recipe indicators, or a mirrored game.
+
+    The number of a row's layout in a batch says both: number n of N layouts, and N times the number of the mirroring, 0
+    for none, 1 for upside down, 2 for sideways, 3 for both.
+
+    Args:
+        layouts: the N layouts.
+        hidden: names of those whose recipe indicators look like counters.
+    """
+    compact = CompactView("paper", tuple(layouts), canonical=True)
+    hides = jnp.asarray([layout.name in hidden for layout in layouts])
+
+    def view(records: Any, numbers: Any) -> Any:
+        variant = jnp.zeros(records.shape[0], jnp.int32) if numbers is None else jnp.asarray(numbers)
+        number, mirroring = variant % len(layouts), variant // len(layouts)
+        obs: Any = compact(records, number if len(layouts) > 1 else None)
+        change = ViewChange(hides[number], mirroring % 2 > 0, mirroring // 2 > 0)
+        within = (1,) * (records.ndim - 2)
+        return ViewChange(*(flag.reshape(-1, *within) for flag in change)).observations(obs)
+
+    return view

@@ -1,0 +1,476 @@
+"""Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with the teammates of a release.
+
+A step plays one episode of every task, then learns from all of them. After an episode a task continues with the model's
+recurrent state, or ends by chance; a new task with the same teammate then begins. Returns include the rewards of later
+episodes, so the model is rewarded for exploration that helps later.
+
+Learning starts from imitation: the loss contains the cross-entropy of the scripted oracle's actions in the states that
+the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
+oracle knows what the model has to find out, so imitation alone is not the goal.
+
+Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.collection.curate import follow_oracle
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer
+from icrl4aht_generation.policy import Policy, stacked
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, no_outcome
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.tokens import StepInput, percept_step
+from icrl4aht_baselines.methods.view_change import ViewChange, no_change
+from icrl4aht_baselines.online.programs import SharedProgram, run_all, shared_programs
+from icrl4aht_baselines.online.teammates import mixed_chances, with_manners
+from icrl4aht_baselines.training.options import PlayOptions, TrainOptions
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.channels import to_canonical
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+
+PLAY_REWARD_SCALE = 0.05
+"""Factor of rewards in returns and values; a delivery, which earns 20 points, becomes 1."""
+
+
+class PlayerMemory(NamedTuple):
+    """Memory of the model in a task.
+
+    Attributes:
+        change: changes of its view, see `ViewChange`.
+        state: float32 (S,), its recurrent state.
+        started: bool (), whether a step of the task was played; before it the outcome of the previous step is zero.
+    """
+
+    change: ViewChange
+    state: Float[Array, " S"]
+    started: Bool[Array, ""]
+
+
+class PlayState(NamedTuple):
+    """State of the training: a step maps it to the next one, and a resume needs nothing else.
+
+    Attributes:
+        params: pytree of float32 arrays.
+        optimizer: state of the optimizer.
+        tasks: the running tasks of each group.
+        step: int32 (), steps so far.
+    """
+
+    params: Any
+    optimizer: Any
+    tasks: tuple[RolloutState, ...]
+    step: Int[Array, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class TaskGroup:
+    """Tasks of one family of teammates, on one layout or on as many as there are tasks, which are played side by side.
+
+    Attributes:
+        layouts: the layout of all tasks alone, or one for each task.
+        family: kind of the teammates, such as "assembly_line".
+        teammates: policies, one for each task; those on one layout share their functions.
+        hidden: whether the model does not see recipe indicators.
+        label: the layouts' name in the log.
+    """
+
+    layouts: Sequence[Layout]
+    family: str
+    teammates: Sequence[Policy]
+    hidden: bool
+    label: str
+
+    @property
+    def name(self) -> str:
+        """Name in the log."""
+        return f"{self.label} {self.family}"
+
+
+def make_groups(
+    teammates: Mapping[tuple[Layout, str], Sequence[Policy]],
+    tasks: int,
+    shares: Mapping[str, float],
+    hidden: Collection[str] = (),
+) -> list[TaskGroup]:
+    """Divides tasks among layouts by their shares, and equally among the families of each layout.
+
+    Args:
+        teammates: layout and family -> training teammates; see `chosen_teammates` for those of each task.
+        tasks: number of all tasks; the result has a few fewer or more, at least one in each group.
+        shares: name of each of these layouts -> its share.
+        hidden: names of layouts whose recipe indicators the model does not see.
+    """
+    families: dict[str, int] = defaultdict(int)
+    for layout, _ in teammates:
+        families[layout.name] += 1
+    total = sum(shares[name] for name in families)
+    groups = []
+    for (layout, family), policies in teammates.items():
+        count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
+        chosen = [policies[number] for number in chosen_teammates(len(policies), count)]
+        mates = with_manners(chosen, mixed_chances(count))
+        groups.append(TaskGroup([layout], family, mates, layout.name in hidden, layout.name))
+    return groups
+
+
+def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:
+    """Returns the number of the teammate of each task of a group, int (tasks,).
+
+    Every teammate has as many tasks as the others, or one more. If there are fewer tasks than teammates, some teammates
+    have none. The order is random, because the manners of teammates follow the order of the tasks.
+    """
+    numbers = np.arange(max(tasks, teammates)) % teammates
+    return np.random.default_rng(0).permutation(numbers)[:tasks]
+
+
+class _Network(NamedTuple):
+    """The model with the interface of `ppo.RecurrentNetwork`."""
+
+    model: Any
+
+    def apply(self, variables: Any, /, *inputs: Any) -> Any:
+        hidden, seen, *_ = inputs
+        output, state = self.model.apply({"params": variables}, seen, hidden)
+        return state, output.logits, output.value
+
+
+class _Player:
+    """Plays one episode after another of tasks on one layout."""
+
+    def __init__(
+        self, layout: Layout, teammates: Sequence[Policy], hidden: bool, method: Method, play: PlayOptions, mirror: bool
+    ) -> None:
+        self.layout, self.hidden, self._method, self._play, self._mirror = layout, hidden, method, play, mirror
+        self._changes = mirror or hidden
+        ego = _model_policy(method, layout, self._changes)
+        self.rollout = EvaluationRollout(layout, ego, teammates, get_protocol("seeded"))
+        self.tasks = len(teammates)
+
+    def start(self, key: Key[Array, ""]) -> RolloutState:
+        """Returns the state before the first episode of all tasks."""
+        env_key, change_key = jax.random.split(key)
+        state = self.rollout.start(jax.random.split(env_key, self.tasks))
+        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key)))
+
+    def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
+        change = no_change(self.tasks)._replace(hidden=jnp.full(self.tasks, self.hidden))
+        if not self._mirror:
+            return change
+        upside_down, sideways = jax.random.bernoulli(key, 0.5, (2, self.tasks))
+        return change._replace(upside_down=upside_down, sideways=sideways)
+
+    def episode(
+        self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
+    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
+        """Returns the state after one episode of every task, the episode for learning, and its returns."""
+        change_key, end_key = jax.random.split(key)
+        after, played = self.rollout.episode(params, mates, state)
+        ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
+        sequences = self._sequences(params, state, after, played, ended)
+        begun = _select(ended, self._draw_change(change_key), after.ego.change)
+        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended)
+        before = _select(ended, no_outcome(self.tasks), after.before)
+        return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
+
+    def _sequences(
+        self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
+    ) -> Sequences:
+        layout, change = self.layout, state.ego.change
+        record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
+        taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
+        # One step more than was played: the value there is what the last step leads to.
+        steps = StepInput(
+            obs=observe(layout, jnp.concatenate([record, after.env.record[None]]), EGO, canonical=True),
+            prev_action=jnp.concatenate([state.before.prev_action[None], taken]),
+            prev_reward=jnp.concatenate([state.before.prev_reward[None], reward]),
+            prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),
+        )
+        if self._changes:
+            started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
+            seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps, started)
+        else:
+            seen = steps
+        _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
+        own = change.at_each_step(len(record), 0)
+        action = own.actions(taken)
+        log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
+        return Sequences(
+            seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
+            reset=jnp.zeros(reward.shape, bool),
+            action=action,
+            log_prob=log_prob,
+            value=value[:-1],
+            reward=PLAY_REWARD_SCALE * reward,
+            done=jnp.zeros(reward.shape, bool).at[-1].set(ended),
+            hidden=state.ego.state[None],
+            partner=jnp.zeros((1, self.tasks), jnp.int32),
+            weight=jnp.ones((1, self.tasks)),
+            last_value=value[-1][None],
+            expert=own.actions(follow_oracle(layout, record, taken)),
+        )
+
+
+class _GroupPlayer:
+    """Plays one episode after another of a group's tasks, all in one compiled program."""
+
+    def __init__(self, group: TaskGroup, method: Method, play: PlayOptions, mirror: bool) -> None:
+        self.group, self.tasks = group, len(group.teammates)
+        player = _Player(group.layouts[0], group.teammates, group.hidden, method, play, mirror)
+        self.mates = player.rollout.teammate_params
+        self.start: Callable[..., RolloutState] = player.start
+        self.episode: Any = jax.jit(player.episode)
+
+
+class _LayoutsPlayer:
+    """Plays one episode after another of tasks that are each on a layout of its own, all in one compiled program.
+
+    `start` and `episode` are programs of `_Player` for one task, with the tables of every task's layout.
+    """
+
+    def __init__(self, group: TaskGroup, start: SharedProgram, episode: SharedProgram) -> None:
+        self.group, self.tasks = group, len(group.teammates)
+        self.mates = jax.tree.map(lambda leaf: leaf[:, None], stacked(mate.params for mate in group.teammates))
+        self._start, self._episode = start, episode
+        self.episode: Any = jax.jit(self._play)
+
+    def start(self, key: Key[Array, ""]) -> RolloutState:
+        """Returns the state before the first episode of all tasks."""
+        state = run_all(self._start, 0, jax.random.split(key, self.tasks))
+        return jax.tree.map(lambda leaf: leaf[:, 0], state)
+
+    def _play(
+        self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
+    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
+        state = jax.tree.map(lambda leaf: leaf[:, None], state)
+        keys = jax.random.split(key, self.tasks)
+        after, sequences, returns = run_all(self._episode, 1, params, mates, state, keys)
+        after = jax.tree.map(lambda leaf: leaf[:, 0], after)
+        return after, jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, :, 0], 0, 1), sequences), returns[:, 0]
+
+
+def _group_players(
+    group: TaskGroup, method: Method, play: PlayOptions, mirror: bool
+) -> Sequence[_GroupPlayer | _LayoutsPlayer]:
+    """Returns the players of a group; more than one if its layouts differ in more than their tables."""
+    if len(group.layouts) == 1:
+        return [_GroupPlayer(group, method, play, mirror)]
+    layouts = list(dict.fromkeys(group.layouts))
+    players = [
+        _Player(layout, [group.teammates[group.layouts.index(layout)]], group.hidden, method, play, mirror)
+        for layout in layouts
+    ]
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    params = jax.eval_shape(lambda: method.init(jax.random.key(0)))
+    state, mates = jax.eval_shape(players[0].start, key), players[0].rollout.teammate_params
+    found = []
+    for episode in shared_programs([player.episode for player in players], params, mates, state, key):
+        # A start is a part of an episode, after which the next one starts: equal episodes have equal starts.
+        (start,) = shared_programs([players[number].start for number in episode.members], key)
+        own = [layouts[number] for number in episode.members]
+        tasks = [task for task, layout in enumerate(group.layouts) if layout in own]
+        rows = [own.index(group.layouts[task]) for task in tasks]
+        part = replace(
+            group,
+            layouts=[group.layouts[task] for task in tasks],
+            teammates=[group.teammates[task] for task in tasks],
+        )
+        found.append(_LayoutsPlayer(part, start.repeated(rows), episode.repeated(rows)))
+    return found
+
+
+def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
+    """Returns steps as an ego sees them whose view is changed.
+
+    Args:
+        change: the changes (*B,).
+        steps: the steps (*B, ..).
+        started: whether a step precedes in the task; otherwise the previous actions are zeros that mean nothing.
+    """
+
+    def seen(actions: Array) -> Array:
+        return jnp.where(started, change.actions(actions), actions)
+
+    mate = steps.prev_teammate_action
+    return steps._replace(
+        obs=change.observations(steps.obs),
+        prev_action=seen(steps.prev_action),
+        prev_teammate_action=None if mate is None else seen(mate),
+    )
+
+
+def _select(which: Bool[Array, " B"], one: Any, other: Any) -> Any:
+    """Returns a pytree with the leaves of `one` where `which`, and of `other` elsewhere."""
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, one, other)
+
+
+def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
+    """Returns the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
+
+    def init(params: Any, key: Array) -> PlayerMemory:
+        return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
+
+    def act(params: Any, memory: PlayerMemory, percept: Any, key: Array) -> tuple[Array, PlayerMemory]:
+        step = percept_step(percept._replace(obs=to_canonical(layout, percept.obs)))
+        step = seen_steps(memory.change, step, memory.started) if changes else step
+        logits, state = method.act(params, step, percept.prev_done, memory.state)
+        action = jax.random.categorical(key, logits).astype(jnp.int32)
+        return memory.change.actions(action), memory._replace(state=state, started=jnp.bool_(True))
+
+    return Policy({}, init, act, "percept")
+
+
+class StepNumbers:
+    """Numbers of the training steps, with the interface of `Batches`."""
+
+    waited = 0.0
+
+    def __init__(self, start: int, stop: int) -> None:
+        self._numbers = range(start, stop)
+
+    def __enter__(self) -> StepNumbers:
+        return self
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._numbers)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+
+class PlayTrainer:
+    """Training by playing, with the interface of `icrl4aht_baselines.training.trainer.Trainer`.
+
+    Args:
+        method: RL^2.
+        options: `steps`, `batch_size`, `learning_rate`, `warmup`, `clip` and `seed` count.
+        play: hyper-parameters of playing and learning.
+        groups: the tasks.
+        mirror: whether tasks are mirrored at random.
+
+    Raises:
+        OptionError: if there are fewer tasks than minibatches.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        options: TrainOptions,
+        play: PlayOptions,
+        groups: Sequence[TaskGroup],
+        mirror: bool = False,
+    ) -> None:
+        self.method, self.options, self.play = method, options, play
+        self.players = [player for group in groups for player in _group_players(group, method, play, mirror)]
+        self._mates = [player.mates for player in self.players]
+        self.tasks = sum(player.tasks for player in self.players)
+        if self.tasks < play.minibatches:
+            raise OptionError(
+                f"minibatches = {play.minibatches}: expected at most the {self.tasks} tasks that are played at once; "
+                f"give fewer --minibatches or a larger --batch-size"
+            )
+        learned = self.tasks - self.tasks % play.minibatches  # from so many tasks in each pass
+        config = PPOConfig(
+            total_steps=options.steps * learned * KEPT_STEPS,
+            environments=learned,
+            rollout=KEPT_STEPS,
+            epochs=play.epochs,
+            minibatches=play.minibatches,
+            learning_rate=options.learning_rate,
+            warmup=options.warmup,
+            discount=play.discount,
+            gae_lambda=play.gae_lambda,
+            entropy=play.entropy,
+            max_grad_norm=options.clip,
+        )
+        self.ppo = PPO(_Network(method.model), config)
+        self._learn = jax.jit(self._learn_from, donate_argnums=(0, 1))
+        self._compiled: list[Any] | None = None
+
+    def init(self) -> PlayState:
+        """Returns the state before the first step."""
+        return jax.jit(self._initial_state)()
+
+    def state_like(self) -> Any:
+        """Returns shapes and dtypes of the state, to restore a checkpoint by."""
+        return jax.eval_shape(self._initial_state)
+
+    def _initial_state(self) -> PlayState:
+        key = jax.random.key(self.options.seed)
+        params = self.method.model.init(key, *self.method.example)["params"]
+        keys = jax.random.split(jax.random.fold_in(key, 1), len(self.players))
+        tasks = tuple(player.start(own) for player, own in zip(self.players, keys, strict=True))
+        return PlayState(params, ppo_optimizer(self.ppo.config).init(params), tasks, jnp.int32(0))
+
+    def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> StepNumbers:
+        """Returns the numbers of the steps."""
+        return StepNumbers(start, stop)
+
+    def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
+        """Returns nothing: such models are compared by `evaluate` on validation tasks."""
+        return []
+
+    def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
+        """Plays one episode of every task and learns from them; returns the state after it and the numbers to log."""
+        play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
+        keys = jax.random.split(play_key, len(self.players))
+        if self._compiled is None:
+            self._compiled = self._compile(state, keys[0])
+        played = [
+            episode(state.params, mates, tasks, key)
+            for episode, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
+        ]
+        tasks, sequences, returns = zip(*played, strict=True)
+        weight = imitation_weight(self.play, state.step, self.options.steps)
+        params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
+        by_name: dict[str, list[Array]] = defaultdict(list)
+        for player, own in zip(self.players, returns, strict=True):
+            by_name[player.group.name].append(own)
+        log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
+        return PlayState(params, optimizer, tasks, state.step + 1), log
+
+    def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
+        """Compiles the episodes of all groups side by side."""
+        with ThreadPoolExecutor() as pool:
+            lowered = [
+                player.episode.lower(state.params, mates, tasks, key)
+                for player, mates, tasks in zip(self.players, self._mates, state.tasks, strict=True)
+            ]
+            return list(pool.map(lambda one: one.compile(), lowered))
+
+    def _learn_from(
+        self, params: Any, optimizer: Any, parts: tuple[Sequences, ...], key: Key[Array, ""], weight: Array
+    ) -> tuple[Any, Any, dict[str, Array]]:
+        played: Sequences = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
+        played = played._replace(imitation=jnp.full((1, self.tasks), weight))
+        params, optimizer, log = self.ppo.learn(params, optimizer, played, key)
+        config = self.ppo.config
+        total = log["policy_loss"] + config.value * log["value_loss"] - config.entropy * log["entropy"]
+        total += weight * log["imitation_loss"]
+        return params, optimizer, {"loss": total, **log, "imitation_weight": weight}
+
+
+def imitation_weight(play: PlayOptions, step: Int[Array, ""], steps: int) -> Float[Array, ""]:
+    """Returns the weight of imitating the oracle in a step of a training of `steps` steps; it falls linearly to 0."""
+    return play.imitation * jnp.maximum(0.0, 1.0 - step / (play.imitation_end * steps))

@@ -1,0 +1,353 @@
+"""Histories of the source `student`: a trained agent plays with the teammates of a release, and the oracle labels it.
+
+The agent's memory lasts for a history, as it does in a test. A chance of a random action may fall over a history's
+episodes, as in noise distillation (Zisman et al. 2024); with a chance of 0 the histories show what the agent itself
+visits. `expert_actions` are the agent's own choices, before the noise, or those of another trained agent, which sees
+the same history. Labels on what a student visits are those of on-policy imitation (DAgger, Ross et al. 2011).
+
+Shapes: `B` histories that are played side by side, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.collection.curate import oracle_labels
+from icrl4aht_generation.collection.noise_rollout import noise_schedules
+from icrl4aht_generation.learners.resume import differing_settings, xla_threads
+from icrl4aht_generation.policy import Policy, sometimes_random
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from jaxtyping import Array, Float, Int, Int8
+
+from icrl4aht_baselines.agents.egos import NamedEgo
+from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.online.teammates import check_heuristics
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks
+from icrl4aht_data.commands.options import counted
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.checkpoints import checkpoint_files
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, episode_ends
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.release_folder import check_target
+
+SOURCE = "student"
+
+FIRST_SEED = 3_000_000
+"""Seed of the first student task; those of other sources are below."""
+
+_SEEDS = 100_000
+"""Student tasks of one collection have seeds from a range of this size."""
+
+
+class NoisyMemory(NamedTuple):
+    """Memory of an agent whose actions are replaced by random ones with a chance.
+
+    Attributes:
+        own: the agent's memory.
+        chance: float32 (), of a random action, in this episode.
+        steps: int32 (), steps so far.
+        labels: int8 (T,), the labeller's choices in the last T steps.
+        labeller: the labeller's memory; None if the agent labels its own histories.
+    """
+
+    own: Any
+    chance: Float[Array, ""]
+    steps: Int[Array, ""]
+    labels: Int8[Array, " T"]
+    labeller: Any = None
+
+
+def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> Policy:
+    """Returns an agent that sometimes acts at random, and remembers labels of the steps.
+
+    Args:
+        policy: the agent.
+        length: T, steps of an episode.
+        labeller: another agent that sees the same; by default the labels are what the agent does without the noise.
+
+    Raises:
+        OptionError: if the labeller sees something else than the agent.
+    """
+    if labeller is not None and labeller.sees != policy.sees:
+        raise OptionError(
+            f"the labeller sees a {labeller.sees}, expected a {policy.sees}, as the agent does: choose a trained model"
+        )
+    params = policy.params, None if labeller is None else labeller.params
+
+    def init(params: Any, key: Any) -> NoisyMemory:
+        labels = jnp.zeros(length, jnp.int8)
+        other = None if labeller is None else labeller.init(params[1], key)
+        return NoisyMemory(policy.init(params[0], key), jnp.float32(0), jnp.int32(0), labels, other)
+
+    def act(params: Any, memory: NoisyMemory, view: Any, key: Any) -> tuple[Any, NoisyMemory]:
+        clean, own = policy.act(params[0], memory.own, view, key)
+        label, other = clean, None
+        if labeller is not None:
+            label, other = labeller.act(params[1], memory.labeller, view, jax.random.fold_in(key, 2))
+        action = sometimes_random(jax.random.fold_in(key, 1), memory.chance, clean).astype(jnp.int32)
+        labels = memory.labels.at[memory.steps % length].set(label.astype(jnp.int8))
+        return action, NoisyMemory(own, memory.chance, memory.steps + 1, labels, other)
+
+    return Policy(params, init, act, policy.sees)
+
+
+class RecordedHistories(NamedTuple):
+    """Histories of some tasks; NumPy.
+
+    Attributes:
+        state: uint8 (B, E * T, S), state records before each step.
+        actions: int8 (B, E * T), the agent's.
+        teammate_actions: int8 (B, E * T).
+        rewards: int8 (B, E * T).
+        expert_actions: int8 (B, E * T), the labels.
+        episode_end_state: uint8 (B, E, S), state records after each episode.
+    """
+
+    state: np.ndarray
+    actions: np.ndarray
+    teammate_actions: np.ndarray
+    rewards: np.ndarray
+    expert_actions: np.ndarray
+    episode_end_state: np.ndarray
+
+
+def record_histories(
+    make_ego: Callable[[Layout], Policy],
+    tasks: Sequence[Task],
+    config: NoiseConfig,
+    suite: Path | None = None,
+    played: Callable[[int], None] = lambda episodes: None,
+    make_labeller: Callable[[Layout], Policy] | None = None,
+) -> RecordedHistories:
+    """Play histories of tasks that share a layout and a teammate family; `config.histories` of each, in their order.
+
+    Args:
+        make_ego: layout -> agent, which sees percepts, observations or state records.
+        tasks: the tasks; their seeds determine schedules and episodes.
+        config: number and length of the histories, and their noise.
+        suite: folder of learned teammates, if tasks have any.
+        played: called with the number of episodes played since the last call.
+        make_labeller: layout -> another agent that labels the histories.
+
+    Raises:
+        OptionError: if an agent does not fit the layout, or the labeller sees something else than the agent.
+    """
+    chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
+    seeds = range(config.histories)
+
+    def noisy(layout: Layout) -> Policy:
+        return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
+
+    rollout, state, episode = prepare_rollout(noisy, tasks, get_protocol("seeded", config.episodes), seeds, suite)
+    parts: list[tuple[np.ndarray, ...]] = []
+    for number in range(config.episodes):
+        state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, number])))
+        state, one = episode(rollout.ego.params, rollout.teammate_params, state)
+        actions = np.asarray(one.actions, np.int8)
+        rewards, labels = np.asarray(one.reward, np.int8), np.asarray(state.ego.labels)
+        record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
+        parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
+        played(len(chances))
+    return RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
+
+
+class Teammates(NamedTuple):
+    """Teammates of a release, and what it says of them.
+
+    Attributes:
+        tasks: one task for each teammate, numbered as a student task.
+        references: task id -> returns of egos that do not learn, where the release states them.
+        suite: folder of the checkpoints of learned teammates.
+        root: folder or address of the release.
+    """
+
+    tasks: list[Task]
+    references: dict[str, ReferenceEgos]
+    suite: Path
+    root: str | Path
+
+
+def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] = ()) -> Teammates:
+    """Returns student tasks with the teammates of a selection's histories and of other tasks, each once.
+
+    Args:
+        dataset: the selection.
+        number: number of the collection, from 0, which decides the tasks' seeds.
+        tasks: tasks with more teammates, heuristics; those on other layouts than the selection's are left out.
+
+    Raises:
+        OptionError: if the release does not describe the teammates of all of these histories, or for tasks with learned
+            teammates.
+    """
+    path = Path(dataset.root) / PROVENANCE
+    provenance = read_provenance(path) if path.is_file() else {}
+    wanted = set(dataset.column("task_id").tolist())
+    listed = Path(dataset.root) / TASKS
+    known = [task for task in (read_tasks(listed) if listed.is_file() else []) if task.task_id in wanted]
+    missing = wanted - {task.task_id for task in known}
+    if missing:
+        raise OptionError(
+            f"{dataset.root}: {TASKS} does not describe {len(missing)} of {len(wanted)} tasks, such as "
+            f"{min(missing)}: choose a release that was made with its tasks"
+        )
+    check_heuristics(tasks)
+    layouts = {layout.name for layout in dataset.layouts}
+    if tasks and not any(task.layout.name in layouts for task in tasks):
+        raise OptionError(
+            f"none of the {len(tasks)} tasks of the manifests is on {', '.join(sorted(layouts))}; leave them out, or "
+            f"choose other layouts"
+        )
+    found: dict[tuple[str, str], Task] = {}
+    references = {}
+    for task in known + [task for task in tasks if task.layout.name in layouts]:
+        if task.teammate_key in found:
+            continue
+        seed = FIRST_SEED + number * _SEEDS + len(found)
+        student = make_task(task.track, task.split, task.layout.name, task.teammate, seed)
+        found[task.teammate_key] = student
+        made = provenance.get(task.task_id)
+        if made is not None and made.references is not None:
+            references[student.task_id] = made.references
+    suite = dataset.origin.below(TEAMMATES)
+    root = str(dataset.origin) if dataset.origin.remote else dataset.root
+    return Teammates(list(found.values()), references, suite, root)
+
+
+def collect_release(
+    agent: NamedEgo,
+    teammates: Teammates,
+    config: NoiseConfig,
+    out: Path,
+    *,
+    labeller: NamedEgo | None = None,
+    data_version: str = "1.0.0",
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> Path:
+    """Play histories with every teammate, and write them as a release of source `student`.
+
+    Until the release is complete, finished groups of tasks are kept in the folder `out` with the ending `.parts`, from
+    which the same call resumes.
+
+    Args:
+        agent: the agent.
+        teammates: tasks to play.
+        config: number and length of each task's histories, and their noise.
+        out: folder of the release.
+        labeller: another agent, whose choices become the expert actions; by default the agent's own, without noise.
+        data_version: version of the data.
+        overwrite: whether to replace a release at `out`.
+        progress: called with (description, episodes played, episodes).
+
+    Raises:
+        OptionError: if `out` may not be written, if an agent does not fit a layout or the labeller sees something else
+            than the agent, or if the saved parts are of other settings.
+    """
+    out = out.resolve()
+    check_target(out, overwrite, [teammates.root])
+    for layout in dict.fromkeys(task.layout for task in teammates.tasks):
+        with_noise(agent.make(layout), KEPT_STEPS, None if labeller is None else labeller.make(layout))
+    parts = out.with_name(f"{out.name}.parts")
+    settings = {
+        "agent": agent.name,
+        "details": agent.details,
+        "labeller": labeller and [labeller.name, labeller.details],
+        "noise": asdict(config),
+        "tasks": [task.task_id for task in teammates.tasks],
+        "xla_threads": xla_threads(),
+        "code_version": version("icrl4aht-data"),
+    }
+    _check_settings(parts / "settings.json", settings)
+    groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
+    for task in teammates.tasks:
+        groups[task.layout.name, task.teammate_kind].append(task)
+    total = len(teammates.tasks) * config.histories * config.episodes
+    show, label = counted(progress, f"{agent.name}: episodes", total), labeller and labeller.make
+    for (layout, kind), tasks in groups.items():
+        folder = parts / f"{layout}-{kind}"
+        if folder.is_dir():
+            show(len(tasks) * config.histories * config.episodes)
+        else:
+            _save_part(folder, record_histories(agent.make, tasks, config, teammates.suite, show, label))
+    by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
+    labels = ExpertLabels(policy_sha256=None, action=by)
+    new = [
+        _student_task(task, number, parts / f"{layout}-{kind}", labels, config, teammates)
+        for (layout, kind), tasks in groups.items()
+        for number, task in enumerate(tasks)
+    ]
+    write_release(out, "lite", new, data_version=data_version, overwrite=overwrite, sources=[teammates.root])
+    shutil.rmtree(parts)
+    return out
+
+
+def _save_part(folder: Path, recorded: RecordedHistories) -> None:
+    """Write the arrays of a group of tasks into a folder, which appears when it is complete."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a killed process
+    partial.mkdir()
+    for name, array in recorded._asdict().items():
+        np.save(partial / f"{name}.npy", array)
+    partial.rename(folder)
+
+
+def _check_settings(path: Path, settings: dict[str, Any]) -> None:
+    """Write the settings of a collection, or check that they are those of the one that was begun here."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as partial:
+            write_json(partial, settings)
+        return
+    different = differing_settings(parse_json(read_text(path)), settings)
+    if different:
+        listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
+        raise OptionError(f"{path.parent}: parts of other settings ({listed}); remove it, or give another --out")
+
+
+def _student_task(
+    task: Task, number: int, folder: Path, labels: ExpertLabels, config: NoiseConfig, teammates: Teammates
+) -> NewTask:
+    """A task with the histories of one group that belong to it, which are read when they are written."""
+    first = number * config.histories
+
+    def load() -> Iterator[NewHistory]:
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in RecordedHistories._fields}
+        for stream in range(config.histories):
+            of_history = {name: array[first + stream] for name, array in arrays.items()}
+            states, actions = of_history["state"], of_history["actions"]
+            (labels,) = oracle_labels(task.layout, [states], [actions])
+            dones = episode_ends(len(actions), KEPT_STEPS)
+            yield NewHistory(stream, of_history | {"dones": dones, "oracle_actions": labels})
+
+    made = Provenance(
+        code_version=version("icrl4aht-data"),
+        jax_version=jax.__version__,
+        platform=jax.default_backend(),
+        xla_threads=xla_threads(),
+        seed=task.seed,
+        source=SOURCE,
+        noise=json.loads(json.dumps(asdict(config))),
+        references=teammates.references.get(task.task_id),
+        teammate={"slot": TEAMMATE, "noise": "seeded"},
+        streams_recorded=config.histories,
+        streams_kept=config.histories,
+        expert=labels,
+    )
+    return NewTask(task, made, config.histories, load, checkpoint_files(teammates.suite, task))

@@ -1,0 +1,101 @@
+"""Returns on layouts that no model was trained on: whether a model knows the game, or its training layouts.
+
+Shapes: `V` layouts, `E` episodes.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.policy import Policy, stacked
+from icrl4aht_generation.teammates.registry import build_teammate
+from jaxtyping import Float
+
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
+from icrl4aht_baselines.online.layouts import unseen_layouts
+from icrl4aht_baselines.online.programs import SharedProgram, run_all, shared_programs
+from icrl4aht_data.benchmark.reference_returns import Cell
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+
+
+def unseen_returns(
+    egos: Mapping[str, Callable[[Layout], Policy]],
+    tasks: Sequence[Task],
+    versions: int,
+    episodes: int,
+    played: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> dict[str, dict[Cell, Float[np.ndarray, "V E"]]]:
+    """Play on rearranged versions of the tasks' layouts, with the teammates of the tasks, under the protocol `seeded`.
+
+    Args:
+        egos: agent -> function from a layout to its policy.
+        tasks: with heuristic teammates.
+        versions: of each layout.
+        episodes: of each ego on each version with each teammate.
+        played: called with what is played, the episodes played and all episodes, for progress.
+
+    Returns:
+        Agent -> layout and family -> returns on each version with a teammate of the family.
+
+    Raises:
+        OptionError: if a teammate is learned and so plays on its own layout only, or if a layout has too few versions.
+    """
+    cells: dict[Cell, list[Task]] = defaultdict(list)
+    for task in tasks:
+        if task.teammate["kind"] != "heuristic":
+            raise OptionError(
+                f"task {task.task_id}: its teammate is learned and plays on {task.layout.name} only; expected "
+                f"heuristics: leave these tasks out"
+            )
+        cells[task.layout.name, task.teammate_family].append(task)
+    layouts = {name: unseen_layouts(get_layout(name), versions) for name, _ in cells}
+    total, done = len(egos) * len(cells) * versions * episodes, 0
+    found: dict[str, dict[Cell, Any]] = {name: {} for name in egos}
+    for (layout, family), mates in cells.items():
+        chosen = [mates[number] for number in np.linspace(0, len(mates) - 1, versions).astype(int)]
+        for name, make in egos.items():
+            played(f"{name} with {family} on {layout}", done, total)
+            found[name][layout, family] = _returns(make, layouts[layout], chosen, episodes)
+            done += versions * episodes
+    played("all layouts", total, total)
+    return found
+
+
+def _returns(
+    make: Callable[[Layout], Policy], layouts: Sequence[Layout], tasks: Sequence[Task], episodes: int
+) -> Float[np.ndarray, "V E"]:
+    """Returns the returns of an ego on each layout, with the teammate of the task of the same number."""
+    rollouts = [
+        EvaluationRollout(layout, make(layout), [build_teammate(layout, task.teammate)], get_protocol("seeded"))
+        for layout, task in zip(layouts, tasks, strict=True)
+    ]
+    keys = jnp.stack([task_key(number, task.task_id) for number, task in enumerate(tasks)])[:, None]
+    params = rollouts[0].ego.params  # those of a model, which are the same on every layout
+    state = jax.eval_shape(rollouts[0].start, keys[0])
+    totals = np.zeros((len(layouts), episodes))
+    for program in shared_programs([one.episode for one in rollouts], params, rollouts[0].teammate_params, state):
+        totals[program.members] = _played_returns(program, [rollouts[n] for n in program.members], keys, episodes)
+    return totals
+
+
+def _played_returns(
+    program: SharedProgram, rollouts: Sequence[EvaluationRollout], keys: Any, episodes: int
+) -> Float[np.ndarray, "V E"]:
+    """Returns the return of each episode on the layouts of one program."""
+    (start,) = shared_programs([one.start for one in rollouts], keys[0])
+    state = run_all(start, 0, keys[jnp.array(program.members)])
+    mates = stacked(one.teammate_params for one in rollouts)
+    episode = jax.jit(lambda params, mates, state: run_all(program, 1, params, mates, state))
+    found = []
+    for _ in range(episodes):
+        state, batch = episode(rollouts[0].ego.params, mates, state)
+        found.append(np.asarray(batch.reward, np.float64)[:, 0].sum(axis=-1))
+    return np.stack(found, axis=-1)

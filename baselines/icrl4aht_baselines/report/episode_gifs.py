@@ -1,0 +1,179 @@
+"""Episodes as GIFs: an agent with a teammate."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from icrl4aht_generation.policy import Policy
+
+from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent, get_agent
+from icrl4aht_baselines.evaluate.evaluator import play_tasks
+from icrl4aht_baselines.evaluate.protocols import Protocol
+from icrl4aht_baselines.report.overlap import describe_overlap
+from icrl4aht_baselines.report.results import EvaluationRun, ResultSource, cell_of, cell_order, group_of, groups_of
+from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.render import save_episode
+from icrl4aht_data.utils.threads import usable_cores
+
+_PROGRESS = "episodes of the report"
+
+
+class ShownEpisode(NamedTuple):
+    """A picture of an episode.
+
+    Attributes:
+        number: number of the episode in its task, from 1.
+        earned: return of the team.
+        path: the GIF.
+    """
+
+    number: int
+    earned: float
+    path: Path
+
+
+class EpisodePair(NamedTuple):
+    """The first and the last episode of a task that a reported agent played with a teammate of one family.
+
+    Attributes:
+        family: of the teammate.
+        title: who plays on which layout.
+        caption: the task and the training data; or why there is no picture.
+        episodes: the first and the last episode, one if the task has only one, none if the agent cannot be restored.
+    """
+
+    family: str
+    title: str
+    caption: str
+    episodes: tuple[ShownEpisode, ...] = ()
+
+
+def save_episodes(
+    paths: Mapping[int, Path],
+    task: Task,
+    make_ego: Callable[[Layout], Policy],
+    protocol: Protocol,
+    *,
+    seed: int = 0,
+    cell: int = 32,
+    suite: Path | None = None,
+) -> tuple[ShownEpisode, ...]:
+    """Play a task, and write some of its episodes as GIFs. Returns them; they earn what `evaluate` stores.
+
+    Args:
+        paths: number of an episode, from 1 -> path of its GIF. Later episodes than these are not played.
+        task, make_ego, protocol, seed, suite: see `evaluator.play_tasks`.
+        cell: pixels per map cell.
+    """
+    shown = []
+    played = play_tasks(make_ego, [task], dataclasses.replace(protocol, episodes=max(paths)), [seed], suite)
+    for number, episode in enumerate(played, start=1):
+        if number in paths:
+            record, reward = np.asarray(episode.record[0]), np.asarray(episode.reward[0])
+            save_episode(paths[number], task.layout, record, reward, cell=cell)
+            shown.append(ShownEpisode(number, float(reward.sum()), paths[number]))
+    return tuple(shown)
+
+
+def family_gifs(
+    runs: Sequence[EvaluationRun],
+    folder: Path,
+    suite: Path | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> list[EpisodePair]:
+    """Write the first and the last episode of an evaluated task for each agent and family of teammates.
+
+    The task is on a layout where that family leaves headroom, if there is one among the results.
+
+    Args:
+        runs: what is reported.
+        folder: for the GIFs.
+        suite: folder of learned teammates' checkpoints.
+        progress: called with (description, tasks drawn, tasks), from the calling thread.
+
+    Returns:
+        Run after run, families in order. If an agent cannot be restored, the caption says why.
+    """
+    chosen = []
+    for run in runs:
+        headroom = read_headroom(run.protocol)
+        played = [(source, cell) for source in run.sources for cell in source.tasks]
+        for family in groups_of(cell for _, cell in played):
+            of_family = [found for found in played if found[1][1] == family]
+            open_cells = [found for found in of_family if found[1] in headroom and has_headroom(headroom[found[1]])]
+            source, cell = min(open_cells or of_family, key=lambda found: cell_order(found[1]))
+            chosen.append((run, source, source.tasks[cell][0]))
+    egos = {source.folder: _restore(source) for _, source, _ in chosen}
+
+    def draw(number: int) -> EpisodePair:
+        run, source, task = chosen[number]
+        return _draw_result(run, source, task, egos[source.folder], folder / str(number), suite)
+
+    progress(_PROGRESS, 0, len(chosen))
+    with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
+        drawn = [pool.submit(draw, number) for number in range(len(chosen))]
+        for done, future in enumerate(as_completed(drawn), start=1):
+            future.result()
+            progress(_PROGRESS, done, len(chosen))
+    return [future.result() for future in drawn]
+
+
+def _draw_result(
+    run: EvaluationRun,
+    source: ResultSource,
+    task: Task,
+    ego: Callable[[Layout], Policy] | Icrl4ahtError,
+    prefix: Path,
+    suite: Path | None,
+) -> EpisodePair:
+    protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
+    family = task.teammate_family
+    group = group_of(cell_of(task))
+    kind = "" if group == "test" else f" ({group})"  # a number without it names a published teammate
+    title = f"{run.label} with {family}/t{task.teammate['theta_id']}{kind} on {task.layout.name}"
+    trained = describe_overlap([task], source.seen)
+    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {trained}"
+    try:
+        if isinstance(ego, Icrl4ahtError):
+            raise ego
+        paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
+        shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite)
+        return EpisodePair(family, title, origin, shown)
+    except Icrl4ahtError as error:
+        return EpisodePair(family, title, f"No picture: {error}. {origin}")
+
+
+def _restore(source: ResultSource) -> Callable[[Layout], Policy] | Icrl4ahtError:
+    try:
+        return restore_ego(source)
+    except Icrl4ahtError as error:
+        return error
+
+
+def restore_ego(source: ResultSource) -> Callable[[Layout], Policy]:
+    """Returns the function that makes the ego of some results, layout -> policy.
+
+    Raises:
+        OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
+    """
+    name, details = source.settings["agent"], dict(source.settings.get("details", {}))
+    if name in AGENTS:
+        return get_agent(name)
+    if source.trained is None and "model" not in details:
+        raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
+    folder = details.get("model") or (source.trained or {})["run"]
+    if "model" not in details and not Path(folder).is_dir():
+        raise OptionError(f"its run folder {folder} is missing")
+    details.pop("variant", None)
+    agent = find_agent(folder, PlayMode.from_details(details))
+    if agent.details != details:
+        raise OptionError(f"{folder} holds another model than these results are of: {agent.details}, not {details}")
+    return agent.make

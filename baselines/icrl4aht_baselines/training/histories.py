@@ -1,0 +1,452 @@
+"""Training on learning histories: their selection, the held-out part, the run's settings, and the trained model."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.learners.config import EncoderKind
+from icrl4aht_generation.learners.resume import Checkpoints, differing_settings
+
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.methods.registry import PLAYING, get_method, overcooked_world
+from icrl4aht_baselines.methods.tokens import BatchView, plain_view
+from icrl4aht_baselines.methods.view_change import changed_view
+from icrl4aht_baselines.training.layout_numbers import number_layouts
+from icrl4aht_baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, read_config
+from icrl4aht_baselines.training.seen import TRAINED_ON
+from icrl4aht_baselines.training.trainer import TrainingData
+from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
+from icrl4aht_data.errors import EmptySelectionError, OptionError
+from icrl4aht_data.format.schema import MANIFEST
+from icrl4aht_data.overcooked.channels import Channels, observation_shape
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.reading.history import Labels
+from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
+from icrl4aht_data.sampling.draws import Curriculum
+from icrl4aht_data.utils.files import json_hash
+from icrl4aht_data.utils.hashes import file_hash
+
+_CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammate_family"]} | {
+    name: FILTERS[name] for name in ("algorithm", "source")
+}
+"""Name in an entry of `training_cells` -> field of the index."""
+
+VALIDATION = "validation"
+"""Split of the histories that are held out where a release has them."""
+
+
+class TrainingTask(NamedTuple):
+    """Arguments of `trainer.train`, except for a folder.
+
+    Attributes:
+        method: what to train.
+        data: batches to train on and to validate with.
+        options: of the training.
+        about: settings of model and data for config.json.
+    """
+
+    method: Method
+    data: TrainingData
+    options: TrainOptions
+    about: dict[str, Any]
+
+
+def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
+    """Returns the training of a method on histories; each process of several gets its share of the batches.
+
+    The held-out part `teammates` are the release's histories of split validation on the training layouts that pass the
+    same filters. Without any, some teammates of the training split are held out instead, see `hold_out`.
+
+    Args:
+        name: of the method.
+        model: its architecture.
+        options: of the training.
+        histories: to train on.
+
+    Raises:
+        EmptySelectionError: if no history has a value that the choice of histories filters by.
+        OptionError: if a window or a context is longer than a history, if the layouts' own channels are asked for and
+            differ in number, or if labels are asked for and the method uses none.
+        LabelsMissingError: for histories without the labels.
+    """
+    if name in PLAYING:
+        raise OptionError(f"{name} learns by playing, not from histories: `icrl4aht-data train {name}` trains it")
+    dataset, validation = _load(histories)
+    split = hold_out(dataset, histories.held_out, validation=validation)
+    hidden = [get_layout(one).name for one in histories.hide_recipe]
+    view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
+    method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
+    labels = _labels_of(method, histories.labels)
+    draws = _draws(split.train, options, histories)
+    parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
+    samplers = {
+        part: number_layouts(
+            _sampler(method, selection, options, model, histories, labels, draws if part == "train" else {}),
+            dataset.layouts,
+            histories.mirror,
+        )
+        for part, selection in parts.items()
+        if selection is not None
+    }
+    about = {
+        "model": asdict(model),
+        "histories": asdict(histories)
+        | history_settings(dataset)
+        | {
+            "hide_recipe": hidden,
+            "obs": dataset.obs,
+            "channels": dataset.channels,
+            "labels": labels,
+            "obs_shape": list(dataset.obs_shape),
+            "selections": {part: sampler.options()["selection"] for part, sampler in samplers.items()},
+            "sizes": {part: len(sampler.dataset) for part, sampler in samplers.items()},
+            "teammates_split": None if split.teammates is None else " and ".join(split.teammates.counts("split")),
+        },
+        TRAINED_ON: training_cells(split.train, labels),
+    }
+    return TrainingTask(method, TrainingData(samplers.pop("train"), samplers), options, about)
+
+
+def history_settings(dataset: Dataset) -> dict[str, Any]:
+    """Returns what a run's settings say of the release: root, hash of its manifest, data version, and layouts."""
+    return {
+        "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
+        "manifest_sha256": file_hash(dataset.root / MANIFEST),
+        "data_version": dataset.info.data_version,
+        "layouts": [layout.name for layout in dataset.layouts],
+    }
+
+
+def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
+    """Returns the view of a training's batches; None for the default one, of state records."""
+    changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
+    if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
+        raise OptionError(
+            f"{changed[0]}: expected state records and canonical channels, found {dataset.obs} and {dataset.channels} "
+            f"channels; add --channels canonical, or choose a release with state records"
+        )
+    if changed:
+        return changed_view(dataset.layouts, hidden)
+    return None if dataset.obs == "state" else plain_view
+
+
+def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
+    """Returns the labels that a method learns from, or None for one that learns from the histories' own actions."""
+    if method.data == "dpt":
+        return wanted or "expert"
+    if wanted is not None and not method.takes_labels:
+        raise OptionError(
+            f"labels = {wanted}: {method.name} learns from the histories' own actions and rewards; leave out --labels, "
+            f"or train another method"
+        )
+    return wanted
+
+
+def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
+    """Opens the release, with state records if there are any and nothing else is required.
+
+    Channels are canonical if all layouts are chosen, or some whose own channels differ, and nothing else is required.
+
+    Returns:
+        The chosen histories, and those of split validation that agree with the choice, if there are any.
+    """
+    every = ALL_LAYOUTS in histories.layouts
+    names = None if every else [get_layout(name).name for name in histories.layouts]
+    release = load_icrl4aht(histories.root, obs=histories.obs or "uint8")
+    found = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
+    differ = len({layout.obs_shape for layout in found.layouts}) > 1
+    channels = histories.channels or ("canonical" if every or differ else "own")
+    if channels == "own" and differ:
+        raise OptionError(
+            f"channels = own: the layouts {', '.join(layout.name for layout in found.layouts)} have own channels of "
+            f"unequal number: leave out --channels or take canonical, or train on one of them, such as --layout "
+            f"{found.layouts[0].name}"
+        )
+    state = "state" if histories.obs is None and found.has_states else None
+    found = found.with_options(obs=state, channels=channels)
+    return found, _validation_part(release.with_options(obs=state, channels=channels), found, histories)
+
+
+def _validation_part(release: Dataset, chosen: Dataset, histories: HistoryOptions) -> Dataset | None:
+    """Returns the histories of split validation on the chosen layouts that pass the filters, if there are any."""
+    if histories.split == VALIDATION:
+        return None
+    filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
+    try:
+        return release.filter(split=VALIDATION, layout=[layout.name for layout in chosen.layouts], **filters)
+    except EmptySelectionError:
+        return None
+
+
+def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
+    """Returns the histories that pass filters, see `HistoryOptions.filters`.
+
+    Raises:
+        EmptySelectionError: for a value that no history has, or if no history has one of each filter's values.
+    """
+    passing = np.ones(len(dataset), bool)
+    for name, values in filters.items():
+        column = dataset.column(FILTERS[name])
+        passing &= np.isin(column, values)
+        found = sorted(set(column.tolist()))
+        for value in values:
+            if value not in found:
+                raise EmptySelectionError(
+                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
+                    f"another layout or release"
+                )
+    if not passing.any():
+        wanted = ", ".join(f"{name} = {' or '.join(values)}" for name, values in filters.items())
+        raise EmptySelectionError(
+            f"{wanted}: none of {dataset!r} has these together: leave one of them out, or choose another layout or "
+            f"release"
+        )
+    return dataset.select(passing) if filters else dataset
+
+
+def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
+    """Returns what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
+
+    An entry has these five names, the `labels`, None for a method that uses none, the numbers of `tasks` and
+    `histories`, `tasks_hash`, a hash of the task ids, and `teammates`, the ids of the teammates, see
+    `dataset.teammate_ids`; None if the release does not describe them. Histories that are held out for validation do
+    not belong to `dataset`.
+    """
+    columns = [dataset.column(field) for field in _CELL_FIELDS.values()]
+    tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    history_of: dict[str, int] = {}
+    for *cell, task_id, history_id in zip(*columns, dataset.column("task_id"), dataset.ids, strict=True):
+        tasks[tuple(map(str, cell))].append(str(task_id))
+        history_of[str(task_id)] = int(history_id)
+    return [
+        {
+            **dict(zip(_CELL_FIELDS, cell, strict=True)),
+            "labels": labels,
+            "tasks": len(set(ids)),
+            "histories": len(ids),
+            "tasks_hash": json_hash(sorted(set(ids))),
+            "teammates": teammate_ids(dataset, [history_of[task_id] for task_id in set(ids)]),
+        }
+        for cell, ids in sorted(tasks.items())
+    ]
+
+
+def _sampler(
+    method: Method,
+    dataset: Dataset,
+    options: TrainOptions,
+    model: ModelOptions,
+    histories: HistoryOptions,
+    labels: Labels | None,
+    draws: Mapping[str, Any],
+) -> Any:
+    """Returns the sampler of a part of the histories; `draws` are further options of it."""
+    lengths, every = dataset.column("T"), histories.every
+    if options.context > lengths.min():
+        raise OptionError(
+            f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
+            + _longer_source(dataset, options.context)
+        )
+    shared: Any = {
+        "batch_size": options.batch_size,
+        "seed": options.seed,
+        "teammate_actions": model.teammate_actions,
+        "process_index": jax.process_index(),
+        "process_count": jax.process_count(),
+        **draws,
+    }
+    if method.data == "ad":
+        _check_thinned(dataset, options.context, every)
+        if histories.queries > 1:
+            raise OptionError(
+                f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
+            )
+        return dataset.ad(length=options.context, every=every, labels=labels, families=model.family_loss, **shared)
+    if every > 1:
+        raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
+    assert labels is not None
+    return dataset.dpt(
+        context=options.context, order=histories.order, labels=labels, queries=histories.queries, **shared
+    )
+
+
+def _draws(dataset: Dataset, options: TrainOptions, histories: HistoryOptions) -> dict[str, Any]:
+    """Returns the sampler's options on how histories are drawn in training; held-out ones are drawn uniformly.
+
+    Raises:
+        OptionError: if a window does not fit the part of a history that a curriculum begins with.
+    """
+    draws: dict[str, Any] = {}
+    if histories.weights == "improvement":  # a history that does not rise counts as one that rises by a point
+        draws["weights"] = np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
+    if histories.curriculum:
+        curriculum = Curriculum(max(1, round(histories.curriculum * options.steps)))
+        first = int(curriculum.first[1] * dataset.column("T").min())
+        if options.context > first:
+            raise OptionError(
+                f"context = {options.context}, curriculum = {histories.curriculum:g}: it begins with {first} steps of "
+                f"the shortest history of {dataset!r}; take fewer, or no --curriculum"
+            )
+        draws["curriculum"] = curriculum
+    return draws
+
+
+def _check_thinned(dataset: Dataset, context: int, every: int) -> None:
+    """Check that every n-th episode of each history makes a complete window."""
+    fewest = int(dataset.column("episodes").min())
+    steps = fewest // every * dataset.info.environment.kept_steps
+    if every > 1 and context > steps:
+        raise OptionError(
+            f"context = {context}, every = {every}: every {every}-th of the {fewest} episodes of the shortest history "
+            f"of {dataset!r} are {steps} steps; take fewer, or a smaller --every"
+        )
+
+
+def _longer_source(dataset: Dataset, context: int) -> str:
+    """Returns the advice to choose a source whose histories all have so many steps, if there is one."""
+    lengths, sources = dataset.column("T"), dataset.column("source")
+    longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
+    return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""
+
+
+class HistorySplit(NamedTuple):
+    """Disjoint parts of a selection.
+
+    Attributes:
+        train: histories to train on.
+        histories: held-out histories of the training tasks.
+        teammates: histories with teammates that are in no other part, of split validation or held out; None if there is
+            neither. They may act like a teammate in training, with other parameters.
+    """
+
+    train: Dataset
+    histories: Dataset
+    teammates: Dataset | None
+
+
+def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
+    """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
+
+    Every task with a teammate that is not held out keeps at least one history. The choice depends on names and the seed
+    alone, see `splitting`; `Dataset.split` makes the same choice of teammates or of histories.
+
+    Args:
+        dataset: the histories to divide.
+        share: share of the teammates, and of the histories with the others.
+        seed: seed of the choice.
+        validation: histories with other teammates, such as those of split validation: these are the part `teammates`
+            then, and no teammate of `dataset` is held out.
+
+    Raises:
+        OptionError: if the share is not between 0 and 1, or every task has one history only.
+    """
+    teammates = validation
+    if validation is None:
+        with_held = choose_teammates(teammate_names(dataset), share, seed)
+        if with_held.any():
+            dataset, teammates = dataset.select(~with_held), dataset.select(with_held)
+    held = choose_histories(dataset, share, seed)
+    return HistorySplit(train=dataset.select(~held), histories=dataset.select(held), teammates=teammates)
+
+
+class TrainedModel(NamedTuple):
+    """A model at its last checkpoint.
+
+    Attributes:
+        method: with the model.
+        params: pytree of float32 arrays.
+        step: training steps so far.
+        context: K.
+        layouts: names of the training layouts.
+        channels: channels of the observations that it takes: the layouts' own, or the canonical ones.
+        obs_shape: shape of these observations.
+        label: as reports show it.
+        encoder: kind of the encoder.
+        hash: of the run's settings.
+        trained_on: the histories that it was trained on, see `training_cells`.
+        hide_recipe: names of layouts whose recipe indicators it does not see.
+    """
+
+    method: Method
+    params: Any
+    step: int
+    context: int
+    layouts: tuple[str, ...]
+    channels: Channels
+    obs_shape: tuple[int, ...]
+    label: str
+    encoder: EncoderKind
+    hash: str
+    trained_on: list[dict[str, Any]]
+    hide_recipe: tuple[str, ...] = ()
+
+
+def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
+    """Returns the parameters of a run, to start another training from, and notes it in that training's settings.
+
+    Args:
+        run: run folder of the model.
+        method: what is to be trained.
+        about: settings of the other training; its record of training data gets that of the model, too.
+
+    Raises:
+        OptionError: if the parameters are of another model; names the options that differ.
+    """
+    before, config = read_trained(run), read_config(run)
+    shapes = jax.eval_shape(method.init, jax.random.key(0))
+    if jax.tree.map(jnp.shape, before.params) != jax.tree.map(jnp.shape, shapes):
+        found, expected = (
+            {"method": name, "obs_shape": list(one["histories"]["obs_shape"]), **asdict(ModelOptions()), **one["model"]}
+            for name, one in ((config["method"], config), (method.name, about))
+        )
+        listed = "; ".join(f"{k} = {a!r}, not {b!r}" for k, (a, b) in differing_settings(found, expected).items())
+        raise OptionError(f"{run}: its parameters are of another model ({listed}): give its options, or another run")
+    about["init"] = {"run": before.hash, "step": before.step}
+    about[TRAINED_ON] = [*about[TRAINED_ON], *(cell for cell in before.trained_on if cell not in about[TRAINED_ON])]
+    return before.params
+
+
+def read_trained(folder: Path) -> TrainedModel:
+    """Returns the model of a run folder.
+
+    Raises:
+        OptionError: if the folder is not a run on histories or has another format, or if its checkpoint is missing or
+            does not fit its settings.
+    """
+    config = read_config(folder)
+    try:
+        histories, train = config["histories"], config["train"]
+        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config["model"].items()}
+        model = ModelOptions(**options)
+        layouts = [get_layout(name) for name in histories["layouts"]]
+        channels, obs_shape = histories["channels"], tuple(histories["obs_shape"])
+        expected = observation_shape(layouts[0], channels == "canonical")
+        world = overcooked_world(layouts, model.encoder, canonical=channels == "canonical")
+        method = get_method(config["method"])(model, world)
+        context, cells = train["context"], config["trained_on"]
+    except (KeyError, TypeError) as error:
+        raise OptionError(f"{folder}: its config.json is not of a run on learning histories: {error!r}") from error
+    if expected != obs_shape:
+        raise OptionError(
+            f"{folder}: trained on observations {obs_shape}, those of {layouts[0].name} with {channels} channels are "
+            f"{expected} in this version; train again"
+        )
+    params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
+    label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
+    label += "+teammate" * model.teammate_loss + "+family" * model.family_loss
+    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
+    names = tuple(layout.name for layout in layouts)
+    digest = json_hash(config)
+    hidden = tuple(histories.get("hide_recipe", ()))
+    return TrainedModel(
+        method, params, step, context, names, channels, obs_shape, label, model.encoder, digest, cells, hidden
+    )

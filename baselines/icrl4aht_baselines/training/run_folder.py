@@ -1,0 +1,96 @@
+"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/, perhaps tensorboard/.
+
+Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume`; this module has the settings of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+from icrl4aht_generation.learners.resume import differing_settings
+
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+
+RUN_FORMAT = 4
+"""Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
+`trained_on`, 4 since it has `channels`."""
+
+CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
+
+
+def format_versions() -> dict[str, Any]:
+    """Returns the versions that a run's config.json states: of the folder's format and of this package."""
+    return {"run_format": RUN_FORMAT, "package_version": version("icrl4aht-data")}
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Returns a run's settings.
+
+    Raises:
+        OptionError: if the folder is not a run, or has another format.
+    """
+    path = folder / CONFIG
+    try:
+        config = parse_json(read_text(path))
+        found = config["run_format"]
+    except (IndexFormatError, KeyError, TypeError) as error:
+        raise OptionError(f"{folder}: not a run: expected {CONFIG} with run_format ({error})") from error
+    if found != RUN_FORMAT:
+        writer, reader = config.get("package_version"), format_versions()["package_version"]
+        other = f", or use this run with version {writer} of this package, which wrote it" if writer != reader else ""
+        raise OptionError(
+            f"{path}: run_format {found!r}, but version {reader} of this package reads run_format {RUN_FORMAT} only: "
+            f"train again into another folder (another --out){other}"
+        )
+    return config
+
+
+_DEFAULTS = {"model": ModelOptions(), "play": PlayOptions(), "histories": HistoryOptions(()), "train": TrainOptions()}
+"""Part of a run's settings -> the defaults of its options."""
+
+
+def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
+    """Start a run in a folder, or check that the run in it has the same settings. Returns the settings in the folder.
+
+    An option that the folder does not state is one that came after the run: the run has its default.
+
+    Args:
+        folder: created if it is missing.
+        config: all settings of the run; JSON values.
+
+    Raises:
+        OptionError: if the folder holds a run of other settings; names each one that differs.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / CONFIG).exists():
+        if jax.process_index() == 0:
+            with atomic_write(folder / CONFIG) as partial:
+                write_json(partial, config)
+        return config
+    found = read_config(folder)
+    different = differing_settings(_with_defaults(found, config), config)
+    if different:
+        listed = "; ".join(f"{name}: the run has {one!r}, expected {two!r}" for name, (one, two) in different.items())
+        raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
+    return found
+
+
+def _with_defaults(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a run with the defaults of those options of a new one that it does not state."""
+    parts = {
+        part: asdict(options)
+        for part, options in _DEFAULTS.items()
+        if isinstance(found.get(part), dict) and part in config
+    }
+    return {**found} | {
+        part: {name: value for name, value in options.items() if name in config[part]} | found[part]
+        for part, options in parts.items()
+    }

@@ -1,0 +1,333 @@
+"""The trainer (paper, App. E.4): any method on any batches; exact resume, accumulation, data parallelism.
+
+Step i is a function of the state before it and of batch i, which is a function of (seed, i). So a run that was killed
+resumes from its last checkpoint to the same parameters and the same log as an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from icrl4aht_generation.learners.resume import METRICS, Checkpoints, RunLog, SaveInterval, run_lock, xla_threads
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
+
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.plotting import plot_training_log
+from icrl4aht_baselines.training.options import SAVE_MINUTES, TrainOptions
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
+from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
+from icrl4aht_baselines.training.tensorboard import TensorBoardLog, check_installed
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.plotting import can_draw
+from icrl4aht_data.sampling.batches import Batches
+
+BATCH_AXIS = "data"
+"""The mesh's one axis: rows of a batch."""
+
+
+StepProgress = Callable[[int, float | None], None]
+"""Called with (steps done, the loss last logged or None)."""
+
+
+def format_loss(loss: float | None) -> str:
+    """Returns the loss as a note for a progress bar; empty for None."""
+    return "" if loss is None else f", loss {loss:.3f}"
+
+
+class TrainingData(NamedTuple):
+    """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
+
+    Attributes:
+        train: sampler of the batches to train on.
+        validation: name of a held-out part -> its sampler.
+    """
+
+    train: Any
+    validation: Mapping[str, Any]
+
+
+class TrainState(NamedTuple):
+    """Content of a checkpoint.
+
+    Attributes:
+        params: pytree of float32 arrays.
+        slow: copy of the parameters that follows them slowly, or None.
+        optimizer: state of the optimizer.
+        step: int32 (), steps so far.
+    """
+
+    params: Any
+    slow: Any
+    optimizer: optax.OptState
+    step: Int[Array, ""]
+
+
+def learning_rate_schedule(options: TrainOptions) -> optax.Schedule:
+    """Returns the learning rate per step: linear warm-up, then cosine to 0 (paper, App. E.4)."""
+    warmup = round(options.warmup * options.steps)
+    return optax.warmup_cosine_decay_schedule(0.0, options.learning_rate, warmup, max(options.steps, warmup + 1))
+
+
+def training_optimizer(options: TrainOptions) -> optax.GradientTransformation:
+    """Returns AdamW on gradients clipped by global norm."""
+    adam = optax.adamw(learning_rate_schedule(options), weight_decay=options.weight_decay)
+    return optax.chain(optax.clip_by_global_norm(options.clip), adam)
+
+
+class Trainer:
+    """A method's training step and validation, compiled for some devices.
+
+    Args:
+        method: what to train.
+        options: how.
+        devices: all devices of all processes by default.
+
+    Raises:
+        OptionError: if a batch cannot be divided among devices and parts.
+    """
+
+    def __init__(self, method: Method, options: TrainOptions, devices: Any = None) -> None:
+        devices = jax.devices() if devices is None else devices
+        share = len(devices) * options.accumulate
+        if options.batch_size % share:
+            raise OptionError(
+                f"batch_size = {options.batch_size}: expected a multiple of {share}, {len(devices)} devices x "
+                f"{options.accumulate} parts"
+            )
+        self.method, self.options, self._optimizer = method, options, training_optimizer(options)
+        self._learning_rate = learning_rate_schedule(options)
+        mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
+        self.rows, self._parts, self.everywhere = (
+            NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((BATCH_AXIS,), (None, BATCH_AXIS), ())
+        )
+        same = self.everywhere
+        self.step = jax.jit(self._step, in_shardings=(same, self.rows), out_shardings=same, donate_argnums=0)
+        self.validate = jax.jit(self._validate, in_shardings=(same, self.rows), out_shardings=same)
+
+    def init(self) -> TrainState:
+        """Returns the state before the first step, on the trainer's devices."""
+        return jax.jit(self._initial_state, out_shardings=self.everywhere)()
+
+    def state_like(self) -> Any:
+        """Returns shapes, dtypes and shardings of the state, to restore a checkpoint by."""
+        shapes = jax.eval_shape(self._initial_state)
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self.everywhere), shapes)
+
+    def _initial_state(self) -> TrainState:
+        params = self.method.init(jax.random.key(self.options.seed))
+        slow = jax.tree.map(jnp.copy, params) if self.method.slow else None
+        return TrainState(params, slow, self._optimizer.init(params), jnp.int32(0))
+
+    def _step(self, state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Array]]:
+        """Returns the state after one update, and the numbers to log."""
+        key = jax.random.fold_in(jax.random.key(self.options.seed + 1), state.step)
+        gradient, log = self._gradient(state, batch, key)
+        change, optimizer = self._optimizer.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, change)
+        slow = state.slow
+        if self.method.slow:
+            slow = optax.incremental_update(params, slow, self.method.slow)
+        rate = jnp.asarray(self._learning_rate(state.step))
+        norm = jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(gradient)))
+        log |= {"gradient_norm": norm, "learning_rate": rate}
+        return TrainState(params, slow, optimizer, state.step + 1), log
+
+    def _gradient(self, state: TrainState, batch: Any, key: Array) -> tuple[Any, dict[str, Array]]:
+        """Returns gradient and log of a batch: the mean of its parts, which are computed one after the other."""
+        parts = self.options.accumulate
+        gradient_of = jax.value_and_grad(self.method.loss, has_aux=True)
+
+        def part_gradient(number: Array, rows: Any) -> tuple[Any, dict[str, Array]]:
+            (_, log), gradient = gradient_of(state.params, state.slow, rows, jax.random.fold_in(key, number))
+            return gradient, log
+
+        if parts == 1:
+            return part_gradient(jnp.int32(0), batch)
+        split = jax.tree.map(self._split_rows, batch)
+        first = jax.tree.map(lambda leaf: leaf[0], split)
+        shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+        def add(total: Any, numbered: Any) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, total, part_gradient(*numbered)), None
+
+        total, _ = jax.lax.scan(add, zero, (jnp.arange(parts), split))
+        return jax.tree.map(lambda leaf: leaf / parts, total)
+
+    def _split_rows(self, rows: Array) -> Array:
+        """Reshapes (B, ..) to (accumulate, B / accumulate, ..), so that every part has rows on every device."""
+        parts = rows.reshape(-1, self.options.accumulate, *rows.shape[1:]).swapaxes(0, 1)
+        return jax.lax.with_sharding_constraint(parts, self._parts)
+
+    def _validate(self, state: TrainState, batch: Any) -> dict[str, Array]:
+        return self.method.loss(state.params, state.slow, batch, None)[1]
+
+    def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 2) -> Batches:
+        """Returns batches on the devices; the next one is transferred during a step."""
+        return Batches(sampler, start, stop, prefetch=prefetch, device=self.rows)
+
+    def validation_lines(self, state: TrainState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
+        """Returns log lines with the mean of every logged number over the first batches of each held-out part."""
+        lines = []
+        for name, sampler in samplers.items():
+            with self.batches(sampler, 0, self.options.validation_batches, prefetch=0) as batches:
+                logs = [_as_floats(self.validate(state, batch)) for batch in batches]
+            if logs:
+                means = {key: float(np.mean([log[key] for log in logs])) for key in logs[0]}
+                lines.append({"step": step, "part": name, **means})
+        return lines
+
+
+def train(
+    method: Method,
+    data: TrainingData,
+    options: TrainOptions,
+    folder: Path,
+    about: Mapping[str, Any],
+    *,
+    devices: Any = None,
+    trainer: Any = None,
+    params: Any = None,
+    tensorboard: bool = False,
+    save_minutes: float = SAVE_MINUTES,
+    done: StepProgress = lambda step, loss: None,
+) -> Any:
+    """Train to the end, from the start or from the last checkpoint in the folder.
+
+    SIGTERM and SIGINT end the training after the running step, once its state is saved; a second SIGINT does not wait.
+
+    Args:
+        method: what to train.
+        data: batches of `options.batch_size` rows.
+        options: how.
+        folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
+            matplotlib is installed, curves.png.
+        about: further settings for config.json, such as the model's and the data's.
+        devices: all by default.
+        trainer: what computes the steps, with the interface of `Trainer`, which is the default.
+        params: initial parameters, such as those of another run; drawn by the seed by default.
+        tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
+        save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
+        done: called after every step, see `StepProgress`.
+
+    Returns:
+        The state after the last step, such as a `TrainState`.
+
+    Raises:
+        OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which the
+            resumed training would give different bits; if tensorboardX is required and not installed.
+        BusyError: if another process trains in the folder.
+        TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
+    """
+    if tensorboard:
+        check_installed()
+    trainer = trainer or Trainer(method, options, devices)
+    config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
+    with ExitStack() as stack:
+        writes = jax.process_index() == 0
+        if writes:
+            stack.enter_context(run_lock(folder))
+        config = open_run(folder, config)
+        checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
+        if checkpoints.latest is None:
+            state = trainer.init()
+            state = state if params is None else _with_params(state, params)
+        else:
+            state = checkpoints.load(trainer.state_like())[0]
+        first = int(state.step)
+        log = stack.enter_context(RunLog(folder, lambda line: line["step"] <= first))
+        events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
+        if events:
+            stack.callback(events.close)
+        batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
+        stop = stack.enter_context(StopSignals())
+        clock = _StepClock(first)
+        save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
+        loss: float | None = None
+        for step, batch in enumerate(batches, start=first + 1):
+            state, numbers = trainer.step(state, batch)
+            last, lines = step == options.steps, []
+            if step % options.log_every == 0 or last:
+                lines.append({"step": step, "part": "train", **_as_floats(numbers)})
+                loss = lines[0]["loss"]
+            done(step, loss)
+            if step % options.validate_every == 0 or last:
+                lines += trainer.validation_lines(state, data.validation, step)
+            if lines:
+                log.write(*lines, timing=clock.line(step, batches.waited))
+                if events:
+                    events.add(lines)
+            saves, stopped_by = agree_on_stop(save.due(step), stop.received)
+            if saves or stopped_by:
+                log.sync()
+                checkpoints.save(state, step)
+            if stopped_by:
+                name = signal.Signals(stopped_by).name
+                where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
+                raise TrainingStopped(stopped_by, f"{where}, whose state is saved; the same command resumes it")
+        if writes and can_draw():
+            plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
+    return state
+
+
+def _with_params(state: Any, params: Any) -> Any:
+    """Returns a state before the first step with other parameters.
+
+    Raises:
+        OptionError: if they are of another model.
+    """
+    found, expected = (jax.tree.map(jnp.shape, tree) for tree in (params, state.params))
+    if found != expected:
+        raise OptionError("initial parameters: of a model of other options; give those of the run that they come from")
+    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
+    return state._replace(params=placed, slow=None if state.slow is None else jax.tree.map(jnp.copy, placed))
+
+
+def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:
+    """Returns whether all processes save now, and the signal that stops them all, or 0.
+
+    Clocks differ and a signal may reach one process only, but saving needs all of them in the same step: process 0
+    decides when to save, and a signal to any process stops all. With several processes this waits for the step.
+
+    Args:
+        save: whether this process would save; ignored in other processes than 0.
+        received: number of the signal that this process received, or 0.
+    """
+    if jax.process_count() == 1:
+        return save, received
+    every_process = np.asarray(multihost_utils.process_allgather(np.array([save, received], np.int32)))
+    return bool(every_process[0, 0]), int(every_process[:, 1].max())
+
+
+def _as_floats(log: dict[str, Array]) -> dict[str, float]:
+    return {name: float(value) for name, value in jax.device_get(log).items()}
+
+
+class _StepClock:
+    """Steps per second, and the share of time spent waiting for batches, since the last line."""
+
+    def __init__(self, step: int) -> None:
+        self._step, self._time, self._waited = step, time.perf_counter(), 0.0
+
+    def line(self, step: int, waited: float) -> dict[str, Any]:
+        now = time.perf_counter()
+        seconds = now - self._time
+        line = {
+            "step": step,
+            "steps_per_second": round((step - self._step) / seconds, 4),
+            "loader_wait": round((waited - self._waited) / seconds, 4),
+        }
+        self._step, self._time, self._waited = step, now, waited
+        return line

@@ -1,3 +1,0 @@
-from generation.cli import main
-
-main()

@@ -1,0 +1,3 @@
+from icrl4aht_generation.cli import main
+
+main()

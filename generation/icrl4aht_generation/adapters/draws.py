@@ -1,0 +1,66 @@
+"""Keys that recorded episodes were drawn from, found again from the task's seed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.errors import NotStoredError
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import Entry
+from icrl4aht_generation.collection.noise_rollout import noisy_episode_keys
+from icrl4aht_generation.collection.task import learner_key
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.ego import stream_keys
+from icrl4aht_generation.profiles.work import Work
+
+
+def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[str, Any]:
+    """Return the options of `TaskEnv.reset` with which everything random is drawn as in a recorded episode.
+
+    Unlike `Dataset.reset_options`, they do not script the teammate: its policy draws what it drew then, so that it
+    answers to other actions of the ego as it would have. The bits of a learned teammate's network may differ between
+    machines; heuristics play exactly as recorded.
+
+    Args:
+        dataset: a release of this package's code.
+        history_id: a history of the release.
+        episode: number of the episode in the history, from 0.
+
+    Returns:
+        `key` uint32 (2,) and `episode`, the number of the episode with this key.
+
+    Raises:
+        OptionError: for an episode that the history does not have.
+        NotStoredError: if the release does not say how the history was drawn, or the keys do not give its start.
+    """
+    recorded = dataset.reset_options(history_id, episode)["state"]
+    entry = dataset.index.entry(history_id)
+    key, number = _key(dataset, entry, episode)
+    env = Environment(dataset.history_task(history_id).layout)
+    drawn = np.asarray(env.first_record(key[None], jnp.array([number])))[0]
+    if not np.array_equal(drawn, recorded):
+        raise NotStoredError(
+            f"{dataset.root}: history {history_id}: the keys of its seed {entry.seed} give another start of episode "
+            f"{episode}: other code made it; take dataset.reset_options, which needs no keys"
+        )
+    return {"key": np.asarray(jax.random.key_data(key)), "episode": number}
+
+
+def _key(dataset: Dataset, entry: Entry, episode: int) -> tuple[Key[Array, ""], int]:
+    """The key of the environment that an episode was played in, and the episode's number there."""
+    task = dataset.history_task(entry.history_id)
+    if entry.source == "noise":  # an environment for each episode
+        return noisy_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
+    ego = dataset.provenance.get(task.task_id, Provenance()).ego
+    if entry.source != "ppo" or ego is None:
+        raise NotStoredError(
+            f"{dataset.root}: history {entry.history_id}, source {entry.source}: its keys are not known; take "
+            f"dataset.reset_options, which needs none"
+        )
+    return stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx], episode

@@ -1,0 +1,245 @@
+"""A task as a Gymnasium environment: the ego's side of the game, with the teammate inside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, SupportsIndex, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from icrl4aht_data.benchmark.tasks import Task, parse_task
+from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.render import draw_frame
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.validation import check_int
+from icrl4aht_generation.adapters.arguments import check_action, check_integers, check_record
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.learners.rollout import policy_player
+from icrl4aht_generation.policy import Noise, Policy
+from icrl4aht_generation.teammates.instances import published_task
+from icrl4aht_generation.teammates.registry import build_teammate
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError as error:
+    reason = f"an environment for Gymnasium needs {error.name or error}: {install_command('gym')}"
+    raise ImportError(reason, name=error.name) from error
+
+RESET_OPTIONS = ("state", "key", "episode", "teammate_actions", "recipes")
+"""Names of the options of `TaskEnv.reset`."""
+
+
+class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
+    """The ego's side of a task; the task's teammate plays inside.
+
+    Observation: uint8 (5, 5, C), what the ego sees, as `icrl4aht_data.overcooked.observe.observe` describes.
+    Action: 0..5 (up, down, left, right, stay, interact).
+    Reward: the team's, without shaping.
+    End: never by itself. `gymnasium.make` adds a limit of 100 steps; give it another `max_episode_steps` to change it.
+    Info: `state`, the state record uint8 (S,); after a step also `teammate_action`, an int, and `shaped_rewards`,
+    float32 (2,), of ego and teammate. The ego of the benchmark does not see them.
+
+    Args:
+        task: the fields of a task, as in a line of a manifest; see `icrl4aht_data.benchmark.tasks.Task`.
+        suite: folder of learned teammates' checkpoints: a suite, or the folder `teammates` of a release.
+        noise: source of a heuristic teammate's randomness, see `icrl4aht_generation.policy.Noise`.
+        channels: the layout's own channels, or the canonical ones, which all layouts share.
+        render_mode: "rgb_array" for pictures, which need Pillow.
+
+    Raises:
+        TaskFormatError: for a malformed task, or parameters that its teammate does not have.
+        OptionError: for a checkpoint that is missing.
+        UnknownNameError: for a noise, channels or a render mode that does not exist.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - declared so by the base class
+
+    def __init__(
+        self,
+        task: Mapping[str, Any],
+        *,
+        suite: str | Path | None = None,
+        noise: Noise = "seeded",
+        channels: Channels = "own",
+        render_mode: str | None = None,
+    ) -> None:
+        for what, value, valid in (
+            ("noise", noise, get_args(Noise)),
+            ("channels", channels, CHANNELS),
+            ("render_mode", render_mode, (None, *self.metadata["render_modes"])),
+        ):
+            if value not in valid:
+                raise unknown(what, value, map(str, valid))
+        if not isinstance(task, Mapping):
+            raise TaskFormatError(
+                f"task = {task!r:.200}: expected the fields of a task by name, such as dataclasses.asdict(task), found "
+                f"{type(task).__name__}"
+            )
+        self.task: Task = parse_task(dict(task))
+        self.layout: Layout = self.task.layout
+        policy = build_teammate(
+            self.layout, self.task.teammate, TEAMMATE, noise, None if suite is None else Path(suite)
+        )
+        self._game = _compiled(self.layout, policy._replace(params=()), channels == "canonical")
+        self._params = policy.params
+        self.observation_space = spaces.Box(0, 255, observation_shape(self.layout, channels == "canonical"), np.uint8)
+        self.action_space = spaces.Discrete(len(ACTIONS))
+        self.render_mode = render_mode
+        self._moment: _Moment | None = None
+        self._script, self._recipes = np.empty(0, np.int32), np.empty(0, np.uint8)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.layout.name}, task {self.task.task_id})"
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: seed of the draws of this episode and those that follow.
+            options: all optional. `state`: uint8 (S,), the state record to start from instead of a drawn one.
+                `key`: uint32 (2,), data of the JAX key that the episode is drawn from, and `episode`: its number with
+                this key, 0 by default; see `icrl4aht_generation.env.Environment`. `teammate_actions`: integers (n,), actions
+                that the teammate repeats in the first n steps, whatever the ego does. `recipes`: uint8 (n,), item of
+                the recipe after each of the first n steps, if it changes in this step. `Dataset.reset_options` returns
+                those of a recorded episode.
+
+        Returns:
+            The first observation, and `info`.
+
+        Raises:
+            UnknownNameError, OptionError: for options that do not exist, or have impossible values.
+        """
+        super().reset(seed=seed)
+        given = dict(options or {})
+        for name in given:
+            if name not in RESET_OPTIONS:
+                raise unknown("option of reset", name, RESET_OPTIONS)
+        # Drawn in any case, so that an episode with options leaves those after it unchanged.
+        drawn = self.np_random.integers(0, 2**32, 2, dtype=np.uint32)
+        key = check_integers("key", given.get("key", drawn), np.uint32, 2**32 - 1, (2,))
+        record = None if (state := given.get("state")) is None else check_record(self.layout, state)
+        episode = check_int("episode", given.get("episode", 0), 0)
+        self._script = check_integers("teammate_actions", given.get("teammate_actions", ()), np.int32, len(ACTIONS) - 1)
+        self._recipes = check_integers("recipes", given.get("recipes", ()), np.uint8, 255)
+        if not np.isin(self._recipes, self.layout.recipe_items).all():
+            raise OptionError(
+                f"recipes: expected items of {self.layout.name}'s recipes, {self.layout.recipe_items.tolist()}, found "
+                f"{np.unique(self._recipes).tolist()}"
+            )
+        self._moment, observation = self._game.start(self._params, key, np.int32(episode), record)
+        return np.asarray(observation)[0], {"state": self.state}
+
+    def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Play one step with the ego's action 0..5, and the teammate's.
+
+        Returns:
+            Observation, reward, False, False and `info`; see the class.
+
+        Raises:
+            OptionError: before the first `reset`, and for an action that does not exist.
+        """
+        moment, number = self._started, check_action("action", action)
+        scripted = np.int32(self._script[0]) if len(self._script) else np.int32(-1)
+        recipe = self._recipes[0] if len(self._recipes) else np.uint8(0)
+        self._script, self._recipes = self._script[1:], self._recipes[1:]
+        played = self._game.step(self._params, moment, np.int32(number), scripted, recipe)
+        self._moment = played.after
+        info = {
+            "state": self.state,
+            "teammate_action": int(played.teammate_action),
+            "shaped_rewards": np.asarray(played.shaped)[0],
+        }
+        return np.asarray(played.observation)[0], float(played.reward[0]), False, False, info
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture of the state, uint8 (height, width, 3), or None without a render mode."""
+        return None if self.render_mode is None else draw_frame(self.layout, self.state)
+
+    @property
+    def state(self) -> np.ndarray:
+        """The state record uint8 (S,); see `icrl4aht_data.overcooked.state`."""
+        return np.array(self._started.env.record[0])
+
+    @property
+    def _started(self) -> _Moment:
+        if self._moment is None:
+            raise OptionError("the environment has not been started: call reset() first")
+        return self._moment
+
+
+def published_environment(layout: str, teammate: str, **options: Any) -> TaskEnv:
+    """Return the environment of a published test task; Gymnasium's ids of these tasks lead here.
+
+    Args:
+        layout: name of the layout.
+        teammate: family and number of the teammate, such as "H4/t0".
+        options: further options of `TaskEnv`.
+
+    Raises:
+        UnknownNameError: for a layout or teammate that does not exist.
+    """
+    return TaskEnv(asdict(published_task(layout, teammate)), **options)
+
+
+class _Moment(NamedTuple):
+    """A running episode, N = 1: the environment's state and the teammate's memory."""
+
+    env: EnvState
+    memory: Any
+
+
+class _Played(NamedTuple):
+    """Result of a step: float32 reward (1,) and shaped rewards (1, 2), observation uint8 (1, 5, 5, C)."""
+
+    after: _Moment
+    observation: UInt8[Array, "1 5 5 C"]
+    reward: Float[Array, " 1"]
+    shaped: Float[Array, "1 2"]
+    teammate_action: Int[Array, ""]
+
+
+class _Game(NamedTuple):
+    """Compiled functions of one layout and one family of teammates."""
+
+    start: Callable[..., tuple[_Moment, Array]]
+    step: Callable[..., _Played]
+
+
+@lru_cache(maxsize=16)
+def _compiled(layout: Layout, policy: Policy, canonical: bool) -> _Game:
+    env = Environment(layout)
+    teammate = lambda params: policy_player(env, policy, params, TEAMMATE, 1)  # noqa: E731
+
+    def start(params, key, episode, record: np.ndarray | None):
+        state = env.init(jnp.asarray(key)[None])
+        state = state._replace(episode=state.episode + episode)
+        drawn = env.first_record(state.key, state.episode)
+        state = state._replace(record=drawn if record is None else jnp.asarray(record)[None])
+        return _Moment(state, teammate(params).init(state)), observe(layout, state.record, EGO, canonical)
+
+    def step(params, moment: _Moment, action, scripted, recipe) -> _Played:
+        state = moment.env
+        # The key is not used: heuristics have keys of their own, and learned teammates act greedily.
+        choice, memory = teammate(params).act(moment.memory, state, jax.random.key(0))
+        other = jnp.where(scripted < 0, choice.action[0], scripted)
+        following = jnp.where(recipe == 0, env.next_recipe(state), recipe)
+        outcome = rules.step(layout, state.record, jnp.stack([action, other])[None], following)
+        after = _Moment(state._replace(clock=state.clock + 1, record=outcome.state), memory)
+        seen = observe(layout, outcome.state, EGO, canonical)
+        return _Played(after, seen, outcome.reward, outcome.shaped, other)
+
+    return _Game(jax.jit(start), jax.jit(step))

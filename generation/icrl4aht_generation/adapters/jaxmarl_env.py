@@ -1,0 +1,171 @@
+"""The environment of a layout with the interface of JaxMARL."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
+
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS
+from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import observe_both
+from icrl4aht_data.overcooked.state import unpack
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.validation import check_int
+from icrl4aht_generation.env import Environment, EnvState
+
+try:
+    from jaxmarl.environments import spaces
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
+    from jaxmarl.environments.overcooked_v2.common import DynamicObject
+except ImportError as error:
+    reason = f"an environment for JaxMARL needs {error.name or error}: {install_command('jaxmarl')}"
+    raise ImportError(reason, name=error.name) from error
+
+
+@struct.dataclass
+class JaxMARLState:
+    """State of one environment, without a batch axis.
+
+    Attributes:
+        key: uint32 (2,), data of the key that the episode is drawn from.
+        step: int32 (), steps taken in the episode.
+        done: bool (), whether the episode has ended.
+        record: uint8 (S,), the state record; see `icrl4aht_data.overcooked.state`.
+        recipe: int32 (), the current recipe as JaxMARL's OvercookedV2 encodes it, for its wrapper of logs.
+    """
+
+    key: UInt32[Array, " 2"]
+    step: Int[Array, ""]
+    done: Bool[Array, ""]
+    record: UInt8[Array, " S"]
+    recipe: Int[Array, ""]
+
+
+class JaxMARLEnv(MultiAgentEnv):
+    """Both agents of a layout, as a `MultiAgentEnv` for JaxMARL's learners and wrappers.
+
+    Agents: "agent_0", the ego, and "agent_1", the teammate.
+    Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
+    Action: 0..5 of each agent (up, down, left, right, stay, interact), which is not JaxMARL's order.
+    Reward: float32, the team's, equal for both.
+    End: `done` of both agents after `max_steps` steps; `step` then starts the next episode, as in all of JaxMARL.
+    Info: `shaped_reward` of each agent, as JaxMARL's OvercookedV2 has it; not part of the reward.
+
+    Args:
+        layout: name of the layout.
+        max_steps: steps of an episode: 400 in training, 100 in evaluation.
+        channels: the layout's own channels, or the canonical ones, which all layouts share.
+
+    Attributes:
+        possible_recipes: int32 (R, 3), the ingredient ids of each recipe, which JaxMARL's wrapper of logs reads.
+
+    Raises:
+        UnknownNameError: for a layout or channels that do not exist.
+        OptionError: for a number of steps below 1.
+    """
+
+    def __init__(self, layout: str, *, max_steps: int = EPISODE_STEPS, channels: Channels = "own") -> None:
+        if channels not in CHANNELS:
+            raise unknown("channels", channels, CHANNELS)
+        super().__init__(num_agents=2)
+        self.layout = get_layout(layout)
+        self.max_steps = check_int("max_steps", max_steps, 1)
+        self._canonical = channels == "canonical"
+        self._environment = Environment(self.layout)
+        self.possible_recipes = jnp.array(self.layout.recipes, jnp.int32)
+        self._recipe_items = jnp.array(self.layout.recipe_items)
+        self._recipe_codes = jax.vmap(DynamicObject.get_recipe_encoding)(self.possible_recipes)
+        self._observed = spaces.Box(0, 255, observation_shape(self.layout, self._canonical), jnp.uint8)
+        self._played = spaces.Discrete(len(ACTIONS))
+        self.observation_spaces = dict.fromkeys(self.agents, self._observed)
+        self.action_spaces = dict.fromkeys(self.agents, self._played)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.layout.name}, episodes of {counted_noun(self.max_steps, 'step')})"
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: Key[Array, ""] | UInt32[Array, " 2"]) -> tuple[dict[str, UInt8[Array, "5 5 C"]], JaxMARLState]:
+        """Returns the first observations and the state of an episode, a function of the key."""
+        data = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+        record = self._environment.init(data[None]).record[0]
+        state = JaxMARLState(data, jnp.int32(0), jnp.bool_(False), record, self._recipe_code(record))
+        return self.get_obs(state), state
+
+    def step_env(  # type: ignore[override]
+        self, key: Key[Array, ""] | UInt32[Array, " 2"], state: JaxMARLState, actions: dict[str, Int[Array, ""]]
+    ) -> tuple[
+        dict[str, UInt8[Array, "5 5 C"]],
+        JaxMARLState,
+        dict[str, Float[Array, ""]],
+        dict[str, Bool[Array, ""]],
+        dict[str, Any],
+    ]:
+        """Returns observations, state, rewards, dones and infos after a step, without a reset.
+
+        Args:
+            key: not used: the key of the episode decides everything random.
+            state: the state before the step.
+            actions: an action of each agent.
+        """
+        both = jnp.stack([jnp.asarray(actions[agent], jnp.int32) for agent in self.agents])
+        running = EnvState(
+            jax.random.wrap_key_data(state.key)[None], jnp.zeros(1, jnp.int32), state.step[None], state.record[None]
+        )
+        recipe = self._environment.next_recipe(running)
+        outcome = rules.step(self.layout, running.record, both[None], recipe)
+        ended = state.step + 1 >= self.max_steps
+        record = outcome.state[0]
+        after = JaxMARLState(state.key, state.step + 1, ended, record, self._recipe_code(record))
+        shaped = dict(zip(self.agents, outcome.shaped[0], strict=True))
+        dones = dict.fromkeys((*self.agents, "__all__"), ended)
+        rewards: dict[str, Any] = dict.fromkeys(self.agents, outcome.reward[0])
+        return self.get_obs(after), after, rewards, dones, {"shaped_reward": shaped}
+
+    def _recipe_code(self, record: UInt8[Array, " S"]) -> Int[Array, ""]:
+        """Returns JaxMARL's encoding of a record's recipe."""
+        return self._recipe_codes[jnp.argmax(self._recipe_items == unpack(self.layout, record).recipe)]
+
+    def get_obs(  # type: ignore[override]
+        self, state: JaxMARLState
+    ) -> dict[str, UInt8[Array, "5 5 C"]]:
+        """Returns the observation of each agent."""
+        return dict(zip(self.agents, observe_both(self.layout, state.record, self._canonical), strict=True))
+
+    def get_avail_actions(  # type: ignore[override]
+        self, state: JaxMARLState
+    ) -> dict[str, Bool[Array, " 6"]]:
+        """Returns for each agent that every action is available."""
+        return dict.fromkeys(self.agents, jnp.ones(len(ACTIONS), bool))
+
+    def observation_space(self, agent: str = "") -> spaces.Box:
+        """Returns the space of observations, the same for both agents; JaxMARL's learners ask without an agent."""
+        return self._observed
+
+    def action_space(self, agent: str = "") -> spaces.Discrete:
+        """Returns the space of actions, the same for both agents."""
+        return self._played
+
+    @property
+    def name(self) -> str:
+        """Name of the environment, with that of its layout."""
+        return f"icrl4aht_{self.layout.name}"
+
+    @property
+    def num_actions(self) -> int:
+        """Number of actions."""
+        return len(ACTIONS)
+
+    @property
+    def agent_classes(self) -> dict[str, list[str]]:
+        """The agents by class: both are chefs."""
+        return {"chef": list(self.agents)}

@@ -1,0 +1,397 @@
+"""Commands of `icrl4aht-data`: they parse, call, and print."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
+from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
+from icrl4aht_data.commands.options import (
+    COUNT,
+    LAYOUT,
+    SEED,
+    SETTINGS,
+    Folder,
+    Names,
+    Sections,
+    bars,
+    examples,
+    json_option,
+    overwrite_option,
+    run,
+    version_option,
+)
+from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.format.schema import KINDS, Kind
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
+from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.progress import progress_bars
+from icrl4aht_generation.teammates.instances import published_tasks
+
+if TYPE_CHECKING:
+    from icrl4aht_generation.profiles import Profile  # loads JAX
+
+console = Console(soft_wrap=True)
+
+_profile_option = click.option(
+    "--profile",
+    "profile_name",
+    default="smoke",
+    metavar="PROFILE",
+    help="smoke, noise, small, mini, cpu or paper, or a TOML file.",
+)
+
+_ego_options = dataclass_options(
+    PPOConfig,
+    "ego",
+    default_text={field.name: "the profile's" for kind in (PPOConfig, Widths) for field in fields(kind)},
+)
+"""One option for every hyper-parameter of the egos; those given replace the profile's."""
+
+_threads_option = click.option(
+    "--xla-threads",
+    type=COUNT,
+    help="Threads of one XLA operation on a CPU; other numbers give other bits.",
+    show_default="the profile's, else all cores",
+)
+
+_SECTIONS = {
+    "Rebuild": ("plan", "generate", "check"),
+    "Learned teammates": ("teammates", "diversity"),
+    "Maintain": ("speed", "draws", "manifests"),
+}
+
+
+@click.group(
+    cls=Sections,
+    sections=_SECTIONS,
+    context_settings=SETTINGS,
+    epilog=examples(
+        "icrl4aht-data plan --profile mini",
+        "icrl4aht-data generate --profile smoke --out build/smoke",
+        "icrl4aht-data teammates --profile mini --layout cramped_up",
+    ),
+)
+@version_option
+def cli() -> None:
+    """Rebuild the ICRL4AHT dataset from the environment and the teammates.
+
+    Needs the extra generation. The same program is installed as icrl4aht-data. Finished work is kept: the same
+    command resumes a stopped one. Exit codes: 0 done, 1 a failure or a difference, 2 a misused command.
+    """
+
+
+@cli.command(
+    epilog=examples(
+        "icrl4aht-data generate --profile smoke --out build/smoke",
+        "icrl4aht-data generate --profile mini --out build/mini --kind lite --kind full",
+        "icrl4aht-data generate --profile paper --out build/paper --executor ray",
+    )
+)
+@_profile_option
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write artefacts and releases here.")
+@click.option(
+    "--kind",
+    type=click.Choice(KINDS),
+    multiple=True,
+    default=("lite",),
+    help="Kind of release, written to OUT/KIND; repeat for more.",
+)
+@click.option(
+    "--suite", type=Folder(), metavar="FOLDER", help="Folder of the learned teammates.", show_default="OUT/suite"
+)
+@click.option("--seed", type=SEED, default=0, help="Seed of the learned teammates.")
+@click.option(
+    "--tasks",
+    "task_file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, each of the source that the release "
+    "names, and train no teammates: --suite is a suite that has them, or the release's folder teammates.",
+    show_default="the profile's tasks",
+)
+@click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
+@_threads_option
+@dataclass_options(CollectOptions, "collect")
+@_ego_options
+def generate(
+    profile_name: str,
+    out: Path,
+    kind: tuple[Kind, ...],
+    suite: Path | None,
+    seed: int,
+    task_file: Path | None,
+    bundle: bool,
+    xla_threads: int | None,
+    collect: dict[str, Any],
+    ego: dict[str, Any],
+) -> None:
+    """Rebuild a release, or resume a rebuild.
+
+    Trains the learned teammates of a profile, then collects its tasks into OUT/artefacts: egos that learn (source ppo),
+    noise histories (source noise), or both. Packs the release OUT/lite or OUT/full. Unfinished work resumes from its
+    last save. This process trains the teammates, the executor collects the tasks. Tasks that fail are listed in
+    OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1. Hyper-parameters of the egos
+    replace those of the profile.
+    """
+    from icrl4aht_generation.releases.build import build_releases
+    from icrl4aht_generation.releases.package import bundle_release, recorded_sources
+
+    if bundle and "lite" not in kind:
+        raise click.UsageError("--bundle needs --kind lite")
+    options = replace_given(CollectOptions(), collect)
+    if options.executor == "local" and (options.address or options.workers):
+        raise click.UsageError("--address and --workers need --executor ray")
+    request_determinism()
+    if options.executor == "ray":
+        allocate_gpu_memory_on_demand()
+    profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
+    tasks = read_tasks(task_file) if task_file else None
+    sources = recorded_sources(task_file.parent.parent) if task_file else {}
+    built = build_releases(profile, out, kind, console, options, suite, seed, tasks, sources)
+    releases = dict(zip(kind, built, strict=True))
+    for release in releases.values():
+        console.print(f"release: {release}")
+    if bundle:
+        console.print(f"bundled: {bundle_release(releases['lite'])}")
+
+
+def _profile_with_threads(name: str, threads: int | None) -> Profile:
+    """A profile by name, with XLA limited to its threads or to the given number."""
+    from icrl4aht_generation.learners.resume import limit_xla_threads
+    from icrl4aht_generation.profiles import load_profile
+
+    def limit(profile: Profile) -> None:
+        if threads or profile.xla_threads:
+            limit_xla_threads(threads or profile.xla_threads or 1)
+
+    profile = load_profile(name, limit)
+    return replace(profile, xla_threads=threads) if threads else profile
+
+
+@cli.command()
+@_profile_option
+@click.option("--devices", type=COUNT, default=8, help="Also estimate the hours on this many devices.")
+@json_option
+@_ego_options
+def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) -> None:
+    """Estimate the cost of a rebuild.
+
+    Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
+    """
+    from icrl4aht_generation.planning.plan import estimate_cost
+
+    with bars() as show:
+        profile = _profile_with_threads(profile_name, None).with_ego(ego)
+        cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, f": {what}"))
+    if as_json:
+        click.echo(json.dumps(cost.to_json(), indent=2))
+    else:
+        for name, value in cost.rows():
+            click.echo(f"{name:<28} {value}")
+
+
+@cli.command(epilog=examples("icrl4aht-data check build/smoke build/again"))
+@click.argument("a", type=Folder())
+@click.argument("b", type=Folder())
+@json_option
+def check(a: Path, b: Path, as_json: bool) -> None:
+    """Compare two rebuilds bit for bit.
+
+    A and B are releases, artefacts, or folders that `generate` wrote. Prints the differences, and exits with 1 if
+    there are any. Writes nothing.
+    """
+    from icrl4aht_generation.releases.check import compare_rebuilds
+
+    compared = compare_rebuilds(a, b)
+    if as_json:
+        click.echo(json.dumps(compared.to_json(), indent=2))
+    else:
+        for name, difference in compared.differences.items():
+            click.echo(f"{name}: {difference}")
+        verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+        for folder, threads in zip((a, b), compared.xla_threads, strict=True):
+            numbers = " and ".join(map(str, threads)) or "an unknown number of"
+            click.echo(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
+        click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
+    sys.exit(1 if compared.differences else 0)
+
+
+@cli.command()
+@_profile_option
+@click.option("--layout", type=LAYOUT, default="demo_wide", help="Layout to measure on.")
+@_ego_options
+def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
+    """Measure how fast a profile's ego learns.
+
+    Prints one JSON line: steps/s, and the shares of environment, forward pass and update. Writes nothing.
+    """
+    from icrl4aht_generation.planning.plan import task_learner
+    from icrl4aht_generation.planning.speed import learner_speed
+
+    name = get_layout(layout).name
+    profile = _profile_with_threads(profile_name, None).with_ego(ego)
+    measured = learner_speed(task_learner(profile, profile.ego_on(name), name))
+    click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
+
+
+@cli.command()
+@click.option("--check", is_flag=True, help="Write nothing; exit with 1 if the files differ.")
+@click.option(
+    "--out", type=Folder(), metavar="FOLDER", help="Write the manifests here.", show_default="the package's folder"
+)
+@overwrite_option
+def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
+    """Write the manifests of test, validation and diverse tasks.
+
+    Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
+    TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured. Files that have these tasks are kept.
+    """
+    from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
+
+    made = [(manifest_path(track, "test"), published_tasks(track)) for track in TRACKS]
+    made += [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
+    made += [
+        (manifest_path(track, split, "diverse"), diverse_tasks(track, split))
+        for track in TRACKS
+        for split in ("train", "validation")
+    ]
+    for path, tasks in made:
+        path = out / path.name if out else path
+        if check or path.is_file():
+            different = read_tasks(path) != tasks
+            if different and (check or not overwrite):
+                remedy = "run `icrl4aht-data research manifests --overwrite`" if check else "replace it by --overwrite"
+                raise TaskFormatError(f"{path}: differs from the parameter sets or draws; {remedy}")
+        if not check:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(path) as partial:
+                write_tasks(partial, tasks)
+        console.print(f"{path}: {len(tasks)} tasks")
+
+
+@cli.command(epilog=examples("icrl4aht-data research draws --layout demo_wide --out draws.jsonl"))
+@click.option(
+    "--layout", "layouts", type=LAYOUT, multiple=True, help="Training layout; repeat for more.", show_default="all"
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Write the table here.",
+    show_default="the package's file",
+)
+@click.option("--overwrite", is_flag=True, help="Measure again what the table has.")
+def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
+    """Measure the heuristic teammates that tasks may draw.
+
+    Draws parameters from the training ranges and diverse ones, of each 32 for training and 8 for validation of each
+    family on each layout. Writes for each draw which test instance acts most like it, and what the egos stay, random
+    and oracle earn with it. Layouts that the table has are kept, so that a stopped command resumes.
+    """
+    from icrl4aht_generation.teammates.draws import DRAWS_TABLE
+    from icrl4aht_generation.teammates.measuring import fill_draws_table
+
+    names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
+    for name in names:
+        if name not in TESTED_ON:
+            raise unknown("training layout", name, TESTED_ON)
+    path = out or DRAWS_TABLE
+    with progress_bars(console) as bars:
+        bar = bars.add_task("draws", total=len(names), note="", unit="layouts")
+        fill_draws_table(path, names, lambda done, name: bars.update(bar, completed=done, note=name), overwrite)
+    console.print(f"wrote {path}")
+
+
+def _layouts_option(default_text: str) -> Callable[[Any], Any]:
+    return click.option(
+        "--layout", "layouts", type=LAYOUT, multiple=True, help="Layout; repeat for more.", show_default=default_text
+    )
+
+
+_algorithms_option = click.option(
+    "--algorithm",
+    "algorithms",
+    type=Names("algorithm", lambda: ALGORITHMS),
+    multiple=True,
+    default=ALGORITHMS,
+    help="fcp, brdiv, lbrdiv or comedi; repeat for more.",
+    show_default="all",
+)
+
+
+@cli.command(epilog=examples("icrl4aht-data teammates --profile mini --layout cramped_up --algorithm fcp"))
+@_profile_option
+@_layouts_option("the profile's")
+@_algorithms_option
+@click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write the populations here.")
+@click.option("--seed", type=SEED, default=0, help="Seed of their training.")
+@_threads_option
+def teammates(
+    profile_name: str,
+    layouts: tuple[str, ...],
+    algorithms: tuple[str, ...],
+    suite: Path,
+    seed: int,
+    xla_threads: int | None,
+) -> None:
+    """Train populations of teammates.
+
+    Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by their returns, and writes
+    tasks with the remaining ones, SUITE/manifests. Finished populations are kept. Without --layout, trains the
+    populations of the profile, or all algorithms on its layouts if it names none.
+    """
+    from icrl4aht_generation.populations.build import build_suite
+
+    request_determinism()
+    profile = _profile_with_threads(profile_name, xla_threads)
+    if layouts:
+        wanted = dict.fromkeys((get_layout(name).name for name in layouts), algorithms)
+    else:
+        available = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
+        wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}
+        if not any(wanted.values()):
+            raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: name a --layout")
+    build_suite(profile, suite, wanted, seed, console)
+
+
+@cli.command()
+@_layouts_option("all that are finished")
+@_algorithms_option
+@click.option(
+    "--suite",
+    type=Folder(),
+    metavar="FOLDER",
+    default="build/suite",
+    help="Folder that `teammates` wrote.",
+)
+@click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
+@click.option("--out", type=Folder(), metavar="FOLDER", help="Draw the pictures here.", show_default="SUITE")
+@overwrite_option
+def diversity(
+    layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool, out: Path | None, overwrite: bool
+) -> None:
+    """Report how much the teammates of a suite differ.
+
+    Prints self-play and cross-play returns of each population and the Hamming distances of all teammates, and draws
+    them into OUT/LAYOUT.
+    """
+    from icrl4aht_generation.populations.build import report_diversity
+
+    report_diversity(suite, layouts, algorithms, greedy, console, out, overwrite)
+
+
+def main() -> None:
+    """Entry point of `icrl4aht-data` and `icrl4aht-data`."""
+    run(cli, extra="generation")

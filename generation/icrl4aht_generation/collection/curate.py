@@ -1,0 +1,186 @@
+"""Selects streams of a task and labels them with expert actions (paper, App. F.1 and App. D.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.format.provenance import StreamFilter, StreamReturns
+from icrl4aht_data.format.schema import curve_ends, stream_score
+from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.plotting import plot_curves
+from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+
+
+def stream_returns(rewards: np.ndarray) -> np.ndarray:
+    """float64 (N, E): returns of every episode's kept steps.
+
+    Args:
+        rewards: int8 (N, T).
+    """
+    return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
+
+
+def best_streams(returns: np.ndarray, keep: int, least_improvement: float | None = None) -> np.ndarray:
+    """int (n,), n <= keep: numbers of the streams with the highest end + improvement, best first, ties by number.
+
+    Args:
+        returns: (N, E), episode returns of a learner's streams.
+        keep: how many at most.
+        least_improvement: only streams whose end exceeds their start by this; None for all.
+    """
+    start, end = curve_ends(returns)
+    order = np.argsort(-stream_score(returns), kind="stable")
+    if least_improvement is not None:
+        order = order[(end - start)[order] >= least_improvement]
+    return order[:keep]
+
+
+def select_streams(
+    returns: Sequence[np.ndarray], keep: int, least_improvement: float | None = None
+) -> list[np.ndarray]:
+    """Streams of each of a task's learners, `keep` of all together, see `best_streams`.
+
+    The learners have as many as each other where they have enough: every turn each learner gives its next best stream,
+    and the learners whose streams are better give theirs first.
+
+    Args:
+        returns: for each learner (N, E), episode returns of its streams.
+        keep: how many in all at most.
+        least_improvement: only streams whose end exceeds their start by this; None for all.
+
+    Returns:
+        for each learner int (n,), best first; the sum of all n is at most `keep`.
+    """
+    candidates = [best_streams(of_learner, keep, least_improvement) for of_learner in returns]
+    turns = [
+        (turn, -float(stream_score(returns[learner][[stream]])[0]), learner)
+        for learner, streams in enumerate(candidates)
+        for turn, stream in enumerate(streams)
+    ]
+    chosen = [learner for _, _, learner in sorted(turns)[:keep]]
+    return [streams[: chosen.count(learner)] for learner, streams in enumerate(candidates)]
+
+
+def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
+    """Mean returns at the start and at the end of learning, before the filter and after it.
+
+    Args:
+        before: (N, E), episode returns of all streams.
+        after: (n, E), those of the selected streams.
+        least_improvement: what the selected streams had to improve by.
+    """
+    sides = []
+    for part in (before, after):
+        start, end = (round(float(values.mean()), 3) for values in curve_ends(part))
+        sides.append(StreamReturns(len(part), start, end))
+    return StreamFilter(before=sides[0], after=sides[1], least_improvement=least_improvement)
+
+
+def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -> None:
+    """Draw the learning curves of all streams, returns (N, E), and of the selected ones, (n, E), into a PNG."""
+    sides = {f"before: {len(before)} streams": before, f"after: {len(after)} streams": after}
+    plot_curves(path, [(title, {label: returns for label, returns in sides.items() if len(returns)})])
+
+
+def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields a policy's most probable action at every step of each stream.
+
+    The recurrent state is zero at the start of each episode, as in training.
+
+    Args:
+        layout: the layout.
+        network: the ego's network.
+        params: parameters of the checkpoint that labels.
+        states: uint8 (T, S) for each stream.
+
+    Yields:
+        int8 (T,) for each stream.
+    """
+    greedy = _compiled_greedy(layout, network.widths)
+    for stream in states:
+        yield _by_step(greedy(params, _by_episode(stream)))
+
+
+def oracle_labels(layout: Layout, states: Iterable[np.ndarray], actions: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields the scripted oracle's action at every step of each stream.
+
+    The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
+    took, and says at each state what it would do now.
+
+    Args:
+        layout: the layout.
+        states: uint8 (T, S) for each stream.
+        actions: int8 (T,) for each stream, the ego's.
+
+    Yields:
+        int8 (T,) for each stream.
+    """
+    follow = _compiled_oracle(layout)
+    for stream, taken in zip(states, actions, strict=True):
+        yield _by_step(follow(_by_episode(stream), _by_episode(taken)))
+
+
+def _by_episode(stream: np.ndarray) -> jax.Array:
+    """(T, ...) -> (100, E, ...)."""
+    return jnp.asarray(stream.reshape(-1, KEPT_STEPS, *stream.shape[1:]).swapaxes(0, 1))
+
+
+def _by_step(labels: jax.Array) -> np.ndarray:
+    """(100, E) -> (T,)."""
+    return np.asarray(labels).swapaxes(0, 1).reshape(-1)
+
+
+@lru_cache(maxsize=8)
+def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array], jax.Array]:
+    """A function of parameters and records (100, E, S) to greedy actions, int8 (100, E); for all egos of a layout."""
+    network = ActorCritic(widths)
+
+    @jax.jit
+    def greedy(params: Any, records: jax.Array) -> jax.Array:
+        steps, episodes, _ = records.shape
+        reset = jnp.zeros((steps, episodes), bool)
+        result: Any = network.apply(params, network.initial_hidden(episodes), observe(layout, records, EGO), reset)
+        return jnp.argmax(result[1], axis=-1).astype(jnp.int8)
+
+    return greedy
+
+
+@lru_cache(maxsize=8)
+def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """A function of records (100, E, S) and the ego's actions (100, E) to the oracle's actions, int8 (100, E)."""
+    return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
+
+
+def follow_oracle(layout: Layout, records: jax.Array, taken: jax.Array) -> jax.Array:
+    """Returns what the scripted oracle would do in each state of episodes in which another ego acted.
+
+    Args:
+        layout: the layout.
+        records: uint8 (T, E, S), state records of E episodes.
+        taken: int (T, E), the ego's actions.
+
+    Returns:
+        int32 (T, E).
+    """
+    script, key = oracle(layout), jax.random.key(0)  # which draws nothing
+    act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
+
+    def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+        record, action = now
+        wanted, memory = act((), memory, record, key)
+        return memory._replace(action=action.astype(jnp.int32)), wanted
+
+    memory = jax.vmap(lambda _: script.init((), key))(jnp.arange(records.shape[1]))
+    return jax.lax.scan(step, memory, (records, taken))[1]

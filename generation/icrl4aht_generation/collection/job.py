@@ -1,0 +1,97 @@
+"""The job that every executor runs for a unit of work, and its outcome."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol
+
+from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_generation.collection.noise import is_noise_finished, run_noise
+from icrl4aht_generation.collection.task import UpdateCallback, run_task
+from icrl4aht_generation.collection.task_folder import is_task_finished
+from icrl4aht_generation.learners.resume import BusyError
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.work import Work
+
+
+class CollectionError(Icrl4ahtError):
+    """Some tasks have no finished artefact."""
+
+
+class Run(Protocol):
+    """Makes an artefact, see `task.run_task`."""
+
+    def __call__(
+        self, work: Work, profile: Profile, folder: Path, on_update: UpdateCallback, *, suite: Path | None, wait: bool
+    ) -> bool: ...
+
+
+class IsFinished(Protocol):
+    """Returns whether a folder has the artefact, see `task_folder.is_task_finished`."""
+
+    def __call__(self, folder: Path, work: Work, profile: Profile) -> bool: ...
+
+
+class Collector(NamedTuple):
+    """Functions of one source: to record the histories of a task, and to check whether they are complete."""
+
+    run: Run
+    is_finished: IsFinished
+
+
+def collector(source: str) -> Collector:
+    """Returns the functions that record the histories of a source."""
+    return {"ppo": Collector(run_task, is_task_finished), "noise": Collector(run_noise, is_noise_finished)}[source]
+
+
+@dataclass(frozen=True)
+class TaskOutcome:
+    """Result of a unit of work.
+
+    Attributes:
+        work: the unit.
+        status: "done", now or before; "busy", another collector works on it; "failed".
+        attempts: how often it was tried.
+        error: type and message of the last error.
+        trace: its traceback.
+    """
+
+    work: Work
+    status: Literal["done", "busy", "failed"]
+    attempts: int = 1
+    error: str = ""
+    trace: str = ""
+
+
+@dataclass(frozen=True)
+class CollectionJob:
+    """Collects single units of work; it is called in this process or in a worker's.
+
+    Attributes:
+        profile: the profile of all tasks.
+        artefacts: folder of all artefacts.
+        suite: folder of the learned teammates, if the tasks have any.
+        wait: whether to wait for other collectors instead of reporting "busy".
+    """
+
+    profile: Profile
+    artefacts: Path
+    suite: Path | None
+    wait: bool
+
+    def folder(self, work: Work) -> Path:
+        """Folder of the artefact."""
+        return self.artefacts / work.name
+
+    def is_finished(self, work: Work) -> bool:
+        """Whether the artefact is complete and unchanged."""
+        return collector(work.source).is_finished(self.folder(work), work, self.profile)
+
+    def __call__(self, work: Work, on_update: UpdateCallback = lambda update, metrics: None) -> Literal["done", "busy"]:
+        try:
+            run = collector(work.source).run
+            run(work, self.profile, self.folder(work), on_update, suite=self.suite, wait=self.wait)
+        except BusyError:
+            return "busy"
+        return "done"

@@ -1,0 +1,128 @@
+"""Tasks on Ray, which schedules them, assigns a GPU to each if there are any, and retries failed ones.
+
+A Ray that is started here listens on 127.0.0.1 only, without dashboard and usage reports.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.text import Text
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_generation.collection.job import CollectionJob, TaskOutcome
+from icrl4aht_generation.collection.options import CollectOptions, request_determinism
+from icrl4aht_generation.collection.task_folder import last_timing
+from icrl4aht_generation.learners.resume import limit_xla_threads
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.progress import ProgressBoard
+
+_POLL_SECONDS = 1.0
+_CONNECT_SECONDS = 10.0
+_OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the disk; nothing large passes through Ray
+
+
+def run_on_ray(
+    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+) -> Generator[TaskOutcome]:
+    """Runs tasks as workers are free. The artefacts' folder must be shared by all machines.
+
+    Raises:
+        OptionError: if Ray is not installed, or cannot be reached.
+    """
+    if not tasks:
+        return
+    with _connected(options) as ray:
+        accelerated = ray.cluster_resources().get("GPU", 0) > 0
+        remote = ray.remote(
+            num_cpus=1,
+            num_gpus=int(accelerated),
+            max_calls=1,  # a process for each task, so that its memory is released
+            max_retries=options.retries,
+            retry_exceptions=True,
+        )(_work)
+        pending = {remote.remote(job, work): work for work in tasks}
+        try:
+            while pending:
+                ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
+                for reference in ready:
+                    yield _outcome(ray, reference, pending.pop(reference), options)
+                _show_progress(job, pending.values(), board)
+        finally:
+            for reference in pending:
+                ray.cancel(reference, force=True)
+
+
+def _show_progress(job: CollectionJob, tasks: Iterable[Work], board: ProgressBoard) -> None:
+    for work in tasks:  # workers report through their artefacts' timing files
+        timing = last_timing(job.folder(work))
+        if timing:
+            board.show_running(work.name, int(timing["update"]) + 1, timing["steps_per_second"])
+
+
+def _work(job: CollectionJob, work: Work) -> str:
+    request_determinism()
+    if job.profile.xla_threads:
+        limit_xla_threads(job.profile.xla_threads)
+    return job(work)
+
+
+def _outcome(ray: Any, reference: Any, work: Work, options: CollectOptions) -> TaskOutcome:
+    try:
+        return TaskOutcome(work, ray.get(reference))
+    except ray.exceptions.RayError as error:  # raised by the task, or the worker died
+        cause = getattr(error, "cause", error)
+        trace = Text.from_ansi(str(error)).plain
+        return TaskOutcome(work, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
+
+
+def _check_reachable(address: str | None) -> None:
+    """Raise an error if nothing listens at HOST:PORT; Ray itself would wait for minutes."""
+    host, _, port = (address or "").rpartition(":")
+    if not host or "/" in host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise OptionError(
+            f"Ray at {address} cannot be reached: {error}; check the address, and `ray status`"
+        ) from error
+
+
+@contextmanager
+def _connected(options: CollectOptions) -> Iterator[Any]:
+    if options.address is None:
+        # Read when Ray is first imported. The name is misleading: this makes Ray's servers listen on the loopback
+        # address.
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    elif options.workers is not None:
+        raise OptionError(f"workers = {options.workers}: the Ray at {options.address} has its own")
+    try:
+        import ray
+    except ImportError as error:
+        raise OptionError(f"the executor ray needs Ray: {install_command('cluster')}") from error
+    _check_reachable(options.address)
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    try:
+        if options.address is None:
+            ray.init(
+                address="local",
+                num_cpus=options.workers,  # all cores by default; GPUs are found by Ray
+                include_dashboard=False,
+                object_store_memory=_OBJECT_STORE_BYTES,
+                **quiet,
+            )
+        else:
+            ray.init(address=options.address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise OptionError(f"Ray at {options.address or 'this machine'} cannot be reached: {error}") from error
+    try:
+        yield ray
+    finally:
+        ray.shutdown()

@@ -1,0 +1,148 @@
+"""All tasks of a rebuild, in this process or on Ray. Failures are logged, and the other tasks continue."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+from rich.console import Console
+
+from icrl4aht_generation.collection.failures import FAILED, FailureLog
+from icrl4aht_generation.collection.job import CollectionError, CollectionJob, TaskOutcome
+from icrl4aht_generation.collection.options import CollectOptions
+from icrl4aht_generation.collection.ray_executor import run_on_ray
+from icrl4aht_generation.collection.task_folder import last_timing
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.progress import ProgressBoard
+
+
+class Executor(Protocol):
+    """Runs tasks in any order; closing the generator cancels those that are not done."""
+
+    def __call__(
+        self, job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+    ) -> Generator[TaskOutcome]: ...
+
+
+def run_in_process(
+    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+) -> Generator[TaskOutcome]:
+    """Runs one task after the other."""
+    for work in tasks:
+        yield _attempt(job, work, board, options.retries + 1)
+
+
+def _attempt(job: CollectionJob, work: Work, board: ProgressBoard, attempts: int) -> TaskOutcome:
+    def on_update(update: int, metrics: dict[str, float]) -> None:
+        board.show_running(work.name, update + 1, metrics["steps_per_second"])
+
+    outcome = TaskOutcome(work, "failed")
+    for attempt in range(1, attempts + 1):
+        try:
+            return TaskOutcome(work, job(work, on_update), attempt)
+        except Exception as error:  # whatever it is, the other tasks continue
+            outcome = TaskOutcome(work, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
+    return outcome
+
+
+def collect_tasks(
+    tasks: Sequence[Work],
+    profile: Profile,
+    out: Path,
+    console: Console,
+    options: CollectOptions,
+    suite: Path | None = None,
+) -> None:
+    """Make every artefact under out/artefacts.
+
+    Tasks that another collector works on are left to it, and waited for at the end.
+
+    Args:
+        tasks: the units of work.
+        profile: their profile.
+        out: folder of the rebuild.
+        console: where progress is printed.
+        options: how to collect.
+        suite: folder of the learned teammates, if the tasks have any.
+
+    Raises:
+        CollectionError: if an artefact is missing at the end; out/failed.jsonl has the reasons.
+    """
+    job = CollectionJob(profile, out / "artefacts", suite, wait=False)
+    todo = []
+    for work in tasks:
+        if job.is_finished(work):
+            console.print(f"{_label(work, tasks)}: finished before")
+        else:
+            todo.append(work)
+    missing = {work.name for work in todo}
+    failures, last_error = FailureLog(out / FAILED), ""
+    with (
+        ProgressBoard(console, {work.name: profile.updates(work) for work in todo}) as board,
+        closing(_run_all(job, todo, board, options)) as outcomes,
+    ):
+        for outcome in outcomes:
+            label = _label(outcome.work, tasks)
+            if outcome.status == "busy":
+                console.print(f"{label}: another collector works on it")
+                continue
+            board.show_ended(outcome.work.name)
+            console.print(f"{label}: {_describe(outcome, job.folder(outcome.work))}")
+            if outcome.status == "done":
+                missing.remove(outcome.work.name)
+                failures.forget([outcome.work.name])
+                continue
+            failures.add(outcome)
+            last_error = outcome.error
+            if options.fail_fast:
+                raise CollectionError(f"{failures.path}: the first failure: {outcome.error}")
+    failures.forget({work.name for work in tasks} - missing)
+    if missing:
+        reasons = f"{failures.path} has the reasons"
+        if not failures.is_written:
+            reasons = f"{failures.path} cannot be written, the disk is full; the last failure: {last_error}"
+        raise CollectionError(
+            f"{len(missing)} of {len(tasks)} tasks have no artefact: {', '.join(sorted(missing))}; {reasons}, and the "
+            f"same command tries them again"
+        )
+
+
+def _run_all(
+    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+) -> Generator[TaskOutcome]:
+    """Runs every task, then again, waiting, those that another collector worked on."""
+    execute = _executor(options)
+    for wait in (False, True):
+        busy: list[Work] = []
+        with closing(execute(replace(job, wait=wait), tasks, board, options)) as outcomes:
+            for outcome in outcomes:
+                if outcome.status == "busy":
+                    busy.append(outcome.work)
+                yield outcome
+        tasks = busy
+
+
+def _executor(options: CollectOptions) -> Executor:
+    if options.executor == "local":
+        return run_in_process
+    return run_on_ray
+
+
+def _label(work: Work, tasks: Sequence[Work]) -> str:
+    learner = f", learner {work.learner}" if work.learner else ""
+    source = "" if work.source == "ppo" else f", {work.source}"
+    task = work.task
+    return f"task {tasks.index(work) + 1}/{len(tasks)} {task.layout.name} with {task.teammate_kind}{source}{learner}"
+
+
+def _describe(outcome: TaskOutcome, folder: Path) -> str:
+    if outcome.status == "failed":
+        times = "once" if outcome.attempts == 1 else f"{outcome.attempts} times"
+        return f"failed {times}: {outcome.error}"
+    timing = last_timing(folder)
+    return f"finished at {timing['steps_per_second']:,.0f} steps/s" if timing else "finished"

@@ -1,0 +1,287 @@
+"""A task's artefact on disk: its files, when it counts as finished, and how it is filled.
+
+<task_id>/            finished: its hashes match; -l1 behind the id for a second learner, and so on
+  metadata.json       task, settings, versions, SHA-256 of the files below
+  state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
+  metrics.jsonl       one line per update
+  checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
+  timing.jsonl        wall-clock figures, not hashed
+  filter.png labeller_returns.json   added by packing, not hashed
+<task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
+.<task_id>.lock       held by the collector that works on it
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import time
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import DiskFullError, IndexFormatError
+from icrl4aht_data.utils.cached_arrays import new_mapped_array
+from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.hashes import file_hash, hashes_hold
+from icrl4aht_generation.collection.record import HistoryArrays, array_shapes, record_rollout
+from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.work import Work
+
+METADATA, LEARNER = "metadata.json", "learner.safetensors"
+FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
+"""Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
+
+_LINE_BYTES = 600  # of an update, in the metrics and in the timing
+
+
+def partial_folder(folder: Path) -> Path:
+    """Path of an artefact that is not finished."""
+    return folder.with_name(f"{folder.name}.partial")
+
+
+def checkpoint_path(folder: Path, number: int) -> Path:
+    """Folder of the ego's checkpoint of this number in an artefact."""
+    return folder / "checkpoints" / f"c{number}"
+
+
+def _hashed_files(config: PPOConfig) -> list[str]:
+    checkpoints = (checkpoint_path(Path(), number) for number in range(len(checkpoint_updates(config))))
+    policies = {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)}
+    return sorted({f"{name}.npy" for name in HistoryArrays._fields} | {METRICS} | policies)
+
+
+def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
+    """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
+    ego = profile.ego_on(work.task.layout.name)
+    return common_settings(work) | {
+        "ego_hash": json_hash(asdict(ego)),
+        "checkpoint_updates": list(checkpoint_updates(ego)),
+    }
+
+
+def common_settings(work: Work) -> dict[str, Any]:
+    """Returns the settings that artefacts of every source depend on."""
+    return {
+        "task": asdict(work.task),
+        "source": work.source,
+        "learner": work.learner,
+        "code_version": version("icrl4aht-data"),
+    }
+
+
+def resumable_settings(work: Work, profile: Profile) -> dict[str, Any]:
+    """Returns the settings that must not change for a resumed task to give the bits of an uninterrupted one."""
+    return artefact_settings(work, profile) | software_versions()
+
+
+def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
+    """Returns whether a folder has this learner's artefact under these settings, with all its files unchanged."""
+    return is_artefact_finished(
+        folder, artefact_settings(work, profile), _hashed_files(profile.ego_on(work.task.layout.name))
+    )
+
+
+def is_artefact_finished(folder: Path, settings: dict[str, Any], files: list[str]) -> bool:
+    """Returns whether a folder has an artefact of these settings and files, all of them unchanged.
+
+    Args:
+        folder: the folder.
+        settings: what the artefact depends on.
+        files: its hashed files, sorted.
+    """
+    try:
+        metadata = parse_json(read_text(folder / METADATA))
+        same = {name: metadata[name] for name in settings} == settings
+        return same and sorted(metadata["files"]) == files and hashes_hold(folder, metadata["files"])
+    except (IndexFormatError, OSError, KeyError, TypeError):
+        return False
+
+
+def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
+    """Disk space of an unfinished artefact: histories, checkpoints, log, and two copies of the learner's state.
+
+    Args:
+        task: the task.
+        config: the ego's hyper-parameters.
+        state: the learner's state.
+    """
+    histories = sum(
+        math.prod(shape) * np.dtype(dtype).itemsize
+        for shape, dtype in array_shapes(task.layout, config.environments, config.episodes).values()
+    )
+    saved, params = (sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) for tree in (state, state.params))
+    return histories + 2 * saved + len(checkpoint_updates(config)) * params + config.updates * _LINE_BYTES
+
+
+def check_room(partial: Path, needed: int) -> None:
+    """Check that a disk has room for an artefact.
+
+    Raises:
+        DiskFullError: if it has not.
+    """
+    if needed > shutil.disk_usage(partial).free:
+        raise disk_full(partial, needed)
+
+
+def disk_full(partial: Path, needed: int) -> DiskFullError:
+    """Returns the error for an unfinished artefact whose disk has not the space it needs."""
+    free = shutil.disk_usage(partial if partial.exists() else partial.parent).free
+    folder = partial.with_name(partial.name.removesuffix(".partial"))
+    return DiskFullError(
+        f"{folder}: the disk is full: this task needs {needed:,} bytes, {free:,} are free; free some space, or give "
+        f"another --out"
+    )
+
+
+def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
+    """Write the metadata of a learner's artefact, see `write_metadata`."""
+    ego = profile.ego_on(work.task.layout.name)
+    settings = artefact_settings(work, profile) | {"profile": profile.name, "ego": asdict(ego)}
+    write_metadata(partial, settings, _hashed_files(ego))
+
+
+def write_metadata(partial: Path, settings: dict[str, Any], files: list[str]) -> None:
+    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it.
+
+    Args:
+        partial: the artefact.
+        settings: what it depends on, and what else is known of its origin.
+        files: its hashed files, sorted.
+    """
+    metadata = settings | {
+        "jax_version": jax.__version__,
+        "platform": jax.default_backend(),
+        "xla_threads": xla_threads(),
+        "files": {name: file_hash(partial / name) for name in files},
+    }
+    with atomic_write(partial / METADATA) as unnamed:
+        write_json(unnamed, metadata)
+
+
+def publish_artefact(partial: Path, folder: Path) -> None:
+    """Rename a complete artefact to its final name."""
+    (partial / LEARNER).unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
+class ArtefactWriter:
+    """Fills an artefact's histories, metrics and timing, update by update.
+
+    The arrays are memory maps of files whose space on the disk is allocated at the start. `sync` writes them out and
+    maps them again, so that memory holds only what came since the last `sync`.
+
+    Args:
+        partial: an existing folder.
+        task: the task.
+        config: the ego's hyper-parameters.
+        first: the first update to write; 0 creates the files, otherwise the log is cut at that update.
+
+    Raises:
+        OSError: if the disk is full.
+    """
+
+    def __init__(self, partial: Path, task: Task, config: PPOConfig, first: int) -> None:
+        self._partial, self._task, self._config, self._first = partial, task, config, first
+        self._started = time.perf_counter()
+        self._recording = 0.0
+        if not first:
+            for name, (shape, dtype) in array_shapes(task.layout, config.environments, config.episodes).items():
+                new_mapped_array(self._array(name), shape, np.dtype(dtype))
+        self._log = RunLog(partial, keep=lambda line: line["update"] < first)
+        self._histories = self._mapped()
+
+    def _array(self, name: str) -> Path:
+        return self._partial / f"{name}.npy"
+
+    def _mapped(self) -> HistoryArrays:
+        return HistoryArrays(
+            **{name: np.lib.format.open_memmap(self._array(name), "r+") for name in HistoryArrays._fields}
+        )
+
+    def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> dict[str, float]:
+        """Record one update; returns its metrics and timing.
+
+        Timing counts from the end of this writer's first update, which includes compiling: `steps_per_second`,
+        `seconds`, and how many of these were spent on `recording`.
+        """
+        jax.block_until_ready((rollout, metrics))
+        began = time.perf_counter()
+        record_rollout(self._histories, number, rollout)
+        line = {"update": number, "step": (number + 1) * self._config.steps_per_update} | _finite(metrics)
+        now = time.perf_counter()
+        self._recording += now - began
+        seconds = now - self._started
+        speed = max(1, number - self._first) * self._config.steps_per_update / seconds
+        if number == self._first:
+            self._started, self._recording = now, 0.0
+        timing = {
+            "steps_per_second": round(speed, 1),
+            "seconds": round(seconds, 6),
+            "recording": round(self._recording, 6),
+        }
+        self._log.write(line, timing={"update": number} | timing)
+        return line | timing
+
+    def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
+        """Keep the ego after so many updates, if it is one of `checkpoint_updates`; on the disk when this returns.
+
+        Call before the state after these updates is saved, so that a resumed task has all checkpoints.
+        """
+        moments = checkpoint_updates(self._config)
+        if updates in moments:
+            began = time.perf_counter()
+            card = {"task_id": self._task.task_id, "steps": updates * self._config.steps_per_update}
+            save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
+            self._recording += time.perf_counter() - began
+
+    def sync(self) -> None:
+        """Force everything written so far to the disk, and out of memory."""
+        began = time.perf_counter()
+        for array in self._histories:
+            array.flush()  # type: ignore[attr-defined]
+        self._histories = self._mapped()
+        self._log.sync()
+        self._recording += time.perf_counter() - began
+
+    def add_recording_time(self, seconds: float) -> None:
+        """Add time to what `timing` calls recording."""
+        self._recording += seconds
+
+    def close(self) -> None:
+        """Close the log and unmap the arrays."""
+        self._log.close()
+        del self._histories
+
+
+def last_timing(folder: Path) -> dict[str, float] | None:
+    """The last line of an artefact's timing, finished or not; None if there is none yet."""
+    for path in (partial_folder(folder) / TIMING, folder / TIMING):
+        try:
+            with path.open("rb") as stream:
+                stream.seek(0, os.SEEK_END)
+                stream.seek(max(0, stream.tell() - 1000))
+                lines = [line for line in stream.read().split(b"\n")[:-1] if line.endswith(b"}")]
+            return json.loads(lines[-1]) if lines else None
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+def _finite(metrics: dict[str, Any]) -> dict[str, float]:
+    values = {name: float(value) for name, value in metrics.items()}
+    if not values.get("episodes", 1):
+        values.pop("return", None)  # no episode ended, so there is no mean return
+    return values

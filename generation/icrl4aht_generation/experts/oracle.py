@@ -1,0 +1,478 @@
+"""A scripted ego that sees the complete state: an estimate of how much an ego can matter, next to `stay` and `random`.
+
+It is agent 0. It fills one pot at a time with the ingredients that the recipe still needs, fetches the plate so that it
+arrives when the soup is done, and delivers only soups of the current recipe; any other soup goes onto a counter until
+its recipe comes up. With a second pot it cooks ahead. It learns what to expect of the teammate by watching: it leaves
+the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
+layout rewards, never presses a button, and stays in layouts where it cannot matter. It is deterministic.
+
+Shapes: `P` pots that the ego reaches, `Q` recipes that it may cook (the current one, then the layout's), `O` obstacles,
+`S` bytes of a state record. All times are in steps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, Key, UInt8
+
+from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
+from icrl4aht_data.overcooked.layouts import COOKED, FACING_OF, GOAL, PILE, PLATE, PLATES, POT, WALL, Layout
+from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
+from icrl4aht_generation.paths import Paths, Scene
+from icrl4aht_generation.policy import Policy
+
+FAR = 1000
+"""Time to a cell that cannot be reached, or only when the teammate steps aside."""
+
+NEVER = 10_000
+"""Cost of what cannot or should not be done."""
+
+WAIT_LIMIT = 10
+"""Steps without a change in the pots after which the ego stops waiting for the teammate."""
+
+_DISH = np.uint8(PLATE | COOKED)
+
+
+class LayoutFacts(NamedTuple):
+    """Knowledge of a layout, computed before the ego starts. NumPy.
+
+    Attributes:
+        paths: the layout's shortest paths.
+        mine: bool (cells,), cells that the ego can face.
+        shared: bool (cells,), cells that both agents can face.
+        serves: whether the ego can plate and deliver.
+        mate_serves: whether the teammate can plate and deliver the ego's soups.
+        pots: int (P,), numbers of the pots.
+        pot_cells: int (P,), their cells.
+        piles: bool (types, cells), piles of each ingredient that the ego can face.
+        passed: bool (P,), pots that the teammate, walking from its piles, leaves for a nearer one.
+        obstacles: int (O,), cells where a teammate can be in the way; the first is -1, nowhere, and the only one if
+            the agents' rooms are apart.
+        time: int32 (O, cells, 4, cells), steps until the ego, on a cell with a facing, faces another cell.
+        action: int32 (O, cells, 4, cells), first action of that way; INTERACT if it faces the cell already.
+        leg: int32 (cells, cells), steps from facing one cell to facing another, without a teammate in the way.
+        trip: int32 (P, types), steps to carry a piece from its pile to a pot and to return.
+    """
+
+    paths: Paths
+    mine: np.ndarray
+    shared: np.ndarray
+    serves: bool
+    mate_serves: bool
+    pots: np.ndarray
+    pot_cells: np.ndarray
+    piles: np.ndarray
+    passed: np.ndarray
+    obstacles: np.ndarray
+    time: np.ndarray
+    action: np.ndarray
+    leg: np.ndarray
+    trip: np.ndarray
+
+
+def _study_layout(layout: Layout) -> LayoutFacts:
+    paths, kinds = Paths(layout), layout.kinds
+    mine, theirs = (np.isin(np.arange(layout.cells), layout.ahead[room]) for room in layout.rooms)
+    shared = mine & theirs
+    pots = np.array([k for k, cell in enumerate(layout.pots) if mine[cell]], int)
+    pot_cells = np.array(layout.pots, int)[pots]
+    serves, mate_serves = (all((here & (kinds == k)).any() for k in (PLATES, GOAL)) for here in (mine, theirs))
+    serves, mate_serves = serves and len(pots) > 0, mate_serves and bool(theirs[pot_cells].any())
+    piles = (layout.piles == np.array([layout.ingredient_item(i) for i in layout.ingredients])[:, None]) & mine
+    starts = paths.access[(kinds == PILE) & theirs].ravel()
+    their_way = paths.target_distance[starts[starts >= 0]][:, pot_cells].sum(axis=0)
+    passed = their_way > their_way.min(initial=NEVER)
+
+    obstacles = np.array([-1, *(layout.rooms[EGO] if np.array_equal(*layout.rooms) else [])], int)
+    time, action = _shortest_ways(layout, obstacles)
+    leg = np.full((layout.cells, layout.cells), FAR, np.int32)
+    np.minimum.at(leg, layout.ahead[layout.rooms[EGO]], time[0, layout.rooms[EGO]])
+    trip = np.where(piles[:, :, None], leg + leg.T + 2, FAR).min(axis=1).T[pot_cells]
+    return LayoutFacts(
+        paths, mine, shared, serves, mate_serves, pots, pot_cells, piles, passed, obstacles, time, action, leg, trip
+    )
+
+
+def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns `LayoutFacts.time` and `LayoutFacts.action`, by relaxing all ways until none becomes shorter."""
+    count, cells, room = len(obstacles), layout.cells, layout.rooms[EGO]
+    time = np.full((count, cells, 4, cells), FAR, np.int32)
+    for facing in range(4):
+        time[:, room, facing, layout.ahead[room, facing]] = 0
+    ends = np.repeat(layout.moves[None, :, :4].astype(int), count, axis=0)  # (O, cells, actions)
+    ends = np.where(ends == obstacles[:, None, None], np.arange(cells)[:, None], ends)
+    while True:
+        after = time[np.arange(count)[:, None, None], ends, FACING_OF]  # (O, cells, actions, cells)
+        shorter = np.minimum(time, after.min(axis=2, keepdims=True) + 1)
+        if np.array_equal(shorter, time):
+            return time, np.where(time == 0, INTERACT, after.argmin(axis=2)[:, :, None]).astype(np.int32)
+        time = shorter
+
+
+def _hindrance(paths: Paths) -> np.ndarray:
+    """Returns how much the ego would hinder the teammate by waiting on a cell, int32 (3, teammate's cell, ego's cell).
+
+    The first axis is what the teammate carries: a dish, a plate or an ingredient, or nothing. The next cell of each way
+    that the teammate may be taking counts 16, cells next to that one 8, and cells from which something other than a
+    counter is used 4.
+    """
+    layout = paths.layout
+    used = np.isin(layout.kinds, [GOAL, POT, PILE, PLATES])[layout.ahead].any(axis=1) & layout.walkable
+    hindrance = np.tile(4 * used, (3, layout.cells, 1)).astype(np.int32)
+    for carries, kinds in enumerate([[GOAL], [POT], [PILE, PLATES]]):
+        ends = {int(cell) for cell in paths.access[np.isin(layout.kinds, kinds)].ravel() if cell >= 0}
+        for mate in layout.rooms[TEAMMATE]:
+            for end in ends - {int(mate)}:
+                ahead = layout.moves[mate, paths.first_step[mate, end]]
+                hindrance[carries, mate] += 8 * np.maximum(2 - paths.distance[ahead], 0)
+    return hindrance
+
+
+class OracleMemory(NamedTuple):
+    """Memory of the ego, which is kept from one episode to the next.
+
+    Attributes:
+        record: uint8 (S,), state record before the previous step.
+        action: int32 (), the ego's action in the previous step.
+        calm: int32 (), steps since the pots or the recipe changed.
+        still: int32 (), steps since the teammate moved.
+        bumps: int32 (), consecutive steps in which the ego failed to move.
+        plates: bool (), whether the teammate has held a plate.
+        cooks: bool (), whether the teammate has filled a pot.
+        parks: bool (), whether the teammate has put a dish onto a counter.
+    """
+
+    record: UInt8[Array, " S"]
+    action: Int[Array, ""]
+    calm: Int[Array, ""]
+    still: Int[Array, ""]
+    bumps: Int[Array, ""]
+    plates: Bool[Array, ""]
+    cooks: Bool[Array, ""]
+    parks: Bool[Array, ""]
+
+
+def oracle(layout: Layout) -> Policy:
+    """Returns the scripted ego for a layout, a policy without parameters that sees the state record, uint8 (S,)."""
+    facts = _study_layout(layout)
+    matters = facts.serves or bool(np.isin(layout.kinds[facts.shared], [POT, WALL]).any())
+
+    def init(params, key: Key[Array, ""]) -> OracleMemory:
+        zero, no = jnp.int32(0), jnp.asarray(False)
+        return OracleMemory(jnp.zeros(record_size(layout), jnp.uint8), zero + STAY, zero, zero, zero, no, no, no)
+
+    def act(params, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
+        if not matters:
+            return jnp.int32(STAY), memory
+        scene = Scene(facts.paths, record, EGO)
+        memory = _remember(scene, memory)
+        action = _decide(_view_state(facts, scene, memory)).astype(jnp.int32)
+        return action, memory._replace(action=action)
+
+    return Policy((), init, act, "state")
+
+
+def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
+    """Returns the memory with what this state shows; its `action` is still the last one."""
+    layout, new = scene.paths.layout, scene.state
+    old = unpack(layout, last.record)
+    same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
+    ego_rests, mate_rests = new.positions[EGO] == old.positions[EGO], new.positions[TEAMMATE] == old.positions[TEAMMATE]
+    bumped = ego_rests & mate_rests & (jnp.asarray(layout.moves)[scene.me, last.action] != scene.me)
+    had = old.hands[TEAMMATE]
+    put = (had >> 2 > 0) & (new.hands[TEAMMATE] == 0)
+    onto_counter = jnp.any((new.counters > 0) & (old.counters == 0))
+    into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
+    return OracleMemory(
+        scene.record,
+        last.action,
+        jnp.where(same, last.calm + 1, 0),
+        jnp.where(mate_rests, last.still + 1, 0),
+        jnp.where(bumped, last.bumps + 1, 0),
+        last.plates | (new.hands[TEAMMATE] & PLATE > 0),
+        last.cooks | (put & into_pot & ~onto_counter),
+        last.parks | (put & onto_counter & (had & PLATE > 0)),
+    )
+
+
+class OracleView(NamedTuple):
+    """One state as the ego reads it; arrays are traced.
+
+    Attributes:
+        facts: facts of the layout.
+        scene: the state from the ego's point of view.
+        memory: memory of the ego.
+        origin: index into `LayoutFacts.time` and `action`: the obstacle, the ego's cell and facing.
+        time: int32 (cells,), steps until the ego faces a cell, around the teammate.
+        items: uint8 (cells,), items on counters.
+        sources: bool (types, cells), where each ingredient can be taken.
+        contents: uint8 (P,), contents of the pots, without the cooked flag.
+        timers: int32 (P,), steps until a pot's soup is done.
+        full: bool (P,), whether a pot has three ingredients.
+        right: bool (P,), full pots with the current recipe, done or not.
+        recipes: uint8 (Q,), the recipes.
+        stock: int32 (Q,), soups of each recipe that need no more ingredients.
+        missing: int32 (P, Q, types), ingredients that each pot still needs for each recipe; negative for surplus.
+        risky: bool (), the teammate is likely to take any soup out of the ego's pots, also a wrong one.
+        careful: bool (), the teammate also fills them, and a wrong soup keeps it from cooking the right one.
+        mate_delivers: bool (), the teammate is about to change the recipe.
+    """
+
+    facts: LayoutFacts
+    scene: Scene
+    memory: OracleMemory
+    origin: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+    time: Int[Array, " cells"]
+    items: UInt8[Array, " cells"]
+    sources: Bool[Array, "types cells"]
+    contents: UInt8[Array, " P"]
+    timers: Int[Array, " P"]
+    full: Bool[Array, " P"]
+    right: Bool[Array, " P"]
+    recipes: UInt8[Array, " Q"]
+    stock: Int[Array, " Q"]
+    missing: Int[Array, "P Q types"]
+    risky: Bool[Array, ""]
+    careful: Bool[Array, ""]
+    mate_delivers: Bool[Array, ""]
+
+    @property
+    def dish(self) -> UInt8[Array, ""]:
+        """The current recipe's soup on a plate."""
+        return self.recipes[0] | _DISH
+
+    def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
+        """Returns the time to the cells of a mask plus the time that follows; NEVER for other cells."""
+        return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
+
+    def at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
+        """Returns the time to some of the pots plus the time that follows; NEVER for other cells."""
+        cells = self.facts.pot_cells
+        there = jnp.where(which, self.time[cells] + then, NEVER)
+        return jnp.full(self.time.shape, NEVER).at[cells].set(there)
+
+    @property
+    def parking(self) -> Int[Array, " cells"]:
+        """Cost of putting an item down: out of the teammate's reach, or near a pot if the ego only fills pots."""
+        facts = self.facts
+        near = 2 * facts.leg[:, facts.pot_cells].min(axis=1, initial=FAR)
+        return self.cost(self.scene.empty_counters, jnp.asarray(3 * facts.shared if facts.serves else near))
+
+    @property
+    def plates(self) -> Bool[Array, " cells"]:
+        """Cells where the ego can take a plate."""
+        return (self.scene.plate_piles | (self.items == PLATE)) & self.facts.mine
+
+    @property
+    def plans(self) -> Int[Array, "P Q"]:
+        """Cost of cooking each recipe in each pot: the recipe least in stock first, then the least work."""
+        trip = self.facts.trip[:, None]
+        enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
+        possible = enough & ~self.full[:, None]
+        current, short = self.recipes == self.recipes[0], self.stock[0] == 0
+        # With a cooking teammate: cook nothing ahead in a pot that it uses, unless nothing else is left to do.
+        wanted = jnp.where(short, current, self.facts.passed[:, None]) | (short & ~jnp.any(possible[:, 0]))
+        work = jnp.sum(self.missing * np.minimum(trip, FAR // 10), axis=-1)
+        return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
+
+    @property
+    def spoiled(self) -> Bool[Array, " P"]:
+        """Pots whose contents fit no recipe, to be filled up with anything and cleared if nothing else helps."""
+        nowhere = ~self.full & (self.contents > 0) & (jnp.min(self.plans, axis=1) == NEVER)
+        return nowhere & (self.stock[0] == 0) & self.facts.serves
+
+    @property
+    def clears(self) -> Bool[Array, ""]:
+        """Whether soups of no current recipe have to leave their pots."""
+        return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plans[:, 0]) == NEVER))
+
+    @property
+    def mate_takes(self) -> Bool[Array, " P"]:
+        """Soup left to the teammate to serve: the first right one, if it also cooks and does not idle."""
+        first = jnp.arange(len(self.timers)) == jnp.argmin(jnp.where(self.right, self.timers, NEVER))
+        elsewhere = (self.scene.partner_hand & COOKED > 0) | (
+            self.scene.holds_plate & (self.scene.partner_hand != PLATE)
+        )
+        idles = (self.memory.calm >= WAIT_LIMIT) & (self.timers == 0)
+        return self.right & first & self.careful & ~self.memory.parks & ~elsewhere & ~idles
+
+    @property
+    def too_early(self) -> Bool[Array, " P"]:
+        """Pots in front of which the ego waits instead of interacting."""
+        hand, mixed = self.scene.hand, self.contents + self.scene.hand
+        completes = self.careful & (ingredient_count(mixed) == 3)
+        # A wrong soup, or a second one, should finish soon after one that the teammate waits for.
+        ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
+        spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
+        leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)
+        unknown = self.mate_delivers & (self.careful | (len(self.timers) == 1))
+        adds = self.full | (completes & (spoils | leaves_it)) | unknown
+        return (self.timers > 0) | (self.scene.holds_ingredient & adds)
+
+
+def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
+    state, layout = scene.state, scene.paths.layout
+    obstacle = jnp.argmax(jnp.asarray(facts.obstacles) == scene.partner)
+    origin = (obstacle, scene.me, state.facings[EGO].astype(jnp.int32))
+    items = jnp.zeros(layout.cells, jnp.uint8).at[np.array(layout.counters, int)].set(state.counters)
+    lying = items == (4 << 2 * np.arange(len(facts.piles)))[:, None]
+    contents = state.pot_items[facts.pots] & np.uint8(0xFF - COOKED)
+    full = ingredient_count(contents) == 3
+    recipes = jnp.concatenate([state.recipe[None], jnp.asarray(layout.recipe_items)])
+    cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
+    plated = ((items[:, None] == recipes | _DISH) & facts.mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
+    risky = memory.plates & facts.mate_serves
+    return OracleView(
+        facts,
+        scene,
+        memory,
+        origin,
+        time=jnp.asarray(facts.time)[origin],
+        items=items,
+        sources=(jnp.asarray(facts.piles) | lying) & facts.mine,
+        contents=contents,
+        timers=state.pot_timers[facts.pots].astype(jnp.int32),
+        full=full,
+        right=full & (contents == state.recipe),
+        recipes=recipes,
+        stock=cooked + plated + ((scene.partner_hand == recipes | _DISH) & ~memory.parks),
+        missing=scene.counts(recipes) - scene.counts(contents)[:, None],
+        risky=risky,
+        careful=risky & memory.cooks,
+        mate_delivers=(scene.partner_hand == state.recipe | _DISH) & ~memory.parks,
+    )
+
+
+class Subgoal(NamedTuple):
+    """One thing to do: go to the cheapest cell and interact.
+
+    Attributes:
+        when: bool (), whether the subgoal applies.
+        cost: int32 (cells,), cost of going to each cell in steps; NEVER for cells that do not serve it.
+    """
+
+    when: Bool[Array, ""]
+    cost: Int[Array, " cells"]
+
+
+def _decide(view: OracleView) -> Int[Array, ""]:
+    """Returns the action of the first option that applies and is possible."""
+    facts, options = view.facts, _with_dish(view)
+    if len(facts.pots):
+        options += _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
+    possible = jnp.stack([option.when & (jnp.min(option.cost) < NEVER) for option in options])
+    target = jnp.argmin(jnp.stack([option.cost for option in options])[jnp.argmax(possible)])
+    action = jnp.asarray(facts.action)[view.origin][target]
+    waits = jnp.any((facts.pot_cells == target) & view.too_early) & (action == INTERACT)
+    action = jnp.where(waits, STAY, action)
+    if len(facts.obstacles) > 1:
+        return _act_in_shared_room(view, jnp.any(possible), target, action)
+    return jnp.where(jnp.any(possible), action, STAY)
+
+
+def _with_dish(view: OracleView) -> list[Subgoal]:
+    scene, facts = view.scene, view.facts
+    wanted = (view.items == view.dish) & facts.mine & bool((scene.paths.static(GOAL) & facts.mine).any())
+    options = [
+        Subgoal(scene.hand == view.dish, view.cost(scene.goals)),
+        Subgoal(scene.holds_dish, view.parking),
+        Subgoal(scene.holds_nothing, view.cost(wanted)),
+        Subgoal(jnp.any(wanted), view.parking),
+    ]
+    if not len(facts.pots):  # wait where the teammate may put down a dish that only the ego will deliver
+        near = view.cost(
+            scene.empty_counters & facts.shared, jnp.asarray(scene.paths.manhattan)[scene.partner] - view.time
+        )
+        options.append(Subgoal(scene.holds_nothing & (scene.partner_hand == view.dish), near))
+    return options
+
+
+def _with_plate(view: OracleView) -> list[Subgoal]:
+    holds, building = view.scene.holds_plate, jnp.min(view.plans) < NEVER
+    right = view.right & ~view.mate_takes
+    soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
+    rest = jnp.maximum(view.timers - view.time[view.facts.pot_cells], 0)
+    return [
+        Subgoal(holds & (soon | ~building), view.at_pots(right, rest)),
+        Subgoal(holds & (view.clears | ~building), view.at_pots(view.full & ~view.right, rest)),
+        Subgoal(holds, view.parking),
+    ]
+
+
+def _with_ingredient(view: OracleView) -> list[Subgoal]:
+    holds, kind = view.scene.holds_ingredient, view.scene.counts(view.scene.hand) > 0
+    takes = jnp.any((view.missing > 0) & kind, axis=-1)
+    # An ingredient for a later recipe goes into a pot only if another pot is left for the current recipe.
+    fits = view.plans[:, 0] < NEVER
+    spare = (view.recipes == view.recipes[0]) | (view.stock[0] > 0) | (jnp.sum(fits) > fits)[:, None]
+    plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plans, NEVER), axis=1)
+    return [
+        Subgoal(holds, view.at_pots(plans < NEVER, plans)),
+        Subgoal(holds & ~jnp.any(fits), view.at_pots(view.spoiled)),
+        Subgoal(holds & (not view.facts.serves), view.at_pots(view.full | view.mate_delivers)),
+        Subgoal(holds, view.parking),
+    ]
+
+
+def _with_nothing(view: OracleView) -> list[Subgoal]:
+    facts, scene, plans = view.facts, view.scene, view.plans
+    empty = scene.holds_nothing
+    to_pot = jnp.asarray(facts.leg)[:, facts.pot_cells]
+
+    def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
+        return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
+
+    def plate_for(which: Bool[Array, " P"]) -> Subgoal:
+        return Subgoal(empty & jnp.any(which), view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1)))
+
+    pot, recipe = jnp.unravel_index(jnp.argmin(plans), plans.shape)
+    builds = empty & (jnp.min(plans) < NEVER)
+    missing = view.missing[pot, recipe]
+    delivering = (scene.partner_hand & PLATE == 0) & (view.memory.calm < WAIT_LIMIT)
+    coming = scene.counts(scene.partner_hand) * delivering
+    ingredients = fetch(missing > coming, to_pot[:, pot])
+    quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
+
+    arrival = jnp.min(jnp.where(view.plates[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
+    due = view.timers <= arrival + 2
+    right = view.right & ~view.mate_takes & facts.serves
+    wrong = view.full & ~view.right & view.clears & facts.serves
+    used = jnp.any(scene.counts(view.recipes) > 0, axis=0)
+    return [
+        Subgoal(builds & quick & ~view.risky, ingredients),
+        plate_for(right & due),
+        plate_for(wrong & due & view.risky),
+        Subgoal(builds, ingredients),
+        plate_for(right),
+        plate_for(wrong),
+        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, 0])),
+        # An ego that only fills pots holds a piece ready for the next soup.
+        Subgoal(empty & jnp.any(view.full | view.mate_delivers) & (not facts.serves), fetch(used, to_pot[:, 0])),
+    ]
+
+
+def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
+    """Returns the action in a room that both agents share: wait out of the teammate's way, without blocking forever."""
+    scene, facts, still = view.scene, view.facts, view.memory.still
+    layout, origin = scene.paths.layout, view.origin[1:]
+    ahead = jnp.asarray(layout.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
+    pushed = (ahead == scene.me) & (still > 0)
+    reachable = found & (view.time[target] < FAR)
+    # A teammate on the ego's way may leave it in this very step; one that does not may be waiting for the ego.
+    follows = found & ~reachable & ~pushed & (still < 3)
+    through = jnp.asarray(facts.action)[0, *origin, target]
+
+    carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
+    ends = jnp.asarray(layout.moves[:, : STAY + 1].astype(np.int32))[scene.me]
+    stays = jnp.arange(STAY + 1) == STAY
+    taken = (ends == scene.partner) | ((ends == scene.me) & ~stays) | (stays & pushed)
+    away = jnp.where(found, jnp.asarray(facts.time[0].min(axis=1))[ends, target], 0)
+    hindrance = jnp.asarray(_hindrance(scene.paths))[carries, scene.partner, ends]
+    aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
+
+    works = reachable & ((action != STAY) | scene.holds_plate)
+    action = jnp.where(works, action, jnp.where(follows, through, aside))
+    return jnp.where(view.memory.bumps % 2 == 1, STAY, action)

@@ -1,0 +1,135 @@
+"""Policies on disk: a folder with the weights as safetensors and a JSON card that describes them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from safetensors.numpy import load_file
+from safetensors.numpy import save as to_bytes
+
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.format.checkpoints import CHECKPOINT_BYTES
+from icrl4aht_data.utils.files import parse_json, plain_size, read_text
+from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.learners.network import ActorCritic
+
+POLICY_WEIGHTS, POLICY_CARD = "policy.safetensors", "policy.json"
+
+_ROWS = "@rows"
+"""Ending of the name of the array with the numbers of a matrix's stored rows."""
+
+POLICY_CHECKPOINTS = 5
+"""Checkpoints of each policy, evenly spaced over its training (paper, App. B.1)."""
+
+
+def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
+    """Numbers of updates after which a checkpoint is kept, ascending; the last one is the end of training.
+
+    Fewer than `POLICY_CHECKPOINTS` if there are fewer updates.
+    """
+    moments = (-(-config.updates * (number + 1) // POLICY_CHECKPOINTS) for number in range(POLICY_CHECKPOINTS))
+    return tuple(dict.fromkeys(moments))
+
+
+def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
+    """Write policy.safetensors and policy.json into a folder, which is replaced atomically."""
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    write_policy(partial, network, params, card)
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
+def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
+    """Write policy.safetensors and policy.json into an existing folder, and sync them to the disk."""
+    weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
+    stored = _without_zero_rows(weights)
+    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(stored))  # `save_file` has errors of its own for a full disk
+    shapes = {name: list(w.shape) for name, w in weights.items()}
+    content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
+    (folder / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    for name in (POLICY_WEIGHTS, POLICY_CARD):
+        with (folder / name).open("rb+") as stream:
+            os.fsync(stream.fileno())
+
+
+def load_card(folder: Path) -> dict[str, Any]:
+    """Returns a policy's card.
+
+    Raises:
+        OptionError: if it is missing or not a JSON object.
+    """
+    try:
+        card = parse_json(read_text(folder / POLICY_CARD))
+    except IndexFormatError as error:
+        raise _no_checkpoint(folder, repr(error)) from error
+    if not isinstance(card, dict):
+        raise _no_checkpoint(folder, f"{POLICY_CARD} is not an object")
+    return card
+
+
+def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
+    """Returns a policy's network, its parameters, and its card.
+
+    Raises:
+        OptionError: if the files are missing or unreadable, or the weights' shapes are not those of the card.
+    """
+    card = load_card(folder)
+    try:
+        plain_size(folder / POLICY_WEIGHTS, CHECKPOINT_BYTES)
+        network = ActorCritic(Widths.from_json(card["widths"]), card["partners"])
+        expected = card["shapes"]
+        weights = _with_zero_rows(load_file(folder / POLICY_WEIGHTS), expected)
+        tree = unflatten_dict(weights, sep="/")
+    except Exception as error:  # three libraries read what may be any bytes, and each has errors of its own
+        raise _no_checkpoint(folder, repr(error)) from error
+    shapes = {name: list(w.shape) for name, w in weights.items()}
+    if shapes != expected or "params" not in tree:
+        raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {expected}")
+    return network, tree, card
+
+
+def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Weights as they are stored: of a matrix that is mostly rows of zeros, the other rows and their numbers.
+
+    The kernel of encoder `mlp` is one: most entries of the flat window are always 0 on a layout.
+    """
+    stored = {}
+    for name, matrix in weights.items():
+        rows = np.flatnonzero(matrix.any(axis=1)) if matrix.ndim == 2 else ()
+        if matrix.ndim == 2 and 2 * len(rows) < len(matrix):
+            stored[name] = np.ascontiguousarray(matrix[rows])
+            stored[name + _ROWS] = np.asarray(rows, np.int32)
+        else:
+            stored[name] = matrix
+    return stored
+
+
+def _with_zero_rows(stored: dict[str, np.ndarray], shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
+    """The weights of a file, see `_without_zero_rows`; `shapes` are the complete ones.
+
+    Raises:
+        ValueError, IndexError, KeyError: if rows and shapes do not fit.
+    """
+    weights = {name: matrix for name, matrix in stored.items() if not name.endswith(_ROWS)}
+    for name in stored.keys() - weights.keys():
+        name = name.removesuffix(_ROWS)
+        length, width = shapes[name]
+        if length * width * weights[name].itemsize > CHECKPOINT_BYTES:
+            raise ValueError(f"{name}: shape {shapes[name]} is larger than any checkpoint")
+        complete = np.zeros((length, width), weights[name].dtype)
+        complete[stored[name + _ROWS]] = weights[name]
+        weights[name] = complete
+    return weights
+
+
+def _no_checkpoint(folder: Path, problem: str) -> OptionError:
+    return OptionError(f"{folder}: not a checkpoint ({problem}); expected {POLICY_WEIGHTS} and {POLICY_CARD}")

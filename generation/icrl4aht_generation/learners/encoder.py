@@ -1,0 +1,303 @@
+"""The encoder of observations, for learners and sequence models: convolutions, or one dense layer of the flat window.
+
+Its input are observations, or a compact form that is made of state records; parameters are the same, and so are the
+results, up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution sees one cell, so it
+is computed once per word of the layouts and looked up. `WindowEntries` are for the dense layer: of the flat window of
+an agent, most entries are always 0, since it stays in its room. B denotes the batch dimensions.
+
+Convolutions are matrix products: a 3 x 3 SAME convolution of a 5 x 5 patch is one dense matrix built from its kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Num, UInt8
+
+from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.layouts import VISIBLE, WINDOW, Layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.words import CellWords, cell_words
+from icrl4aht_generation.learners.config import EncoderKind
+
+MLP_WIDTH = 64
+"""Width of the first dense layer of encoder `mlp`."""
+
+
+class WindowWords(NamedTuple):
+    """Observations as words of cells.
+
+    Attributes:
+        ids: int32 (*B, 25), see `CellWords.ids`.
+    """
+
+    ids: Int[Array, "*B 25"]
+
+
+class WindowEntries(NamedTuple):
+    """Flat observations without the entries that are always 0.
+
+    Attributes:
+        values: uint8 (*B, E), see `CellWords.entries`.
+    """
+
+    values: UInt8[Array, "*B E"]
+
+
+class GroupedWords(NamedTuple):
+    """Observations as words of cells, with equal ones in groups, so that one of each is encoded.
+
+    N denotes the number of observations, the product of B.
+
+    Attributes:
+        ids: int32 (*B, 25), see `CellWords.ids`.
+        first: int32 (N,), for each group the number of one of its observations, then zeros.
+        group: int32 (*B,), the group of each observation.
+        groups: int32 (), number of groups.
+    """
+
+    ids: Int[Array, "*B 25"]
+    first: Int[Array, " N"]
+    group: Int[Array, "*B"]
+    groups: Int[Array, ""]
+
+
+Seen = Num[Array, "*B 5 5 C"] | WindowWords | GroupedWords | WindowEntries
+"""Input of an encoder: observations, uint8 or float, or one of their compact forms."""
+
+_BLOCKS = 4
+"""Grouped observations are encoded in so many blocks; those without a group are skipped."""
+
+
+@dataclass(frozen=True)
+class CompactView:
+    """State records -> input of an encoder: `WindowWords`, `WindowEntries`, or plain observations for kind `paper`.
+
+    Attributes:
+        kind: kind of the encoder.
+        layouts: layouts of the records.
+        agents: the agents that observe, each as the first agent of its records; see `CellWords.entries`.
+        canonical: whether observations have the canonical channels, or the layouts' own.
+    """
+
+    kind: EncoderKind
+    layouts: tuple[Layout, ...]
+    agents: tuple[int, ...] = (EGO,)
+    canonical: bool = False
+
+    @property
+    def words(self) -> CellWords:
+        """The words of the layouts."""
+        return cell_words(self.layouts, self.canonical)
+
+    @property
+    def channels(self) -> int:
+        """C, the number of channels of an observation."""
+        return self.words.channels.shape[-1]
+
+    @property
+    def entries(self) -> np.ndarray:
+        """int64 (E,): entries of the flat observation that `WindowEntries` consist of."""
+        return self.words.entries(self.agents)
+
+    def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:
+        """Returns the encoder's input; `layout_number` is needed for several layouts, see `CellWords.ids`."""
+        batch = record.shape[:-1]
+        if self.kind == "words":
+            return WindowWords(self.words.ids(record, layout_number))
+        if layout_number is None:
+            obs: Any = observe(self.layouts[0], record, EGO, self.canonical)
+        else:
+            obs = jnp.asarray(self.words.channels)[self.words.ids(record, layout_number)]
+            obs = obs.reshape(*batch, WINDOW, WINDOW, self.channels)
+        return obs if self.kind == "paper" else WindowEntries(obs.reshape(*batch, -1)[..., self.entries])
+
+    def observations(self, seen: Seen) -> Num[Array, "*B 5 5 C"]:
+        """Returns the observations that an encoder's input was made of."""
+        if isinstance(seen, (WindowWords, GroupedWords)):
+            flat = jnp.asarray(self.words.channels)[seen.ids]
+        elif isinstance(seen, WindowEntries):
+            zeros = jnp.zeros((*seen.values.shape[:-1], VISIBLE * self.channels), seen.values.dtype)
+            flat = zeros.at[..., self.entries].set(seen.values)
+        else:
+            return seen
+        return flat.reshape(*jax.tree.leaves(seen)[0].shape[:-1], WINDOW, WINDOW, self.channels)
+
+
+def group_equal(seen: Seen) -> Seen:
+    """Returns words of cells with equal observations in groups, and any other input unchanged.
+
+    Observations are sorted by a hash, and then compared exactly: if two that differ have one hash, every observation
+    becomes a group of its own. Sorting needs all observations on one device, so with several nothing is grouped.
+    """
+    if not isinstance(seen, WindowWords) or jax.device_count() > 1:
+        return seen
+    shape, ids = seen.ids.shape[:-1], jnp.asarray(seen.ids).reshape(-1, VISIBLE)
+    number = jnp.arange(len(ids), dtype=jnp.int32)
+    *hashes, order = jax.lax.sort((*_hash_words(ids), number), num_keys=2)
+    starts = jnp.append(True, (jnp.diff(hashes[0]) != 0) | (jnp.diff(hashes[1]) != 0))
+    group_of_sorted = jnp.cumsum(starts, dtype=jnp.int32) - 1
+    group = jnp.zeros_like(number).at[order].set(group_of_sorted, unique_indices=True)
+    first = jnp.zeros_like(number).at[jnp.where(starts, group_of_sorted, len(ids))].set(order, mode="drop")
+    exact = (ids[first[group]] == ids).all()
+    first, group = (jnp.where(exact, found, number) for found in (first, group))
+    count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
+    return GroupedWords(ids.reshape(*shape, VISIBLE), first, group.reshape(shape), count)
+
+
+def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
+    """Returns two uint32 (N,) that equal rows have in common: sums of the words times random odd numbers."""
+    factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
+    one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
+    return one, two
+
+
+def encoding_log(seen: Seen) -> dict[str, Array]:
+    """Returns what a training log says of an encoder's input: the share of observations that differ, if known."""
+    return {"distinct_observations": seen.groups / seen.group.size} if isinstance(seen, GroupedWords) else {}
+
+
+class WindowEncoder(nn.Module):
+    """Maps observations, each by itself, to features (paper, App. B.1 and E.1).
+
+    Args:
+        features: width of the result.
+        kind: see `EncoderKind`.
+        pointwise: widths of the 1 x 1 convolutions of kinds `paper` and `words`.
+        spatial: widths of their 3 x 3 convolutions.
+        normalize: whether ReLU and a layer norm follow the last dense layer, as in learners.
+        view: view that makes the compact inputs; None if all inputs are observations.
+        dtype: of the arithmetic.
+    """
+
+    features: int
+    kind: EncoderKind = "paper"
+    pointwise: tuple[int, ...] = (128, 128, 8)
+    spatial: tuple[int, ...] = (16, 32, 32)
+    normalize: bool = False
+    view: CompactView | None = None
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, seen: Seen) -> Float[Array, "*B F"]:
+        if isinstance(seen, GroupedWords):
+            return self._encode_groups(seen)
+        if self.kind == "mlp":
+            x = nn.relu(FlatDense(MLP_WIDTH, self.view, self.dtype)(seen))
+        else:
+            x = self._encode_cells(seen)
+            batch = x.shape[:-2]
+            x = x.reshape(-1, VISIBLE * x.shape[-1])
+            for width in self.spatial:
+                x = nn.relu(Conv3x3(width)(x))
+            x = x.reshape(*batch, x.shape[-1])
+        x = orthogonal_dense(self.features)(x)
+        return nn.LayerNorm()(nn.relu(x)) if self.normalize else x
+
+    def _encode_groups(self, seen: GroupedWords) -> Float[Array, "*B F"]:
+        """Encodes one observation of each group."""
+        encoder, variables = self.clone(parent=None), self.variables
+        size = -(-len(seen.first) // _BLOCKS)
+        rows = jnp.pad(seen.first, (0, _BLOCKS * size - len(seen.first))).reshape(_BLOCKS, size)
+        ids = seen.ids.reshape(-1, VISIBLE)[rows]
+
+        def encode(variables: Any, ids: Array) -> Array:
+            features: Any = encoder.apply(variables, WindowWords(ids))
+            return features
+
+        shape = jax.eval_shape(encode, variables, ids[0])
+
+        def encode_block(_: None, block: tuple[Array, Array]) -> tuple[None, Array]:
+            number, ids = block
+            nothing = jnp.zeros(shape.shape, shape.dtype)
+            return None, jax.lax.cond(number * size < seen.groups, encode, lambda *_: nothing, variables, ids)
+
+        _, features = jax.lax.scan(encode_block, None, (jnp.arange(_BLOCKS), ids))
+        return features.reshape(-1, self.features)[seen.group]
+
+    def _encode_cells(self, seen: Num[Array, "*B 5 5 C"] | WindowWords | WindowEntries) -> Float[Array, "*B 25 F"]:
+        """Applies the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""
+        if isinstance(seen, WindowWords):
+            x = jnp.asarray(_required(self.view).words.channels, self.dtype)
+        elif isinstance(seen, WindowEntries):
+            raise TypeError(f"encoder {self.kind}: expected observations or words, found entries")
+        else:
+            x = seen.reshape(*seen.shape[:-3], VISIBLE, seen.shape[-1]).astype(self.dtype)
+        for width in self.pointwise:
+            x = nn.relu(orthogonal_dense(width)(x))
+        return x.at[-1].set(jnp.nan)[seen.ids] if isinstance(seen, WindowWords) else x
+
+
+class FlatDense(nn.Module):
+    """A dense layer of flat observations; its kernel has rows for all 25 * C entries, whatever the input has.
+
+    Initial rows of entries that are always 0 in `view` are zeros: they never learn, and random ones would add noise on
+    other layouts.
+    """
+
+    features: int
+    view: CompactView | None = None
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, seen: Seen) -> Float[Array, "*B F"]:
+        if isinstance(seen, (WindowWords, GroupedWords)):
+            raise TypeError("encoder mlp: expected observations or entries, found words")
+        if isinstance(seen, WindowEntries):
+            x, rows = seen.values, VISIBLE * _required(self.view).channels
+        else:
+            x = seen.reshape(*seen.shape[:-3], -1)
+            rows = x.shape[-1]
+        kernel = self.param("kernel", self._initial_kernel, (rows, self.features))
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        if isinstance(seen, WindowEntries):
+            kernel = kernel[_required(self.view).entries]
+        return x.astype(self.dtype) @ kernel + bias
+
+    def _initial_kernel(self, key: Array, shape: tuple[int, int]) -> Array:
+        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)
+        if self.view is None:
+            return kernel
+        varies = np.zeros((shape[0], 1), bool)
+        varies[self.view.entries] = True
+        return jnp.where(varies, kernel, 0)
+
+
+class Conv3x3(nn.Module):
+    """A 3 x 3 SAME convolution of a 5 x 5 patch: (B, 25 * c_in) -> (B, 25 * features)."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B _"]) -> Float[Array, "B _"]:
+        channels = x.shape[-1] // VISIBLE
+        kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
+        matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
+        return x @ matrix + jnp.tile(bias, VISIBLE)
+
+
+def _tap_of_cells() -> np.ndarray:
+    """int (25, 25): number of the kernel tap, 0..8, between an input and an output cell; 9 if they are not adjacent."""
+    cell = np.arange(VISIBLE)
+    dy = cell[:, None] // WINDOW - cell // WINDOW + 1
+    dx = cell[:, None] % WINDOW - cell % WINDOW + 1
+    near = (dy >= 0) & (dy < 3) & (dx >= 0) & (dx < 3)
+    return np.where(near, dy * 3 + dx, 9)
+
+
+def orthogonal_dense(width: int, scale: float = 2**0.5, name: str | None = None) -> nn.Dense:
+    """Returns a dense layer with orthogonal initial weights of this scale."""
+    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale), name=name)
+
+
+def _required(view: CompactView | None) -> CompactView:
+    if view is None:
+        raise TypeError("expected `view` for a compact input")
+    return view

@@ -1,0 +1,71 @@
+"""BRDiv: confederates that only their own best response can play with (Rahman et al. 2023; paper, App. B.1).
+
+K denotes members. Policies 0..K-1 are the confederates, always the teammate; K..2K-1 their best responses, always the
+ego. Confederate i plays with its own best response in three quarters of its environments, and with the others in turn
+in the rest: weights apply to mean returns, so this share only decides which of them are estimated well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from icrl4aht_generation.learners.population.population import Assignment
+
+
+def pairs_assignment(members: int, environments: int) -> Assignment:
+    """Returns the assignment of confederates and best responses.
+
+    Terms: i * K + j is the return of confederate i with best response j, as the confederate's objective counts it;
+    K * K more are the same returns in the best response's objective.
+
+    Raises:
+        ValueError: if a confederate has fewer environments for cross-play than there are other best responses.
+    """
+    if environments // 4 < members - 1:
+        raise ValueError(f"environments = {environments}: {members} members need at least {4 * members - 4}")
+    env = np.tile(np.arange(environments), members)
+    confederate = np.repeat(np.arange(members), environments)
+    with_own = env < environments - environments // 4 if members > 1 else np.ones(env.size, bool)
+    shift = np.where(with_own, 0, 1 + env % max(members - 1, 1))
+    response = (confederate + shift) % members
+    pair = confederate * members + response
+    return Assignment(
+        policy=np.stack([members + response, confederate]),
+        term=np.stack([members**2 + pair, pair]),
+        group=np.tile(np.arange(members), 2),
+        learning=2 * members,
+        starts_from=np.full(env.size, -1),
+    )
+
+
+@dataclass(frozen=True)
+class BRDiv:
+    """L(pi_k) = -w_SP J(pi_k, BR_k) + w_XP sum_{j != k} J(pi_k, BR_j), with w_SP = 1 + 2 w_XP (paper, App. B.1, BRDiv
+    "Training Objective"); best responses maximise their return with their own confederate only.
+
+    Attributes:
+        members: K.
+        cross_play_weight: w_XP.
+    """
+
+    members: int
+    cross_play_weight: float = 0.5
+
+    def assignment(self, environments: int) -> Assignment:
+        return pairs_assignment(self.members, environments)
+
+    def init(self) -> Any:
+        return ()
+
+    def weights(self, memory: Any) -> Float[Array, " terms"]:
+        own = np.eye(self.members)
+        confederates = own * (1 + 2 * self.cross_play_weight) - (1 - own) * self.cross_play_weight
+        return jnp.asarray(np.concatenate([confederates.ravel(), own.ravel()]), jnp.float32)
+
+    def adapt(self, memory: Any, returns, seen) -> Any:
+        return memory

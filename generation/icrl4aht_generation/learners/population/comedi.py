@@ -1,0 +1,75 @@
+"""CoMeDi: members trained in turn, each good with itself and bad with the member it resembles most (Sarkar et al.
+2023; paper, App. B.1). The first member has nobody to differ from: it is trained by self-play, as FCP's are.
+
+Policy 0 is the new member; its best response is itself, as in the original. Policy 1 is a frozen member. A quarter of
+the environments each:
+
+* self-play (SP): the new member as both agents;
+* cross-play (XP): the new member with the frozen one, which is the ego in half of them;
+* mixed play (MP): the new member or the frozen one as its partner, assigned by environment rather than drawn per
+  episode; nothing is learned here, it only visits states;
+* mixed play from states that the third quarter visited (SMP), which gives J_MP: the new member cannot recognise its
+  partner by such states, so it cannot learn to play badly with strangers on purpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from icrl4aht_generation.learners.population.population import Assignment
+
+_SP, _XP, _MP_SELF, _MP_FROZEN = range(4)
+
+
+@dataclass(frozen=True)
+class CoMeDi:
+    """L = -J_SP + alpha J_XP - beta J_MP (paper, App. B.1, CoMeDi "Training Objective"), where the partner of J_MP is
+    the new member or the frozen one, each in half of the episodes.
+
+    Attributes:
+        cross_play_weight: alpha.
+        mixed_play_weight: beta.
+    """
+
+    cross_play_weight: float = 1.0
+    mixed_play_weight: float = 1.0
+
+    def assignment(self, environments: int) -> Assignment:
+        """One member's environments.
+
+        Raises:
+            ValueError: if their number is not a multiple of 8.
+        """
+        if environments % 8:
+            raise ValueError(f"environments = {environments}: CoMeDi needs a multiple of 8")
+        quarter = environments // 4
+        new, frozen = np.zeros(quarter, int), np.ones(quarter, int)
+        first_half = np.arange(quarter) < quarter // 2
+        cross = np.stack([np.where(first_half, frozen, new), np.where(first_half, new, frozen)])
+        with_self = np.arange(quarter) % 2 == 0
+        mixed = np.where(with_self, 0, cross)
+        play = np.stack([new, new])
+        none = np.full_like(play, -1)
+        mixed_term = np.where(with_self, _MP_SELF, np.where(mixed == 0, _MP_FROZEN, -1))
+        return Assignment(
+            policy=np.concatenate([play, cross, mixed, mixed], axis=1),
+            term=np.concatenate([play + _SP, np.where(cross == 0, _XP, -1), none, mixed_term], axis=1),
+            group=np.arange(2),
+            learning=1,
+            starts_from=np.concatenate([np.full(3 * quarter, -1), 2 * quarter + np.arange(quarter)]),
+        )
+
+    def init(self) -> Any:
+        return ()
+
+    def weights(self, memory: Any) -> Float[Array, " terms"]:
+        half = self.mixed_play_weight / 2
+        return jnp.array([1.0, -self.cross_play_weight, half, half])
+
+    def adapt(self, memory: Any, returns, seen) -> Any:
+        return memory

@@ -1,0 +1,40 @@
+"""FCP: independent self-play learners that differ by their seeds (Strouse et al. 2021; paper, App. B.1).
+
+With one member this is IPPO, one policy as both agents (paper, App. B.1 "Independent PPO").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from icrl4aht_generation.learners.population.population import Assignment
+
+
+@dataclass(frozen=True)
+class FCP:
+    """Fictitious co-play: each member plays with itself.
+
+    Attributes:
+        members: number of policies.
+    """
+
+    members: int
+
+    def assignment(self, environments: int) -> Assignment:
+        """One term per member: its own return."""
+        member = np.repeat(np.arange(self.members), environments)
+        both = np.stack([member, member])
+        return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
+
+    def init(self) -> Any:
+        return ()
+
+    def weights(self, memory: Any):
+        return jnp.ones(self.members)
+
+    def adapt(self, memory: Any, returns, seen) -> Any:
+        return memory

@@ -1,0 +1,355 @@
+"""Policies that learn together: a fixed assignment of policies to agents, one PPO for each policy, all at once by vmap.
+
+N denotes environments, P policies, of which the first L learn, G policies of one group, M agent slots of a policy, T
+steps. An algorithm (`fcp`, `brdiv`, `lbrdiv`, `comedi`) states which policies play together and how much each expected
+return counts. Agent slots are numbered as in `learners.rollout`: a * N + e for agent a of environment e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.encoder import CompactView
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.ppo import PPO, ppo_optimizer, sequences, shaping_weight
+from icrl4aht_generation.learners.rollout import Player, Rollout, RolloutCarry, init_rollout, network_player, roll_out
+
+
+class Assignment(NamedTuple):
+    """Fixed assignment of policies to both agents of N environments.
+
+    The objective is a weighted sum of expected returns, its *terms*. Each slot that a policy learns from is a sample of
+    one term: of the return that this policy raises or lowers there.
+
+    Attributes:
+        policy: int (2, N), the policy that plays each agent of each environment.
+        term: int (2, N), the term that a slot is a sample of; -1 for slots that nothing is learned from.
+        group: int (P,); a pair of policies with the same number is self-play, any other pair is cross-play.
+        learning: L.
+        starts_from: int (N,), the environment whose visited states an environment's episodes start from; -1 for the
+            usual start.
+    """
+
+    policy: np.ndarray
+    term: np.ndarray
+    group: np.ndarray
+    learning: int
+    starts_from: np.ndarray
+
+    def agent_slots(self, policy: int) -> tuple[np.ndarray, np.ndarray]:
+        """Slots of a policy, int: those that it learns from, and the others."""
+        own = self.policy.ravel() == policy
+        counts = self.term.ravel() >= 0
+        return (own & counts).nonzero()[0], (own & ~counts).nonzero()[0]
+
+    @property
+    def envs(self) -> int:
+        """N."""
+        return self.policy.shape[1]
+
+    @property
+    def policies(self) -> int:
+        """P."""
+        return len(self.group)
+
+    @property
+    def partner(self) -> np.ndarray:
+        """int (2 N,): the policy of the other agent in each slot's environment."""
+        return self.policy[::-1].ravel()
+
+    @property
+    def self_play(self) -> np.ndarray:
+        """bool (N,): environments in which two policies of one group play."""
+        return self.group[self.policy[0]] == self.group[self.policy[1]]
+
+
+class Algorithm(Protocol):
+    """Interface of the population algorithms. `memory` is a pytree of the algorithm, such as multipliers."""
+
+    def assignment(self, environments: int) -> Assignment:
+        """Returns the pairing of policies, with this number of environments per member."""
+        ...
+
+    def init(self) -> Any:
+        """Returns the memory before the first update."""
+        ...
+
+    def weights(self, memory: Any) -> Float[Array, " terms"]:
+        """Returns the weight of each term in the objective that is maximised; negative to minimise a return."""
+        ...
+
+    def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:
+        """Returns the memory after an update.
+
+        Args:
+            memory: the memory before it.
+            returns: [i, j] is the mean return of the episodes that ended in the update with policy i as the ego and j
+                as the teammate.
+            seen: whether there was such an episode.
+        """
+        ...
+
+
+class PolicyGroup(NamedTuple):
+    """Successive policies with equally many slots, so that one vmap serves them all.
+
+    Attributes:
+        first: number of the first policy.
+        agent_slots: int (G, M), those that the policies learn from first.
+        counting: how many of the M slots the policies learn from.
+    """
+
+    first: int
+    agent_slots: np.ndarray
+    counting: int
+
+    @property
+    def _rows(self) -> slice:
+        return slice(self.first, self.first + len(self.agent_slots))
+
+    def take(self, tree: Any) -> Any:
+        """Returns the group's rows of leaves (P, ...)."""
+        return jax.tree.map(lambda leaf: leaf[self._rows], tree)
+
+    def put(self, tree: Any, rows: Any) -> Any:
+        """Returns a tree of leaves (P, ...) with the group's rows replaced."""
+        return jax.tree.map(lambda leaf, new: leaf.at[self._rows].set(new), tree, rows)
+
+
+class PopulationState(NamedTuple):
+    """State of a `Population`: an update maps it to the next one, and a resume needs nothing else.
+
+    Attributes:
+        params: parameters of all policies, leaves (P, ...).
+        optimizer: optimiser states of the learning policies, leaves (L, ...).
+        carry: environments and memories before the next roll-out.
+        memory: the algorithm's memory.
+        visited: uint8 (N, S), for each environment one of the states of its last roll-out.
+        key: typed key, scalar, constant; every update folds its number into it.
+        update: int32 scalar, number of updates so far.
+    """
+
+    params: Any
+    optimizer: optax.OptState
+    carry: RolloutCarry
+    memory: Any
+    visited: UInt8[Array, "N S"]
+    key: Key[Array, ""]
+    update: Int[Array, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Trains policies together on one layout; their learning, nearly all of the work, uses every device.
+
+    Args:
+        env: the layout's environment.
+        algorithm: see `Algorithm`.
+        config: hyper-parameters of every policy; `environments` are those of one member.
+        partners: number of policies among which the critics distinguish the partner. By default all of them if some
+            policy meets different partners, else none.
+    """
+
+    env: Environment
+    algorithm: Algorithm
+    config: PPOConfig
+    partners: int | None = None
+
+    @cached_property
+    def assignment(self) -> Assignment:
+        """The pairing of policies in all environments."""
+        return self.algorithm.assignment(self.config.environments)
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps of an update, over all environments."""
+        return self.assignment.envs * self.config.rollout
+
+    @cached_property
+    def network(self) -> ActorCritic:
+        """The network of all policies."""
+        policies = self.assignment.policies
+        pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
+        partners = policies if len(pairs) > policies else 0
+        partners = partners if self.partners is None else self.partners
+        return ActorCritic(self.config.widths, partners, view=self.view)
+
+    @cached_property
+    def view(self) -> CompactView:
+        """View that converts state records to inputs of the network."""
+        return CompactView(self.config.widths.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
+
+    @cached_property
+    def ppo(self) -> PPO:
+        """The algorithm of each policy's updates."""
+        return PPO(self.network, self.config)
+
+    @cached_property
+    def groups(self) -> list[PolicyGroup]:
+        """All policies, in groups that one vmap can serve."""
+        slots = [self.assignment.agent_slots(policy) for policy in range(self.assignment.policies)]
+        shapes = [(p < self.assignment.learning, len(own), len(others)) for p, (own, others) in enumerate(slots)]
+        groups = []
+        for (_, counting, _), members in groupby(range(len(slots)), key=shapes.__getitem__):
+            numbers = list(members)
+            groups.append(PolicyGroup(numbers[0], np.stack([np.concatenate(slots[p]) for p in numbers]), counting))
+        return groups
+
+    def init(self, key: Key[Array, ""]) -> PopulationState:
+        """Returns the state of untrained policies, each from a seed of its own, before the first step."""
+        params_key, env_key, running_key = jax.random.split(key, 3)
+        # By `map`, not by `vmap`, under which the orthogonal initialisers deadlock on a CPU.
+        channels = self.env.layout.channels
+        seeds = jax.random.split(params_key, self.assignment.policies)
+        params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
+        carry = init_rollout(self.env, self._players(params), jax.random.split(env_key, self.assignment.envs))
+        learning = jax.tree.map(lambda leaf: leaf[: self.assignment.learning], params)
+        return PopulationState(
+            params=params,
+            optimizer=jax.vmap(ppo_optimizer(self.config).init)(learning),
+            carry=carry,
+            memory=self.algorithm.init(),
+            visited=carry.env.record,
+            key=running_key,
+            update=jnp.int32(0),
+        )
+
+    def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
+        """Plays one roll-out, then every policy learns from its slots and the algorithm adapts its memory.
+
+        A pure function of the state.
+
+        Returns:
+            The next state, and scalar metrics.
+        """
+        play_key, learn_key, visit_key = jax.random.split(jax.random.fold_in(state.key, state.update), 3)
+        players = self._players(state.params)
+        restart = self._restart(state.visited)
+        carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key, restart)
+        params, optimizer, losses = self._learn(state, players, carry, rollout, learn_key)
+        returns, seen = self._returns(rollout)
+        steps = jax.random.randint(visit_key, (self.assignment.envs,), 0, self.config.rollout)
+        after = PopulationState(
+            params=params,
+            optimizer=optimizer,
+            carry=carry,
+            memory=self.algorithm.adapt(state.memory, returns, seen),
+            visited=jnp.take_along_axis(rollout.record, steps[None, :, None], axis=0)[0],
+            key=state.key,
+            update=state.update + 1,
+        )
+        metrics = self._metrics(rollout) | {"shaping": shaping_weight(self.config, state.update)}
+        return after, losses | metrics
+
+    def _players(self, params: Any) -> list[Player]:
+        """One player per group."""
+        return [
+            network_player(
+                self.env,
+                self.network,
+                group.take(params),
+                group.agent_slots,
+                jnp.asarray(self.assignment.partner[group.agent_slots]),
+            )
+            for group in self.groups
+        ]
+
+    def _restart(self, visited: UInt8[Array, "N S"]) -> Callable[[EnvState, Array], EnvState]:
+        """The `restart` of `roll_out`: new episodes of some environments start from states that others visited."""
+        source = self.assignment.starts_from
+
+        def restart(state: EnvState, done: Bool[Array, " N"]) -> EnvState:
+            replaced = (done & (source >= 0))[:, None]
+            return state._replace(record=jnp.where(replaced, visited[source], state.record))
+
+        return restart if (source >= 0).any() else lambda state, done: state
+
+    def _learn(self, state: PopulationState, players: list[Player], carry: RolloutCarry, rollout: Rollout, key: Array):
+        """Parameters and optimiser states of all policies after learning from the roll-out, and mean losses."""
+        weight = self._slot_weights(state.memory)
+        shaping = shaping_weight(self.config, state.update)
+        params, optimizer, losses = state.params, state.optimizer, []
+        for number, (group, player) in enumerate(zip(self.groups, players, strict=True)):
+            if group.first >= self.assignment.learning:
+                continue
+            slots = player.agent_slots
+            last, _ = player.act(carry.memories[number], carry.env, key)
+            # A policy that lowers a return must not be paid, nor charged, for the shaped rewards on the way.
+            own_shaping = shaping * (weight[slots] >= 0)
+            memory, forgiveness = state.carry.memories[number], self.config.forgiveness
+            played = sequences(self.view, rollout, number, slots, memory, last.value, own_shaping, forgiveness)
+            partner = jnp.asarray(self.assignment.partner[slots])[None]
+            played = played._replace(partner=partner, weight=weight[slots][None])
+
+            def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
+                """(T, G * M, ...) -> (G, T, counting, ...)."""
+                return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
+
+            keys = jax.random.split(jax.random.fold_in(key, number), len(group.agent_slots))
+            own = (group.take(state.params), group.take(state.optimizer), jax.tree.map(by_policy, played), keys)
+            new_params, new_optimizer, loss = self._learn_by_policy(group)(*own)
+            params, optimizer = group.put(params, new_params), group.put(optimizer, new_optimizer)
+            losses.append(loss)
+        return params, optimizer, jax.tree.map(lambda *parts: jnp.concatenate(parts).mean(), *losses)
+
+    def _learn_by_policy(self, group: PolicyGroup) -> Callable[..., Any]:
+        """`PPO.learn` with a leading axis of policies, sharded over as many devices as divide them evenly."""
+        learn, devices = jax.vmap(self.ppo.learn), jax.devices()
+        count = max(n for n in range(1, len(devices) + 1) if len(group.agent_slots) % n == 0)
+        if count == 1:
+            return learn
+        mesh = Mesh(np.array(devices[:count]), ("policy",))
+        each = PartitionSpec("policy")
+        return jax.shard_map(learn, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
+
+    def _slot_weights(self, memory: Any) -> Float[Array, " 2N"]:
+        """The weight of each slot's advantage.
+
+        A term's weight is shared equally among its slots, then every policy's weights are scaled to 1 on average, so
+        that the learning rate means the same for all policies and algorithms.
+        """
+        term, policy = self.assignment.term.ravel(), self.assignment.policy.ravel()
+        counts = np.bincount(term[term >= 0])
+        raw = jnp.where(term >= 0, self.algorithm.weights(memory)[term] / np.maximum(counts, 1)[term], 0.0)
+        total = jnp.zeros(self.assignment.policies).at[policy].add(jnp.abs(raw))
+        samples = np.bincount(policy[term >= 0], minlength=self.assignment.policies)
+        return raw * (samples / jnp.maximum(total, 1e-8))[policy]
+
+    def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
+        """Mean return of the episodes that ended, by ego and teammate, and whether there was one."""
+        size = (self.assignment.policies,) * 2
+        pairs = tuple(self.assignment.policy)
+        ended = jnp.zeros(size).at[pairs].add(rollout.done.sum(axis=0))
+        total = jnp.zeros(size).at[pairs].add(jnp.where(rollout.done, rollout.returns, 0.0).sum(axis=0))
+        return total / jnp.maximum(ended, 1), ended > 0
+
+    def _metrics(self, rollout: Rollout) -> dict[str, Array]:
+        """Mean returns of the episodes that ended, in self-play and in cross-play; 0 if none did."""
+
+        def mean_return(envs: np.ndarray) -> Array:
+            done = rollout.done & envs
+            return jnp.sum(jnp.where(done, rollout.returns, 0.0)) / jnp.maximum(jnp.sum(done), 1)
+
+        # Episodes that start from visited states are shorter tasks: their returns do not compare.
+        usual_start = self.assignment.starts_from < 0
+        self_play = self.assignment.self_play
+        return {
+            "episodes": jnp.sum(rollout.done),
+            "self_play": mean_return(self_play & usual_start),
+            "cross_play": mean_return(~self_play),
+            "shaped_per_step": jnp.mean(rollout.shaped),
+        }

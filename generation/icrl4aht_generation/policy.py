@@ -1,0 +1,47 @@
+"""The policy type that egos and teammates share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, Key
+
+from icrl4aht_data.overcooked.actions import ACTIONS
+
+Noise = Literal["fixed", "seeded"]
+"""Source of a heuristic teammate's randomness: "fixed", the published PRNGKey(slot) in every episode, for results that
+compare with the paper's; or "seeded", a new key in every episode."""
+
+
+class Policy(NamedTuple):
+    """A policy for one agent of one environment, as pure functions without a batch axis; roll-outs vmap them.
+
+    Attributes:
+        params: pytree of arrays that the functions take as an argument, so that policies which differ only in their
+            parameters share one compilation.
+        init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, of a task.
+        act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
+        sees: content of `view`: "state" for the state record, uint8 (S,); "observation" for uint8 (5, 5, C); "percept",
+            for egos in evaluation only, for the observation with the outcome of the previous step
+            (`icrl4aht_baselines.agents.Percept`).
+    """
+
+    params: Any
+    init: Callable[[Any, Key[Array, ""]], Any]
+    act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]
+    sees: Literal["state", "observation", "percept"]
+
+
+def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:
+    """Returns an action, or with a chance one that is drawn uniformly from the six actions."""
+    whether, which = jax.random.split(key)
+    drawn = jax.random.randint(which, (), 0, len(ACTIONS))
+    return jnp.where(jax.random.uniform(whether) < chance, drawn, action)
+
+
+def stacked(trees: Iterable[Any]) -> Any:
+    """Returns one pytree whose leaves are those of all trees, stacked on a new first axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

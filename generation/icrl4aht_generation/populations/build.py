@@ -1,0 +1,239 @@
+"""Builds a suite of learned teammates, and reports how they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from icrl4aht_data.benchmark.facts import (
+    ALGORITHMS,
+    EPISODE_STEPS,
+    HEURISTIC_KINDS,
+    TRACKS,
+    layout_number,
+    track_layouts,
+    track_of,
+)
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.plotting import check_can_draw
+from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_generation.learners.resume import BusyError
+from icrl4aht_generation.plotting import plot_matrix
+from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
+from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
+from icrl4aht_generation.populations.select import TeammateSelection, select_teammates, write_manifests
+from icrl4aht_generation.populations.train import (
+    PopulationRun,
+    is_trained,
+    play_matrix,
+    suite_checkpoints,
+    train_population,
+)
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.progress import progress_bars
+from icrl4aht_generation.teammates.instances import published_thetas
+from icrl4aht_generation.teammates.learned import build_learned
+from icrl4aht_generation.teammates.registry import build_teammate
+
+
+def build_suite(
+    profile: Profile,
+    suite: Path,
+    algorithms: Mapping[str, Sequence[str]],
+    seed: int,
+    console: Console,
+) -> list[TeammateSelection]:
+    """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
+
+    Populations that another process trains are left to it, and waited for at the end.
+
+    Args:
+        profile: sizes of the populations.
+        suite: the suite's folder.
+        algorithms: layout -> algorithms.
+        seed: seed of the suite.
+        console: where progress is printed.
+
+    Returns:
+        The selected teammates of each population in `algorithms`.
+
+    Raises:
+        OptionError: if matplotlib is not installed.
+    """
+    check_can_draw()  # before the long work, not after it
+    for name in chain(*algorithms.values()):
+        if name not in ALGORITHMS:
+            raise unknown("algorithm", name, ALGORITHMS)
+    config = profile.teammates
+    todo = population_runs(profile, algorithms, seed)
+    wanted = [(run.layout.name, run.algorithm) for run in todo]
+    for wait in (False, True):
+        todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
+    selections = [
+        select_teammates(suite, name, algorithm, config.train, config.heldout, seed)
+        for name in training_layouts()
+        for algorithm in ALGORITHMS
+        if is_trained(suite, name, algorithm)
+    ]
+    for selection in selections:
+        console.print(_describe(selection, config.train))
+    for path in write_manifests(suite, selections):
+        console.print(f"wrote {path}")
+    return [selection for selection in selections if (selection.layout, selection.algorithm) in wanted]
+
+
+def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], seed: int) -> list[PopulationRun]:
+    """The populations by these algorithms of each layout, each with a seed of its own."""
+    config = profile.teammates
+    return [
+        PopulationRun(
+            get_layout(name),
+            algorithm,
+            config.members,
+            config.ppo,
+            seed + 1000 * layout_number(name) + 100 * ALGORITHMS.index(algorithm),
+        )
+        for name, wanted in algorithms.items()
+        for algorithm in wanted
+    ]
+
+
+def training_layouts() -> list[str]:
+    """The layouts of all training tasks."""
+    return list(dict.fromkeys(name for track in TRACKS for name in track_layouts(track, "train")))
+
+
+def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bool:
+    """Returns whether the population is finished now; False if another process trains it."""
+    label = f"{run.algorithm} on {run.layout.name}"
+    last: dict[str, float] = {}
+    with progress_bars(console) as bars:
+        bar = bars.add_task(label, total=run.updates, note="compiling")
+
+        def on_update(update: int, updates: int, metrics: dict[str, float]) -> None:
+            last.update(metrics)
+            note = f"{metrics['steps_per_second']:,.0f} steps/s, self-play {last.get('self_play', 0.0):.1f}"
+            bars.update(bar, completed=update, note=note)
+
+        try:
+            if not train_population(run, folder, on_update, wait=wait):
+                console.print(f"{label}: finished before")
+                return True
+        except BusyError:
+            console.print(f"{label}: another process is training it")
+            return False
+    console.print(
+        f"{label}: {last['step']:,} steps a member at {last['steps_per_second']:,.0f} steps/s (all environments), "
+        f"last self-play return {last.get('self_play', 0.0):.1f} (400 steps)"
+    )
+    return True
+
+
+def _describe(selection: TeammateSelection, wanted: int) -> str:
+    few = f"; only {len(selection.train)} of {wanted}" if len(selection.train) < wanted else ""
+    return (
+        f"{selection.algorithm} on {selection.layout}: {selection.good} of {selection.candidates} checkpoints exceed "
+        f"the threshold; {len(selection.train)} for training, {len(selection.heldout)} held out{few}"
+    )
+
+
+def report_diversity(
+    suite: Path,
+    layouts: Sequence[str],
+    algorithms: Sequence[str],
+    greedy: bool,
+    console: Console,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
+
+    Args:
+        suite: the suite's folder.
+        layouts: names; by default the layouts that have all their populations.
+        algorithms: the populations.
+        greedy: whether teammates take their most probable actions.
+        console: where to print.
+        out: folder of the pictures; by default the suite's.
+        overwrite: replace pictures.
+
+    Raises:
+        OptionError: if a population is not finished, or no layout has all of them; if a picture may not be written, see
+            `new_file.check_new_file`; if matplotlib is not installed.
+    """
+    check_can_draw()
+    out = out or suite
+    names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
+        name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
+    ]
+    if not names:
+        raise OptionError(
+            f"{suite}: no layout has all its populations finished; `icrl4aht-data teammates --suite {suite}` "
+            f"trains them, or name a --layout"
+        )
+    for name in names:
+        for picture in (_distances_picture(out, name), *(_cross_play_picture(out, name, each) for each in algorithms)):
+            check_new_file(picture, overwrite)
+    for name in names:
+        layout = get_layout(name)
+        for algorithm in algorithms:
+            _report_population(suite, layout, algorithm, greedy, out, console)
+        _report_distances(suite, layout, algorithms, out, console)
+
+
+def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, out: Path, console: Console) -> None:
+    returns = play_matrix(suite, layout, algorithm, greedy)
+    members = [f"m{k}" for k in range(len(returns))]
+    diagonal = np.eye(len(returns), dtype=bool)
+    title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
+    console.print(_matrix_table(title, "ego \\ teammate", members, returns, ".1f"))
+    self_play = returns[diagonal].mean()
+    cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
+    console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
+    path = _cross_play_picture(out, layout.name, algorithm)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_matrix(returns, members, path, f"{algorithm}, {layout.name}: return", ("ego", "teammate"))
+    console.print(f"wrote {path}")
+
+
+def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], out: Path, console: Console) -> None:
+    policies, families = [], {}
+    for algorithm in algorithms:
+        points = list(suite_checkpoints(suite, layout.name, algorithm))
+        families[algorithm] = range(len(policies), len(policies) + len(points))
+        policies += [build_learned(layout, suite / point.path) for point in points]
+    for kind, short in HEURISTIC_KINDS.items():
+        thetas = published_thetas(layout.name, kind)
+        families[short] = range(len(policies), len(policies) + len(thetas))
+        policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
+    distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
+    labels = list(families)
+    console.print(_matrix_table(f"{layout.name}: mean Hamming distance of families", "", labels, distances, ".2f"))
+    path = _distances_picture(out, layout.name)
+    plot_matrix(distances, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
+    console.print(f"wrote {path} ({track_of(layout.name)} track)")
+
+
+def _cross_play_picture(out: Path, layout: str, algorithm: str) -> Path:
+    return out / layout / algorithm / "cross_play.png"
+
+
+def _distances_picture(out: Path, layout: str) -> Path:
+    return out / layout / "distances.png"
+
+
+def _matrix_table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:
+    """A square matrix with the same names for rows and columns."""
+    table = Table(title=title)
+    table.add_column(corner)
+    for name in names:
+        table.add_column(name, justify="right")
+    for name, row in zip(names, values, strict=True):
+        table.add_row(name, *(f"{value:{form}}" for value in row))
+    return table

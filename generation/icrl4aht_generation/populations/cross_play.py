@@ -1,0 +1,91 @@
+"""Returns of learned policies with each other, over complete training episodes, by one compiled roll-out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.rollout import Player, init_rollout, network_player, roll_out
+
+EPISODES_PER_PAIR = 20
+"""Paper, App. B.1."""
+
+
+def cross_play_returns(
+    layout: Layout,
+    network: ActorCritic,
+    egos: Any,
+    teammates: Any,
+    seed: int = 0,
+    episodes: int = EPISODES_PER_PAIR,
+    greedy: bool = False,
+) -> np.ndarray:
+    """Mean returns of all pairs over episodes of 400 steps.
+
+    Args:
+        layout: the layout.
+        network: the network of all policies.
+        egos: parameters of A policies, stacked on a leading axis.
+        teammates: parameters of B policies.
+        seed: seed of the episodes and the actions.
+        episodes: episodes of each pair.
+        greedy: whether teammates take their most probable actions, as in the dataset. All other policies draw theirs,
+            as in training, since two greedy policies can block each other for ever.
+
+    Returns:
+        float64 (A, B).
+    """
+    a, b = (jax.tree.leaves(params)[0].shape[0] for params in (egos, teammates))
+    first, second = np.divmod(np.arange(a * b), b)
+    play = _compiled(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)
+    return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64).reshape(a, b)
+
+
+def paired_returns(
+    layout: Layout,
+    network: ActorCritic,
+    egos: Any,
+    teammates: Any,
+    seed: int = 0,
+    episodes: int = EPISODES_PER_PAIR,
+    greedy: bool = False,
+) -> np.ndarray:
+    """Mean returns float64 (A,) of ego i with teammate i; arguments as in `cross_play_returns`."""
+    pairs = tuple(range(jax.tree.leaves(egos)[0].shape[0]))
+    play = _compiled(layout, network.widths, network.partners, pairs, pairs, episodes, greedy)
+    return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
+
+
+@lru_cache(maxsize=32)
+def _compiled(
+    layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
+) -> Callable[[Any, Any, jax.Array], jax.Array]:
+    """A function of both stacks and a key that returns the mean return of each pair (first[k], second[k])."""
+    env, network = Environment(layout), ActorCritic(widths, partners)
+    n = len(first) * episodes
+    policies = [np.repeat(np.array(side), episodes) for side in (first, second)]
+
+    def player(params: Any, agent: int, greedy: bool) -> Player:
+        numbers = range(max(policies[agent]) + 1)
+        slots = np.stack([(policies[agent] == number).nonzero()[0] for number in numbers]) + agent * n
+        return network_player(env, network, params, slots, jnp.zeros(slots.shape, jnp.int32), greedy)
+
+    @jax.jit
+    def play(egos, teammates, key):
+        players = [player(egos, EGO, False), player(teammates, TEAMMATE, greedy)]
+        carry = init_rollout(env, players, jax.random.split(jax.random.fold_in(key, 0), n))
+        _, rollout = roll_out(env, players, carry, EPISODE_STEPS, jax.random.fold_in(key, 1))
+        return rollout.reward.sum(axis=0).reshape(len(first), episodes).mean(axis=1)
+
+    return play

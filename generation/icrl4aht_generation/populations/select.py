@@ -1,0 +1,135 @@
+"""Selects the teammates of tasks from a suite's checkpoints (paper, App. B.1 "Checkpoint Quality Filtering")."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, track_of
+from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.locks import lock_path, process_lock
+from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
+from icrl4aht_generation.populations.train import SuiteCheckpoint, suite_checkpoints
+
+THRESHOLD = 20.0
+"""Returns of 400 steps that a teammate must exceed (paper, App. B.1)."""
+
+
+@dataclass(frozen=True)
+class TeammateSelection:
+    """Teammates selected from one population.
+
+    Attributes:
+        layout: name of the layout.
+        algorithm: the population's algorithm.
+        candidates: number of its checkpoints.
+        good: number of those above the threshold.
+        train: teammates of training tasks.
+        heldout: teammates of held-out tasks.
+    """
+
+    layout: str
+    algorithm: str
+    candidates: int
+    good: int
+    train: list[SuiteCheckpoint]
+    heldout: list[SuiteCheckpoint]
+
+
+def select_teammates(
+    suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0
+) -> TeammateSelection:
+    """Draw teammates from the checkpoints whose return as teammates exceeds the threshold.
+
+    They are drawn from the sorted list with a fixed seed, from the members in turn: checkpoints of one member resemble
+    each other. If there are too few for both splits, at most a fifth are held out.
+
+    Args:
+        suite: the suite's folder.
+        layout: name of the layout.
+        algorithm: the population's algorithm.
+        train: largest number of training teammates.
+        heldout: largest number of held-out teammates.
+        seed: seed of the draw.
+
+    Raises:
+        OptionError: if the population is not finished, or was made by a version that did not measure these returns.
+    """
+    candidates = list(suite_checkpoints(suite, layout, algorithm))
+    good = [point for point in candidates if _return_as_teammate(suite, point) > THRESHOLD]
+    order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
+    held_out = min(heldout, max(len(good) - train, len(good) // 5))
+    chosen = _members_in_turn([good[k] for k in order])
+    return TeammateSelection(
+        layout, algorithm, len(candidates), len(good), chosen[held_out : held_out + train], chosen[:held_out]
+    )
+
+
+def _members_in_turn(points: Sequence[SuiteCheckpoint]) -> list[SuiteCheckpoint]:
+    """The first of each member in the given order, then the second of each, and so on."""
+    seen: Counter[int] = Counter()
+    turns = []
+    for point in points:
+        turns.append(seen[point.card["member"]])
+        seen[point.card["member"]] += 1
+    return [points[k] for k in np.argsort(turns, kind="stable")]
+
+
+def _return_as_teammate(suite: Path, point: SuiteCheckpoint) -> float:
+    try:
+        return point.card["teammate_return"]
+    except KeyError as error:
+        raise OptionError(
+            f"{suite / point.path}: its card has no 'teammate_return', an earlier version made it: train the suite "
+            f"again, in another folder"
+        ) from error
+
+
+def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str) -> list[Task]:
+    """One task per teammate, each with a seed that does not depend on the rest of the suite."""
+    tasks = []
+    for selection in selections:
+        first = 10_000 * (layout_number(selection.layout) + 1) + 1_000 * ALGORITHMS.index(selection.algorithm)
+        chosen = selection.train if split == "train" else selection.heldout
+        for number, point in enumerate(chosen):
+            entry = _entry(suite, selection.algorithm, number, point)
+            seed = first + number + (split != "train") * len(selection.train)
+            tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed))
+    return tasks
+
+
+def _entry(suite: Path, algorithm: str, number: int, point: SuiteCheckpoint) -> dict[str, Any]:
+    return {
+        "kind": "rl",
+        "family": algorithm,
+        "theta_id": number,
+        "base_seed": point.card["seed"],
+        "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / POLICY_WEIGHTS)},
+    }
+
+
+def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> list[Path]:
+    """Write SUITE/manifests/<track>_train.jsonl and _heldout.jsonl for the tracks that have teammates; returns them."""
+    folder = suite / "manifests"
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    with process_lock(lock_path(folder)):  # several processes may train one suite
+        for track in TRACKS:
+            own = [selection for selection in selections if track_of(selection.layout) == track]
+            for split in ("train", "heldout"):
+                path, tasks = folder / f"{track}_{split}.jsonl", make_tasks(suite, own, split)
+                if not tasks:
+                    path.unlink(missing_ok=True)
+                    continue
+                with atomic_write(path) as partial:
+                    write_tasks(partial, tasks)
+                written.append(path)
+    return written

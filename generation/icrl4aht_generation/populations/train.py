@@ -1,0 +1,412 @@
+"""The suite of learned teammates: populations trained into folders of checkpoints (paper, App. B.1).
+
+    SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
+    SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, if the algorithm trains them
+    SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, curves.png, population.json
+
+`population.json` is written last and has the hash of every file. Before that, `resume.safetensors` holds the state from
+which a stopped run resumes to the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
+from icrl4aht_data.utils.hashes import file_hash, hashes_hold
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.checkpoint import (
+    POLICY_CARD,
+    POLICY_CHECKPOINTS,
+    POLICY_WEIGHTS,
+    checkpoint_updates,
+    load_card,
+    load_policy,
+    save_policy,
+)
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.population.brdiv import BRDiv
+from icrl4aht_generation.learners.population.comedi import CoMeDi
+from icrl4aht_generation.learners.population.fcp import FCP
+from icrl4aht_generation.learners.population.lbrdiv import LBRDiv
+from icrl4aht_generation.learners.population.population import Population, PopulationState
+from icrl4aht_generation.learners.resume import (
+    METRICS,
+    RunLog,
+    SaveInterval,
+    StateFile,
+    differing_settings,
+    run_lock,
+    software_versions,
+)
+from icrl4aht_generation.plotting import plot_training
+from icrl4aht_generation.policy import stacked
+from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR, cross_play_returns, paired_returns
+
+POPULATION_SAVE_SECONDS = 60.0
+"""Interval of saves: the work that a kill can cost."""
+
+_SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
+RESPONSES = "responses"
+"""Folder of a population's final best responses, if its algorithm trains any."""
+
+POPULATION = "population.json"
+"""The record of a finished population."""
+
+_RESUME = "resume.safetensors"
+
+PopulationCallback = Callable[[int, int, dict[str, float]], None]
+"""Called after each update with its number, the number of all updates, and the metrics."""
+
+
+@dataclass(frozen=True)
+class PopulationRun:
+    """The training of one population on one layout.
+
+    Attributes:
+        layout: the layout.
+        algorithm: one of `ALGORITHMS`.
+        members: policies for the suite. CoMeDi trains one more, the first, by self-play alone: the others are compared
+            with it, and it is no teammate itself.
+        config: hyper-parameters of each policy.
+        seed: seed of everything.
+
+    Raises:
+        OptionError: for an unknown algorithm, and for sizes that do not fit it.
+    """
+
+    layout: Layout
+    algorithm: str
+    members: int
+    config: PPOConfig
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.algorithm not in ALGORITHMS:
+            raise unknown("algorithm", self.algorithm, ALGORITHMS)
+        if self.config.updates < POLICY_CHECKPOINTS:
+            raise OptionError(
+                f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "
+                f"{POLICY_CHECKPOINTS}, one for each checkpoint"
+            )
+        try:
+            for stage in self.stages:
+                _ = stage.assignment
+        except ValueError as error:
+            raise OptionError(f"teammates, {self.algorithm} with {self.members} members: {error}") from error
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings that the population depends on."""
+        return {
+            "layout": self.layout.name,
+            "algorithm": self.algorithm,
+            "members": self.members,
+            "policies": self.members + (self.algorithm == "comedi"),
+            "config": asdict(self.config),
+            "seed": self.seed,
+            "code_version": version("icrl4aht-data"),
+        }
+
+    @property
+    def settings_hash(self) -> str:
+        """Hash of the settings."""
+        return json_hash(self.settings)
+
+    @cached_property
+    def stages(self) -> list[Population]:
+        """The stages of training, one after the other; CoMeDi trains one policy in each, the first by self-play."""
+        env = Environment(self.layout)
+        if self.algorithm == "comedi":
+            first = Population(env, FCP(1), self.config, partners=2)
+            return [first, *[Population(env, CoMeDi(), self.config)] * self.members]
+        kinds = {"fcp": FCP, "brdiv": BRDiv, "lbrdiv": LBRDiv}
+        return [Population(env, kinds[self.algorithm](self.members), self.config)]
+
+    @property
+    def has_best_responses(self) -> bool:
+        """Whether the members' partners in training are best responses."""
+        return self.algorithm in ("brdiv", "lbrdiv")
+
+    @property
+    def updates(self) -> int:
+        """Updates of all stages."""
+        return len(self.stages) * self.config.updates
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all environments and stages."""
+        return self.config.updates * sum(stage.steps_per_update for stage in self.stages)
+
+
+def is_population_finished(folder: Path, run: PopulationRun) -> bool:
+    """Returns whether a folder has this population under these settings, with all its files unchanged."""
+    try:
+        content = json.loads((folder / POPULATION).read_text(encoding="utf-8"))
+        same = content["settings_hash"] == run.settings_hash
+        return same and hashes_hold(folder, content["files"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def train_population(
+    run: PopulationRun,
+    folder: Path,
+    on_update: PopulationCallback = lambda update, updates, metrics: None,
+    *,
+    wait: bool = False,
+    save_seconds: float = POPULATION_SAVE_SECONDS,
+) -> bool:
+    """Train a population into `folder`, resuming a stopped run of the same settings.
+
+    Args:
+        run: the population.
+        folder: its folder.
+        on_update: called after each update.
+        wait: whether to wait for another process that trains it.
+        save_seconds: least time between two saves.
+
+    Returns:
+        Whether there was anything to do; False if the population was finished before.
+
+    Raises:
+        BusyError: if another process trains into this folder.
+        OptionError: if it holds a run of other settings.
+    """
+    with run_lock(folder, wait=wait):
+        folder.mkdir(exist_ok=True)
+        if is_population_finished(folder, run):
+            return False
+        _PopulationTraining(run, folder, on_update, save_seconds).train()
+        return True
+
+
+class _PopulationTraining:
+    """A run in its folder, whose lock is held."""
+
+    def __init__(self, run: PopulationRun, folder: Path, on_update: PopulationCallback, save_seconds: float) -> None:
+        self.run, self.folder, self.on_update = run, folder, on_update
+        self.saved = StateFile(folder / _RESUME, run.settings | software_versions())
+        self.interval = SaveInterval(run.updates, seconds=save_seconds)
+
+    def train(self) -> None:
+        if (self.folder / POPULATION).exists():
+            raise OptionError(
+                f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
+            )
+        done, state = self._resume()
+        updates = self.run.config.updates
+        with RunLog(self.folder, lambda line: line["stage"] * updates + line["update"] < done) as log:
+            for stage in range(max(0, done - 1) // updates, len(self.run.stages)):
+                self._train_stage(stage, state, log)
+                state = None
+        self._finish()
+
+    def _resume(self) -> tuple[int, PopulationState | None]:
+        """Number of updates done over all stages, and the state after them; None at the start."""
+        done = self.saved.progress
+        if done is None:  # remove the checkpoints of a run that was killed before its first save
+            for folder in (*self.folder.glob("m[0-9]*"), self.folder / RESPONSES):
+                shutil.rmtree(folder, ignore_errors=True)
+            return 0, None
+        stage = (done - 1) // self.run.config.updates
+        return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
+
+    def _difference(self) -> str:
+        """Returns a text that names the settings in which a finished population differs from this run."""
+        try:
+            found = json.loads((self.folder / POPULATION).read_text(encoding="utf-8"))["settings"]
+            other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
+        except (OSError, ValueError, KeyError, AttributeError):
+            other = {}
+        return f"of other settings: {other}" if other else "with changed files"
+
+    def _key(self, stage: int):
+        return jax.random.fold_in(jax.random.key(self.run.seed), stage)
+
+    def _train_stage(self, stage: int, resumed: PopulationState | None, log: RunLog) -> None:
+        population, updates = self.run.stages[stage], self.run.config.updates
+        state: PopulationState = resumed or jax.jit(population.init)(self._key(stage))
+        update = jax.jit(population.update, donate_argnums=0)
+        moments = checkpoint_updates(self.run.config)
+        started, first = time.perf_counter(), int(state.update)
+        for number in range(first, updates):
+            if self.run.algorithm == "comedi" and stage and number % max(1, updates // _SELECTIONS) == 0:
+                state = state._replace(params=self._with_nearest_member(state.params, stage, number))
+            state, metrics = update(state)
+            seconds = time.perf_counter() - started
+            line = self._line(stage, number, metrics)
+            speed = {"steps_per_second": round((number + 1 - first) * population.steps_per_update / seconds, 1)}
+            log.write(line, timing={"stage": stage, "update": number} | speed)
+            done = stage * updates + number + 1
+            self.on_update(done, self.run.updates, line | speed)
+            if number + 1 in moments:
+                self._save_checkpoints(stage, moments.index(number + 1), number + 1, state.params)
+            if self.interval.due(done):
+                log.sync()
+                self.saved.save(state, done)
+
+    def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
+        """A line of the log; means over no episodes are left out."""
+        values = {name: float(value) for name, value in metrics.items()}
+        if not values["episodes"]:
+            del values["self_play"], values["cross_play"]
+        elif self.run.stages[stage].assignment.self_play.all():
+            del values["cross_play"]
+        return {
+            "stage": stage,
+            "update": number,
+            "step": (number + 1) * self.run.config.steps_per_update,
+            **values,
+        }
+
+    def _with_nearest_member(self, params: Any, stage: int, number: int) -> Any:
+        """The parameters with the former member that plays best with the new one as the frozen policy (paper, App.
+        B.1, "Partner Selection")."""
+        network, layout = self.run.stages[stage].network, self.run.layout
+        last = POLICY_CHECKPOINTS - 1
+        former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
+        new = jax.tree.map(lambda leaf: leaf[:1], params)
+        returns = cross_play_returns(layout, network, new, former, seed=number)[0]
+        returns = returns + cross_play_returns(layout, network, former, new, seed=number)[:, 0]
+        nearest = int(np.argmax(returns))
+        return jax.tree.map(lambda leaf, old: leaf.at[1].set(old[nearest]), params, former)
+
+    def _save_checkpoints(self, stage: int, checkpoint: int, update: int, params: Any) -> None:
+        run, population = self.run, self.run.stages[stage]
+        count = 1 if run.algorithm == "comedi" else run.members
+        members = jax.tree.map(lambda leaf: leaf[:count], params)
+        partners = jax.tree.map(lambda leaf: leaf[count : 2 * count], params) if run.has_best_responses else members
+        returns, as_teammate = (
+            paired_returns(run.layout, population.network, partners, members, greedy=greedy) for greedy in (False, True)
+        )
+        for k in range(count):
+            card = {
+                "algorithm": run.algorithm,
+                "layout": run.layout.name,
+                "member": stage + k,
+                "checkpoint": checkpoint,
+                "step": update * run.config.steps_per_update,
+                "seed": run.seed,
+                "code_version": version("icrl4aht-data"),
+                "seats": [1] if run.has_best_responses else [0, 1],
+                "return": float(returns[k]),
+                "teammate_return": float(as_teammate[k]),
+                "return_of": f"{EPISODES_PER_PAIR} episodes of 400 steps with its best response or itself, both "
+                "drawing their actions; as a teammate it acts greedily, in seat 1",
+            }
+            own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
+            save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
+            if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
+                response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
+                path = self.folder / RESPONSES / f"m{k}"
+                save_policy(path, population.network, response, card | {"role": "best response", "seats": [0]})
+
+    def _finish(self) -> None:
+        title = f"{self.run.algorithm}, {self.run.layout.name}"
+        plot_training(self.folder / METRICS, self.folder / "curves.png", title)
+        files = {
+            str(path.relative_to(self.folder)): file_hash(path)
+            for name in (POLICY_WEIGHTS, POLICY_CARD)
+            for path in sorted(self.folder.rglob(name))
+        }
+        content = {
+            "settings_hash": self.run.settings_hash,
+            "settings": self.run.settings,
+            "software": software_versions(),
+            "files": files,
+        }
+        with atomic_write(self.folder / POPULATION) as partial:
+            write_json(partial, content)
+        (self.folder / _RESUME).unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class SuiteCheckpoint:
+    """A checkpoint of a suite.
+
+    Attributes:
+        path: relative to the suite's folder.
+        card: its card.
+    """
+
+    path: str
+    card: dict[str, Any]
+
+    @property
+    def is_member(self) -> bool:
+        """Whether the population's objective shaped the policy: all but CoMeDi's first one, plain self-play."""
+        return self.card["algorithm"] != "comedi" or self.card["member"] > 0
+
+
+def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
+    """Returns whether a suite has this population and it is finished."""
+    return (suite / layout / algorithm / POPULATION).is_file()
+
+
+def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
+    """Number of XLA threads that trained a suite's population; None if the suite does not say."""
+    try:
+        content = json.loads((suite / layout / algorithm / POPULATION).read_text(encoding="utf-8"))
+        return content["software"]["xla_threads"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
+    """Yields the checkpoints of a population's members, by member and checkpoint.
+
+    Without those of CoMeDi's first policy, which is trained as FCP's are (see `SuiteCheckpoint.is_member`).
+
+    Raises:
+        OptionError: if the population is not finished.
+    """
+    folder = suite / layout / algorithm
+    if not is_trained(suite, layout, algorithm):
+        raise OptionError(f"{folder}: no finished population; run `icrl4aht-data teammates --layout {layout}`")
+    found = [path.parent for path in folder.glob(f"m*/c*/{POLICY_WEIGHTS}")]
+    for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
+        point = SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
+        if point.is_member:
+            yield point
+
+
+def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
+    """Mean returns float64 (K, K) of a population's final policies with each other.
+
+    Args:
+        suite: the suite's folder.
+        layout: the layout.
+        algorithm: the population's algorithm.
+        greedy: whether teammates take their most probable actions.
+
+    Returns:
+        Rows are egos (best responses, if the algorithm trains them), columns members as teammates; the diagonal is
+        self-play.
+
+    Raises:
+        OptionError: if the population is not finished.
+    """
+    final = f"c{POLICY_CHECKPOINTS - 1}"
+    last = [point for point in suite_checkpoints(suite, layout.name, algorithm) if point.path.endswith(final)]
+    loaded = [load_policy(suite / point.path) for point in last]
+    members = stacked([params for _, params, _ in loaded])
+    folder = suite / layout.name / algorithm / RESPONSES
+    egos = members
+    if folder.is_dir():
+        egos = stacked([load_policy(folder / f"m{point.card['member']}")[1] for point in last])
+    return cross_play_returns(layout, loaded[0][0], egos, members, greedy=greedy)

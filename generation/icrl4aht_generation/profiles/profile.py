@@ -1,0 +1,268 @@
+"""What a profile says: the sizes of a rebuild and the units of work that it consists of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from icrl4aht_data.benchmark.facts import (
+    HEURISTIC_KINDS,
+    LAYOUT_NAMES,
+    PAPER_TEAMMATE_STEPS,
+    PAPER_TEAMMATES,
+    SOURCES,
+    track_of,
+)
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.commands.dataclass_options import replace_given
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import json_hash
+from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.teammates.draws import drawn_teammates
+from icrl4aht_generation.teammates.registry import heuristic_teammate
+
+LEAST_EPISODES = 5
+"""Episodes of a stream: its start and its end are means over five."""
+
+VALIDATION_DRAWS = 1
+"""The base seed of validation teammates; training teammates are drawn with 0, so that no draw is in both splits."""
+
+_SOURCE_SEEDS, _LAYOUT_SEEDS, _FAMILY_SEEDS, _DRAW_SEEDS = 1_000_000, 10_000, 1_000, 500
+_UNSAMPLED_SEEDS = 500_000  # tasks with presets and learned teammates come behind those with drawn ones
+
+
+@dataclass(frozen=True)
+class TeammateConfig:
+    """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1).
+
+    Attributes:
+        members: policies of each algorithm's population.
+        train: teammates of each algorithm for the training tasks.
+        heldout: further ones, for the in-distribution check.
+        ppo: hyper-parameters of every policy.
+    """
+
+    members: int = option_field(10, "Policies of each population.", at_least=1)
+    train: int = option_field(PAPER_TEAMMATES, "Teammates of each algorithm for training tasks.", at_least=1)
+    heldout: int = option_field(5, "Held-out teammates of each algorithm.", at_least=0)
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000
+        )
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class SampledConfig:
+    """Heuristic teammates drawn from the published train ranges, see `teammates.draws`.
+
+    Attributes:
+        families: layout -> families, which take turns.
+        per_layout: layout -> number of training teammates, which the source "noise" has all of.
+        ppo: layout -> how many of these, the first ones, learners of the source "ppo" play with.
+        validation: layout -> number of validation teammates, which only the source "noise" has.
+    """
+
+    families: dict[str, tuple[str, ...]]
+    per_layout: dict[str, int]
+    ppo: dict[str, int]
+    validation: dict[str, int]
+
+    def training(self, layout: str, source: str) -> list[dict[str, Any]]:
+        """The training teammates of a source on a layout.
+
+        Raises:
+            OptionError: if there are fewer draws that differ from the test instances.
+        """
+        drawn = drawn_teammates(layout, self.families[layout], self.per_layout[layout])
+        return [entry for entry, _ in (drawn[: self.ppo[layout]] if source == "ppo" else drawn)]
+
+    def validating(self, layout: str) -> list[dict[str, Any]]:
+        """The validation teammates on a layout.
+
+        Raises:
+            OptionError: if there are fewer draws that differ from the test instances.
+        """
+        drawn = drawn_teammates(layout, self.families[layout], self.validation[layout], VALIDATION_DRAWS)
+        return [entry for entry, _ in drawn]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The size of a rebuild.
+
+    Attributes:
+        name: of the profile's file.
+        ego: hyper-parameters of the egos.
+        teammates: the learned teammates.
+        data_version: version of the release, SemVer.
+        keep: streams of each task that the release keeps, best first.
+        layouts: names of the layouts.
+        sources: how histories are made: "ppo", "noise" or both.
+        learners: independent learners of each task of the source "ppo".
+        presets: teammates by the heuristic H4 `utility_greedy`, on every layout and of every source.
+        sampled: teammates by heuristics with sampled parameters.
+        algorithms: layout -> algorithms of its learned teammates.
+        ego_layouts: layout -> hyper-parameters of its egos, where they differ from `ego`.
+        noise: histories of the source "noise".
+        policies: whether the release has the policies that label its histories.
+        oracle_actions: whether the release has the scripted oracle's action at every step.
+        least_improvement: how much a stream's end must exceed its start to be kept; None keeps the best in any case.
+        least_rise: how much the end of a task's kept histories must exceed their start, on average, for the release to
+            have the task; None has it in any case. Neither holds on layouts where the ego matters with no teammate.
+        xla_threads: threads of XLA on a CPU, so that every machine computes the same bits; None for all cores.
+
+    Raises:
+        OptionError: if there is no task, or the ego's sizes do not fit.
+    """
+
+    name: str
+    ego: PPOConfig
+    teammates: TeammateConfig
+    data_version: str
+    keep: int
+    layouts: tuple[str, ...]
+    sources: tuple[str, ...] = ("ppo",)
+    learners: int = 1
+    presets: tuple[str, ...] = ()
+    sampled: SampledConfig | None = None
+    algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    ego_layouts: dict[str, PPOConfig] = field(default_factory=dict)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    policies: bool = False
+    oracle_actions: bool = False
+    least_improvement: float | None = None
+    least_rise: float | None = None
+    xla_threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("xla_threads", "learners"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise OptionError(f"{name} = {value}: expected at least 1")
+        if not self.layouts or not (self.presets or self.sampled or self.algorithms):
+            raise OptionError(
+                "expected at least one of tasks.layouts, and one of tasks.presets, tasks.sampled or tasks.algorithms"
+            )
+        if "ppo" not in self.sources:
+            return
+        for ego in (self.ego, *self.ego_layouts.values()):
+            if not 0 < self.keep <= ego.environments * self.learners:
+                raise OptionError(f"release.keep = {self.keep}: expected 1..{ego.environments * self.learners}")
+            if ego.episodes < LEAST_EPISODES:
+                raise OptionError(
+                    f"ego.total_steps gives {ego.episodes} episodes a stream, expected at least {LEAST_EPISODES}"
+                )
+
+    def with_ego(self, given: Mapping[str, Any]) -> Profile:
+        """Returns the profile with some of the ego's hyper-parameters replaced, at any depth and on every layout.
+
+        Raises:
+            OptionError: if they do not fit.
+        """
+        try:
+            egos = {layout: replace_given(ego, given) for layout, ego in self.ego_layouts.items()}
+            return replace(self, ego=replace_given(self.ego, given), ego_layouts=egos)
+        except ValueError as error:
+            raise OptionError(f"profile {self.name} with the given options: {error}") from error
+
+    def ego_on(self, layout: str) -> PPOConfig:
+        """Hyper-parameters of the egos on a layout (short name)."""
+        return self.ego_layouts.get(layout, self.ego)
+
+    def updates(self, work: Work) -> int:
+        """Number of updates of a learner, or of histories of the source "noise": the units of its progress."""
+        return self.ego_on(work.task.layout.name).updates if work.source == "ppo" else self.noise.histories
+
+    def works(self, learned: Sequence[Task] = ()) -> list[Work]:
+        """The units of work, by source and layout.
+
+        Args:
+            learned: training tasks with learned teammates, see `populations.select.make_tasks`.
+
+        Raises:
+            OptionError: if a layout has too few draws of sampled teammates.
+        """
+        works = []
+        for source in self.sources:
+            for layout in self.layouts:
+                own = [task for task in learned if task.layout.name == layout]
+                tasks = [*self._heuristic_tasks(layout, source), *(_of_source(task, source) for task in own)]
+                works += [Work(task, source, learner) for task in tasks for learner in range(self._learners(source))]
+        return works
+
+    def works_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
+        """The units of work of given tasks.
+
+        Args:
+            tasks: the tasks.
+            sources: task id -> source; other tasks have the profile's first source.
+
+        Raises:
+            OptionError: if a task's source is none of the profile's.
+        """
+        works = []
+        for task in tasks:
+            source = sources.get(task.task_id, self.sources[0])
+            if source not in self.sources:
+                raise OptionError(
+                    f"task {task.task_id}: its source is {source}, those of profile {self.name} are "
+                    f"{', '.join(self.sources)}: choose a profile with both, or leave the task out"
+                )
+            works += [Work(task, source, learner) for learner in range(self._learners(source))]
+        return works
+
+    def _learners(self, source: str) -> int:
+        return self.learners if source == "ppo" else 1
+
+    def tasks_on(self, layout: str, source: str) -> int:
+        """Number of tasks of a source on a layout, if every population has enough good teammates."""
+        learned = len(self.algorithms.get(layout, ())) * self.teammates.train
+        return len(self._heuristic_tasks(layout, source)) + learned
+
+    def _heuristic_tasks(self, layout: str, source: str) -> list[Task]:
+        track, first = track_of(layout), self.layouts.index(layout) * len(self.presets)
+        tasks = [
+            make_task(track, "train", layout, heuristic_teammate("utility_greedy", preset, number), first + number)
+            for number, preset in enumerate(self.presets)
+        ]
+        tasks = [_of_source(task, source) for task in tasks]
+        if self.sampled is None:
+            return tasks
+        entries = [("train", entry) for entry in self.sampled.training(layout, source)]
+        if source == "noise":
+            entries += [("validation", entry) for entry in self.sampled.validating(layout)]
+        return tasks + [
+            make_task(track, split, layout, entry, _sampled_seed(layout, source, entry)) for split, entry in entries
+        ]
+
+    @property
+    def hash(self) -> str:
+        """Hash of the profile."""
+        return json_hash(asdict(self))
+
+
+def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
+    """A seed that no other task has, and that does not depend on the rest of the profile."""
+    family = list(HEURISTIC_KINDS).index(entry["family"])
+    first = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS + entry["base_seed"] * _DRAW_SEEDS
+    return _first_seed(source) + first + entry["theta_id"]
+
+
+def _of_source(task: Task, source: str) -> Task:
+    """A task with a preset or a learned teammate as one of a source: those of "ppo" keep their seed."""
+    if source == "ppo":
+        return task
+    seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed
+    return make_task(task.track, task.split, task.layout.name, task.teammate, seed)
+
+
+def _first_seed(source: str) -> int:
+    return (1 + SOURCES.index(source)) * _SOURCE_SEEDS

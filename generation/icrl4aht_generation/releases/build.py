@@ -1,0 +1,141 @@
+"""A complete rebuild: the teammates trained, every task of a profile collected, then packed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+
+from rich.console import Console
+
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.info import LeftOutTask, read_info
+from icrl4aht_data.format.provenance import ReferenceEgos
+from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.plotting import check_can_draw
+from icrl4aht_data.utils.locks import process_lock
+from icrl4aht_data.writing.card_content import read_content
+from icrl4aht_data.writing.card_tables import print_learning, teammate_name
+from icrl4aht_data.writing.statistics import print_statistics
+from icrl4aht_generation.collection.job import CollectionError
+from icrl4aht_generation.collection.options import CollectOptions
+from icrl4aht_generation.collection.run import collect_tasks
+from icrl4aht_generation.populations.build import build_suite
+from icrl4aht_generation.populations.headroom import learned_headroom
+from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.progress import progress_bars
+from icrl4aht_generation.releases.measures import teammate_facts
+from icrl4aht_generation.releases.package import check_release_folder, package_release
+
+SUITE = "suite"
+"""Name of the suite's folder in a rebuild."""
+
+
+def build_releases(
+    profile: Profile,
+    out: Path,
+    kinds: Sequence[Kind],
+    console: Console,
+    options: CollectOptions | None = None,
+    suite: Path | None = None,
+    seed: int = 0,
+    tasks: Sequence[Task] | None = None,
+    sources: Mapping[str, str] | None = None,
+) -> list[Path]:
+    """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
+
+    Args:
+        profile: the profile.
+        out: folder of the rebuild; tasks are collected under out/artefacts.
+        kinds: kinds of releases.
+        console: where progress is printed.
+        options: how tasks are collected.
+        suite: folder of the learned teammates: a suite, by default out/suite, or with `tasks` also the folder
+            TEAMMATES of a release.
+        seed: seed of the suite.
+        tasks: tasks to collect instead of the profile's, which trains no teammates.
+        sources: task id -> source of these tasks, where it is not the profile's first one.
+
+    Returns:
+        The release folders.
+
+    Raises:
+        CollectionError: if a task could not be collected; nothing is packed then.
+        OptionError: if something but a release of this profile is at out/<kind>, or if matplotlib is not installed.
+    """
+    check_can_draw()  # before the long work, not after it
+    for kind in kinds:
+        check_release_folder(out / kind, profile)
+    out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
+    if tasks is None:
+        works, headroom, left_out = train_teammates(profile, suite, seed, console)
+    else:
+        works, headroom, left_out = profile.works_of(tasks, sources or {}), {}, []
+    collect_tasks(works, profile, out, console, options or CollectOptions(), suite)
+    tasks = list({work.task.task_id: work.task for work in works}.values())
+    artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
+    with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
+        facts = teammate_facts(tasks, artefacts, suite, headroom)
+        for kind, release in zip(kinds, releases, strict=True):
+            with _packing_bars(kind, len(tasks), console) as advance:
+                package_release(
+                    artefacts, release, works, profile, suite, kind, advance, facts=facts, left_out=left_out
+                )
+        for release in releases:
+            print_statistics(read_info(release), console)
+            print_learning(read_content(release), console)
+    return releases
+
+
+@contextmanager
+def _packing_bars(kind: Kind, tasks: int, console: Console) -> Iterator[Callable[[int], None]]:
+    """Show the two steps of packing; yields a function that is called with the number of a task's finished step."""
+    with progress_bars(console) as bars:
+        steps = [f"choosing labellers for {kind}", f"packing {kind}"]
+        rows = [bars.add_task(step, total=tasks, note="", unit="tasks") for step in steps]
+        yield lambda step: bars.advance(rows[step])
+
+
+def train_teammates(
+    profile: Profile, suite: Path, seed: int, console: Console
+) -> tuple[list[Work], dict[str, ReferenceEgos], list[LeftOutTask]]:
+    """The units of work of a profile, for which its learned teammates are trained first.
+
+    Returns:
+        The units; task id -> how much an ego matters with learned teammates; the tasks that are not collected, because
+        it does not.
+
+    Raises:
+        CollectionError: if there is no task, because no teammate is good enough.
+    """
+    if not profile.algorithms:
+        return profile.works(), {}, []
+    selections = build_suite(profile, suite, profile.algorithms, seed, console)
+    learned = make_tasks(suite, selections, "train")
+    headroom = learned_headroom(learned, suite)
+    of_teammate = {task.teammate_key: headroom[task.task_id] for task in learned}
+    works, left_out = [], []
+    for work in profile.works(learned):
+        earned = of_teammate.get(work.task.teammate_key)
+        if earned is None or earned.matters:
+            works.append(work)
+        elif work.learner == 0:
+            reason = f"the ego does not matter: {earned.describe()}"
+            console.print(f"{work.task.task_id}: left out, {reason}")
+            task, name = work.task, teammate_name(work.task)
+            left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))
+    if not works and left_out:
+        raise CollectionError(
+            f"{suite}: the ego matters with none of the learned teammates: train others, or add drawn heuristics "
+            f"([tasks.sampled]) to profile {profile.name}"
+        )
+    if not works:
+        names = dict.fromkeys(chain(*profile.algorithms.values()))
+        raise CollectionError(
+            f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
+            f"teammate needs: raise teammates.total_steps in profile {profile.name}"
+        )
+    return works, headroom, left_out

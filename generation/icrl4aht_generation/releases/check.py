@@ -1,0 +1,121 @@
+"""Compares two rebuilds bit for bit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.schema import PROVENANCE
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_generation.collection.failures import FAILED
+from icrl4aht_generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS, METADATA
+from icrl4aht_generation.learners.resume import TIMING
+from icrl4aht_generation.populations.train import POPULATION
+
+_IGNORED = {TIMING, FAILED, FILTER_CURVES, LABELLER_RETURNS}
+"""Files about the course of a rebuild, and those that packing adds to artefacts."""
+
+_TEXT = {".json", ".jsonl", ".md", ".sha256"}
+
+
+@dataclass
+class Comparison:
+    """Result of a comparison.
+
+    Attributes:
+        files: number of files in either folder.
+        differences: file -> how it differs.
+        xla_threads: the numbers of XLA threads that made each folder, as far as they were recorded; results of
+            different numbers differ in their bits.
+    """
+
+    files: int = 0
+    differences: dict[str, str] = field(default_factory=dict)
+    xla_threads: tuple[list[int], list[int]] = ([], [])
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields, and whether the folders are equal."""
+        return {"equal": not self.differences, **asdict(self)}
+
+
+def compare_rebuilds(a: Path, b: Path) -> Comparison:
+    """Compare two folders by the hashes of their files.
+
+    Wall-clock figures, failures, hidden files and what packing adds to artefacts are left out.
+
+    Raises:
+        OptionError: if one is not a folder, or there is nothing to compare.
+    """
+    for folder in (a, b):
+        if not folder.is_dir():
+            raise OptionError(f"{folder}: no such folder")
+    ours, theirs = _files(a), _files(b)
+    result = Comparison(len(ours | theirs), xla_threads=(_xla_threads(a, ours), _xla_threads(b, theirs)))
+    if not result.files:
+        raise OptionError(f"{a} and {b}: no files to compare")
+    for name in sorted(ours | theirs):
+        if name not in theirs:
+            result.differences[name] = f"only in {a}"
+        elif name not in ours:
+            result.differences[name] = f"only in {b}"
+        elif file_hash(a / name) != file_hash(b / name):
+            result.differences[name] = _describe_difference(a / name, b / name)
+    return result
+
+
+def _files(root: Path) -> set[str]:
+    paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file() and path.name not in _IGNORED]
+    return {path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)}
+
+
+def _xla_threads(root: Path, names: set[str]) -> list[int]:
+    """The numbers of XLA threads in records of tasks, populations and releases; nothing of unreadable files."""
+    found = set()
+    for name in names:
+        if name.endswith((METADATA, POPULATION, PROVENANCE)):
+            try:
+                found |= set(_values(json.loads((root / name).read_text(encoding="utf-8")), "xla_threads"))
+            except (OSError, ValueError):
+                continue  # the comparison of files reports it
+    return sorted(value for value in found if isinstance(value, int))
+
+
+def _values(content: Any, name: str) -> Iterator[Any]:
+    """Yields the values of a key at any depth of a JSON value."""
+    if isinstance(content, dict):
+        if name in content:
+            yield content[name]
+        for value in content.values():
+            yield from _values(value, name)
+
+
+def _describe_difference(a: Path, b: Path) -> str:
+    if a.suffix == ".npy":
+        try:
+            return _describe_arrays(np.load(a, mmap_mode="r"), np.load(b, mmap_mode="r"))
+        except ValueError:  # one of them is not an array
+            pass
+    sizes = a.stat().st_size, b.stat().st_size
+    ours, theirs = np.memmap(a, np.uint8, "r") if sizes[0] else (), np.memmap(b, np.uint8, "r") if sizes[1] else ()
+    common = min(sizes)
+    wrong = np.flatnonzero(np.asarray(ours[:common]) != np.asarray(theirs[:common]))
+    first = int(wrong[0]) if len(wrong) else common
+    size = f"{sizes[0]} bytes" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} bytes"
+    line = f", line {1 + bytes(ours[:first]).count(10)}" if a.suffix in _TEXT else ""
+    return f"{size}, the first difference at byte {first}{line}"
+
+
+def _describe_arrays(a: np.ndarray, b: np.ndarray) -> str:
+    if (a.shape, a.dtype) != (b.shape, b.dtype):
+        return f"{a.dtype} {a.shape} and {b.dtype} {b.shape}"
+    wrong = np.argwhere(np.asarray(a != b))
+    if not len(wrong):
+        return "equal arrays, stored differently"
+    at = tuple(wrong[0].tolist())
+    return f"{len(wrong)} of {a.size} values, the first at {at}: {a[at]} and {b[at]}"

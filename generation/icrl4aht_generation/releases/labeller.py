@@ -1,0 +1,178 @@
+"""Which checkpoint of an ego labels its task's histories, by what the checkpoints earn with the task's teammate.
+
+The labeller is the last checkpoint, the paper's, unless an earlier one earns clearly more when it acts greedily, as
+labellers do. A policy that was trained to draw its actions can repeat the action "stay" when it always takes the most
+probable one, and a model that is trained on its labels would learn to do so, too. Of several independent learners the
+one whose labeller earns most labels the histories of all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+from icrl4aht_generation.collection.task import TEAMMATE_NOISE
+from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, checkpoint_path
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.resume import software_versions
+from icrl4aht_generation.learners.rollout import init_rollout, network_player, policy_player, roll_out
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.registry import build_teammate
+
+_LEAST_GAIN = 2.0  # what an earlier checkpoint must earn more: a tenth of a delivery per episode
+_STANDARD_ERRORS = 2.0  # and by how many standard errors of the difference
+
+
+@dataclass(frozen=True)
+class Labeller:
+    """The checkpoint of an ego whose greedy actions label the histories of its task.
+
+    Attributes:
+        folder: the checkpoint.
+        sha256: SHA-256 of its weights.
+        step: environment steps that it was trained for.
+        return_greedy: its mean return with the task's teammate, acting greedily.
+        return_sampled: its mean return with sampled actions.
+        last_return_greedy: greedy return of the same learner's last checkpoint.
+    """
+
+    folder: Path
+    sha256: str
+    step: int
+    return_greedy: float
+    return_sampled: float
+    last_return_greedy: float
+
+
+def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> Labeller:
+    """Choose the checkpoint that labels the histories of a task: of each learner's choice the one that earns most.
+
+    Args:
+        folders: the finished artefacts of the task's learners.
+        task: the task.
+        suite: folder of the learned teammates.
+    """
+    return max((learner_labeller(folder, task, suite) for folder in folders), key=lambda found: found.return_greedy)
+
+
+def learner_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
+    """Measure the checkpoints of a finished artefact, and choose the one that would label its histories.
+
+    The measurements are kept in the artefact, in `LABELLER_RETURNS`, and are not repeated there.
+
+    Args:
+        folder: the artefact.
+        task: its task.
+        suite: folder of the learned teammates.
+    """
+    metadata = json.loads(read_text(folder / METADATA))
+    checkpoints = [checkpoint_path(folder, number) for number in range(len(metadata["checkpoint_updates"]))]
+    hashes = [metadata["files"][(path / POLICY_WEIGHTS).relative_to(folder).as_posix()] for path in checkpoints]
+    settings = software_versions() | {
+        "checkpoints": hashes,
+        "episodes": LABEL_EPISODES,
+        "steps": KEPT_STEPS,
+        "noise": TEAMMATE_NOISE,
+    }
+    measured = _read(folder / LABELLER_RETURNS, settings)
+    if measured is None:
+        measured = _measure(checkpoints, task, suite)
+        with atomic_write(folder / LABELLER_RETURNS) as partial:
+            content = {way: returns.tolist() for way, returns in measured.items()}
+            partial.write_text(json.dumps({"settings": settings} | content) + "\n", encoding="utf-8")
+    greedy, sampled = (measured[way].mean(axis=1) for way in ("greedy", "sampled"))
+    chosen = choose_checkpoint(measured["greedy"])
+    step = metadata["checkpoint_updates"][chosen] * metadata["ego"]["environments"] * metadata["ego"]["rollout"]
+    return Labeller(
+        folder=checkpoints[chosen],
+        sha256=hashes[chosen],
+        step=step,
+        return_greedy=float(greedy[chosen]),
+        return_sampled=float(sampled[chosen]),
+        last_return_greedy=float(greedy[-1]),
+    )
+
+
+def choose_checkpoint(returns: np.ndarray) -> int:
+    """Number of the checkpoint that labels: the last one, or the best of those that earn clearly more.
+
+    An earlier checkpoint earns clearly more if the mean of its differences to the last one, episode by episode, is at
+    least 2 (a delivery is worth 20) and above two standard errors of that mean.
+
+    Args:
+        returns: (C, E), greedy returns of C checkpoints in the same E episodes.
+    """
+    differences = returns - returns[-1]
+    means = differences.mean(axis=1)
+    errors = differences.std(axis=1, ddof=1) / np.sqrt(returns.shape[1])
+    clearly = (means >= _LEAST_GAIN) & (means > _STANDARD_ERRORS * errors)
+    if not clearly.any():
+        return len(returns) - 1
+    best = np.where(clearly, means, -np.inf)
+    return len(best) - 1 - int(np.argmax(best[::-1]))  # of equal ones the latest
+
+
+def _read(path: Path, settings: dict[str, Any]) -> dict[str, np.ndarray] | None:
+    """The measurements in a file, as `_measure` returns them; None if there are none, or others than these."""
+    try:
+        content = parse_json(read_text(path))
+        if content.pop("settings") != settings:
+            return None
+        measured = {way: np.array(content[way], np.float64) for way in ("greedy", "sampled")}
+    except (IndexFormatError, KeyError, TypeError, ValueError, AttributeError):
+        return None
+    shape = len(settings["checkpoints"]), LABEL_EPISODES
+    usable = all(returns.shape == shape and np.isfinite(returns).all() for returns in measured.values())
+    return measured if usable else None
+
+
+def _measure(checkpoints: list[Path], task: Task, suite: Path) -> dict[str, np.ndarray]:
+    """Way of acting -> float64 (C, LABEL_EPISODES), the returns of C checkpoints."""
+    teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
+    key = jax.random.key(int(hashlib.sha256(task.task_id.encode()).hexdigest()[:8], 16))
+    measured: dict[str, list[np.ndarray]] = {"greedy": [], "sampled": []}
+    for path in checkpoints:
+        network, params, _ = load_policy(path)
+        play = _compiled(task.layout, network.widths, teammate._replace(params=()))
+        for way, returns in measured.items():
+            returns.append(np.asarray(play(params, way == "greedy", teammate.params, key), np.float64))
+    return {way: np.stack(returns) for way, returns in measured.items()}
+
+
+@lru_cache(maxsize=8)
+def _compiled(layout: Layout, widths: Widths, teammate: Policy) -> Callable[..., jax.Array]:
+    """A function of the ego's parameters, whether it acts greedily, the teammate's parameters and a key.
+
+    It returns the returns, float32 (LABEL_EPISODES,), of the first `KEPT_STEPS` steps of episodes, which are the same
+    ones for all egos. One compilation serves all teammates of one family on one layout.
+    """
+    env, network, n = Environment(layout, KEPT_STEPS), ActorCritic(widths), LABEL_EPISODES
+
+    @jax.jit
+    def play(params: Any, greedy: Any, teammate_params: Any, key: jax.Array) -> jax.Array:
+        ego = network_player(env, network, params, np.arange(n), jnp.zeros(n, jnp.int32), greedy)
+        players = [ego, policy_player(env, teammate, teammate_params, TEAMMATE, n)]
+        episodes, actions = jax.random.split(key)
+        carry = init_rollout(env, players, jax.random.split(episodes, n))
+        _, rollout = roll_out(env, players, carry, KEPT_STEPS, actions)
+        return rollout.reward.sum(axis=0)
+
+    return play

@@ -1,0 +1,183 @@
+"""Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
+
+Those of drawn teammates are in the table `teammates/draws.jsonl`, those of a release's teammates in its provenance.
+Others are measured once; the measurements are kept next to the artefacts, in hidden files `.<layout>.teammates.json`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.info import LeftOutTask
+from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+from icrl4aht_generation.learners.resume import software_versions
+from icrl4aht_generation.populations.headroom import learned_headroom
+from icrl4aht_generation.teammates.distances import nearest_test
+from icrl4aht_generation.teammates.draws import Draw, find_draw, hosted_families, read_draws
+from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_returns
+from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
+
+_DIGITS = 4
+
+
+class TeammateFacts(NamedTuple):
+    """Facts about the teammate of a task.
+
+    Attributes:
+        references: returns of the reference egos with it.
+        nearest: the test teammate, of any family, that acts most like it; None where it is unknown.
+    """
+
+    references: ReferenceEgos
+    nearest: NearestTest | None
+
+    @property
+    def matters(self) -> bool:
+        """Whether the ego matters with it."""
+        return self.references.matters
+
+
+def teammate_facts(
+    tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, ReferenceEgos] | None = None
+) -> dict[str, TeammateFacts]:
+    """Look up or measure the teammates of tasks, each once.
+
+    Args:
+        tasks: the tasks.
+        artefacts: folder of their artefacts, where measurements are kept.
+        suite: folder of the learned teammates: a suite, or the folder `teammates` of a release, whose provenance has
+            the facts.
+        headroom: task id -> measurements of learned teammates that were made before.
+
+    Returns:
+        task id -> facts.
+    """
+    headroom, recorded = headroom or {}, recorded_provenance(suite)
+    groups: dict[tuple[str, str], list[Task]] = {}
+    for task in tasks:
+        groups.setdefault(task.teammate_key, []).append(task)
+    found: dict[tuple[str, str], TeammateFacts] = {}
+    for key, members in groups.items():
+        draw, made = find_draw(key[0], members[0].teammate), recorded.get(members[0].task_id)
+        if draw is not None:
+            found[key] = _facts_of_draw(draw)
+        elif made is not None and made.references is not None:
+            found[key] = TeammateFacts(made.references, made.nearest_test)
+    unknown = [key for key in groups if key not in found]
+    for layout in dict.fromkeys(layout for layout, _ in unknown):
+        keys = [key for key in unknown if key[0] == layout]
+        chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
+        kept, settings = artefacts / f".{layout}.teammates.json", _settings(layout, chosen)
+        measured = _read(kept, settings)
+        if measured is None:
+            by_task = _measure(get_layout(layout), chosen, suite, headroom)
+            measured = [by_task[task.task_id] for task in chosen]
+            with atomic_write(kept) as partial:
+                partial.write_bytes(msgspec.json.encode({"settings": settings, "facts": measured}))
+        found |= dict(zip(keys, measured, strict=True))
+    return {task.task_id: found[key] for key, members in groups.items() for task in members}
+
+
+def recorded_provenance(suite: Path) -> dict[str, Provenance]:
+    """Returns the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
+    path = suite.parent / PROVENANCE
+    return read_provenance(path) if suite.name == TEAMMATES and path.is_file() else {}
+
+
+def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
+    """What measurements depend on."""
+    known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": REFERENCE_EPISODES}
+    return software_versions() | {"version": version("icrl4aht-data")} | known
+
+
+def _read(path: Path, settings: dict[str, Any]) -> list[TeammateFacts] | None:
+    """The measurements in a file; None if there are none, or others than these."""
+    try:
+        content = parse_json(read_text(path))
+        if content["settings"] != json.loads(json.dumps(settings)):
+            return None
+        return msgspec.convert(content["facts"], list[TeammateFacts])
+    except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
+        return None
+
+
+def _facts_of_draw(draw: Draw) -> TeammateFacts:
+    near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
+    if draw.other_distance < draw.distance:
+        near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
+    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), near)
+
+
+def _measure(
+    layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]
+) -> dict[str, TeammateFacts]:
+    """Measure teammates of one layout; how unlike the test they act, only of learned ones.
+
+    For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
+    distances would take longer than a small rebuild.
+    """
+    learned = [task for task in tasks if task.teammate_family == "rl"]
+    heuristics = [task for task in tasks if task.teammate_family != "rl"]
+    missing = [task for task in learned if task.task_id not in headroom]
+    returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
+    returns |= learned_headroom(missing, suite) if missing else {}
+    if heuristics:
+        egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
+        for k, task in enumerate(heuristics):
+            stay, random, oracle = (float(egos[ego][k]) for ego in ("stay", "random", "oracle"))
+            returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
+    nearest = _nearest(layout, learned, suite)
+    return {task_id: TeammateFacts(earned, nearest.get(task_id)) for task_id, earned in returns.items()}
+
+
+def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:
+    """task id -> nearest test teammate; nothing on layouts without training tasks."""
+    if not tasks or layout.name not in TESTED_ON:
+        return {}
+    near = nearest_test(layout, [_build(task, suite) for task in tasks])
+    return {
+        task.task_id: NearestTest(found.teammate, round(found.distance, _DIGITS), found.behaviour)
+        for task, found in zip(tasks, near, strict=True)
+    }
+
+
+def _build(task: Task, suite: Path) -> Any:
+    return build_teammate(task.layout, task.teammate, TEAMMATE, suite=suite)
+
+
+def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
+    """Returns the heuristic families of which no draw may be a training teammate, by layout, with the reasons."""
+    found = []
+    for layout in (layout for layout in layouts if layout in TESTED_ON):
+        hosted = hosted_families(layout)
+        for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
+            draws = read_draws(layout, family)
+            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, _why_unhosted(draws)))
+    return found
+
+
+def _why_unhosted(draws: Sequence[Draw]) -> str:
+    if not draws:
+        return "no draws were measured"
+    admissible = [draw for draw in draws if draw.admissible]
+    if not admissible:
+        farthest = max(draw.distance for draw in draws)
+        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
+    widest = max(draw.spread for draw in admissible)
+    return (
+        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
+        f"differ by {widest:.1f} at most)"
+    )

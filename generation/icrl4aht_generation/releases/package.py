@@ -1,0 +1,241 @@
+"""Artefacts -> a release folder: the histories of each task, with labels, and a picture of their learning curves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
+from icrl4aht_data.format.info import LeftOutTask
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite, read_provenance
+from icrl4aht_data.format.schema import PROVENANCE, Kind, episode_ends
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
+from icrl4aht_data.writing.dataset_card import CURVES_FIGURE
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.release_folder import atomic_folder, check_target
+from icrl4aht_generation.collection.curate import filter_report, oracle_labels, plot_filter, relabel
+from icrl4aht_generation.collection.record import HistoryArrays
+from icrl4aht_generation.collection.task import TEAMMATE_NOISE
+from icrl4aht_generation.collection.task_folder import FILTER_CURVES, METADATA
+from icrl4aht_generation.learners.checkpoint import load_policy
+from icrl4aht_generation.populations.select import THRESHOLD
+from icrl4aht_generation.populations.train import population_threads
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.releases.histories import TaskHistories, select_histories
+from icrl4aht_generation.releases.labeller import choose_labeller
+from icrl4aht_generation.releases.measures import TeammateFacts, recorded_provenance, teammate_facts, unhosted_families
+
+
+def package_release(
+    artefacts: Path,
+    target: Path,
+    works: Sequence[Work],
+    profile: Profile,
+    suite: Path,
+    kind: Kind,
+    advance: Callable[[Literal[0, 1]], None] = lambda step: None,
+    *,
+    facts: Mapping[str, TeammateFacts] | None = None,
+    left_out: Sequence[LeftOutTask] = (),
+) -> Path:
+    """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
+
+    `select_histories` chooses what is kept. The histories of learners are labelled by the checkpoint of their egos that
+    `choose_labeller` returns, those of the source "noise" by their script.
+
+    Args:
+        artefacts: folder of the finished artefacts.
+        target: the release folder; a release of this profile there is replaced atomically.
+        works: the units of work, by task in the release's order.
+        profile: their profile.
+        suite: folder of the learned teammates.
+        kind: kind of the release.
+        advance: called after each task with 0, when its histories are chosen, and with 1, when it is written.
+        facts: task id -> what is known of its teammate; by default it is looked up and measured.
+        left_out: tasks that were not collected, for the list in meta/info.json.
+
+    Raises:
+        OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
+    """
+    check_release_folder(target, profile)
+    tasks = _by_task(works)
+    if facts is None:
+        facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
+    headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
+    recorded, new, omitted, curves = recorded_provenance(suite), [], list(left_out), SourceCurves()
+    for task_id, members in tasks.items():
+        task = members[0].task
+        found = select_histories(artefacts, members, profile, facts[task_id], headroom=task.layout.name in headroom)
+        if isinstance(found, LeftOutTask):
+            omitted.append(found)
+            advance(1)
+        else:
+            new.append(_new_task(found, profile, suite, facts[task_id], recorded))
+            for returns in found.kept:
+                add_curve(curves, task.layout.name, found.source, task.split, returns)
+        advance(0)
+    if not new:
+        reasons = "; ".join(one.reason for one in omitted) or "there is no task"
+        raise OptionError(f"{target}: no task has histories to keep: {reasons}")
+    if profile.sampled is not None:
+        omitted += unhosted_families(profile.layouts)
+    with TemporaryDirectory() as folder:
+        files = {CURVES_FIGURE: Path(folder) / "curves.png"}
+        plot_source_curves(curves, files[CURVES_FIGURE])
+        version, done = profile.data_version, lambda task: advance(1)
+        return write_release(
+            target, kind, new, data_version=version, left_out=omitted, files=files, overwrite=True, done=done
+        )
+
+
+def _by_task(works: Sequence[Work]) -> dict[str, list[Work]]:
+    """task id -> its units of work."""
+    tasks: dict[str, list[Work]] = {}
+    for work in works:
+        tasks.setdefault(work.task.task_id, []).append(work)
+    return tasks
+
+
+def check_release_folder(target: Path, profile: Profile) -> None:
+    """Check that nothing is at `target` but an unchanged release that was made with this profile.
+
+    Raises:
+        OptionError: if there is something else.
+    """
+    if not check_target(target, overwrite=True):
+        return
+    path = target / PROVENANCE
+    profiles = {of_task.profile for of_task in read_provenance(path).values()} if path.is_file() else set()
+    if profiles != {profile.name}:
+        made = ", ".join(sorted(map(str, profiles - {None}))) or "no known profile"
+        raise OptionError(
+            f"{target}: has files made with {made}, not with profile {profile.name}, and is not replaced; move it "
+            f"away, or give another --out"
+        )
+
+
+def bundle_release(release: Path) -> Path:
+    """Replace the release that the package bundles by a copy of this one."""
+    with atomic_folder(MINI, overwrite=True, sources=[release]) as copy:
+        shutil.copytree(release, copy, dirs_exist_ok=True)
+    return MINI
+
+
+def recorded_sources(release: Path) -> dict[str, str]:
+    """task id -> source, as a release says; empty for a folder that is none."""
+    path = release / PROVENANCE
+    recorded = read_provenance(path) if path.is_file() else {}
+    return {task_id: made.source or "ppo" for task_id, made in recorded.items()}
+
+
+def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> TeammateSuite | None:
+    """The populations of a learned teammate: the profile's, or those named by the release that it is taken from."""
+    if task.task_id in recorded:
+        return recorded[task.task_id].suite
+    return TeammateSuite(
+        algorithms={layout: list(names) for layout, names in profile.algorithms.items()},
+        members=profile.teammates.members,
+        train=profile.teammates.train,
+        total_steps=profile.teammates.ppo.total_steps,
+        threshold=THRESHOLD,
+        xla_threads=population_threads(suite, task.layout.name, task.teammate_kind),
+    )
+
+
+def _new_task(
+    found: TaskHistories, profile: Profile, suite: Path, facts: TeammateFacts, recorded: Mapping[str, Provenance]
+) -> NewTask:
+    task, metadata = found.task, json.loads((found.folders[0] / METADATA).read_text(encoding="utf-8"))
+    made = Provenance(
+        profile=profile.name,
+        profile_hash=profile.hash,
+        code_version=metadata["code_version"],
+        jax_version=metadata["jax_version"],
+        platform=metadata["platform"],
+        xla_threads=metadata["xla_threads"],
+        seed=task.seed,
+        source=found.source,
+        references=facts.references,
+        nearest_test=facts.nearest,
+        teammate={"slot": TEAMMATE, "noise": TEAMMATE_NOISE},
+        streams_recorded=len(found.recorded),
+        streams_kept=len(found.kept),
+        suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
+    )
+    files = checkpoint_files(suite, task)
+    if found.source == "noise":
+        return _noise_task(found, replace(made, noise=metadata["noise"]), profile, files)
+    learned = replace(made, ego=metadata["ego"], ego_hash=metadata["ego_hash"], learners=len(found.folders))
+    return _ppo_task(found, learned, profile, suite, files)
+
+
+def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
+    """A task of the source "noise", whose labels are the actions of its script."""
+    earned = made.references
+    expert = ExpertLabels(
+        policy_sha256=None,
+        action="scripted oracle, which sees the full state",
+        return_greedy=None if earned is None else earned.oracle,
+        episodes=None if earned is None else earned.episodes,
+    )
+
+    def load() -> Iterator[NewHistory]:
+        for _, stream, arrays in _recorded_histories(found):
+            labels = np.load(found.folders[0] / "oracle_actions.npy", mmap_mode="r")[stream]
+            wanted = {"oracle_actions": labels} if profile.oracle_actions else {}
+            yield NewHistory(stream, arrays | {"expert_actions": labels} | wanted)
+
+    return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
+
+
+def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: dict[str, Path]) -> NewTask:
+    """A task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
+    task = found.task
+    for number, folder in enumerate(found.folders):
+        title = f"{task.layout.name} with {task.teammate_kind}" + f", learner {number}" * (len(found.folders) > 1)
+        plot_filter(folder / FILTER_CURVES, title, found.returns[number], found.returns[number][found.streams[number]])
+    labeller = choose_labeller(found.folders, task, suite)
+    expert = ExpertLabels(
+        policy_sha256=labeller.sha256,
+        action="greedy, recurrent",
+        step=labeller.step,
+        return_greedy=labeller.return_greedy,
+        return_sampled=labeller.return_sampled,
+        episodes=LABEL_EPISODES,
+        last_return_greedy=labeller.last_return_greedy,
+    )
+    effect = filter_report(found.recorded, found.kept, found.least_improvement)
+
+    def load() -> Iterator[NewHistory]:
+        network, params, _ = load_policy(labeller.folder)
+        for learner, stream, arrays in _recorded_histories(found):
+            (labels,) = relabel(task.layout, network, params, [arrays["state"]])
+            wanted = {"expert_actions": labels}
+            if profile.oracle_actions:
+                (wanted["oracle_actions"],) = oracle_labels(task.layout, [arrays["state"]], [arrays["actions"]])
+            yield NewHistory(stream, arrays | wanted, learner)
+
+    policies = expert_files(labeller.folder, labeller.sha256) if profile.policies else {}
+    return NewTask(task, replace(made, expert=expert, filter=effect), len(found.kept), load, files | policies)
+
+
+def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+    """Yields learner, stream, and recorded arrays of the kept histories, which are read when they are used."""
+    for learner, (folder, streams) in enumerate(zip(found.folders, found.streams, strict=True)):
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields}
+        dones = episode_ends(arrays["actions"].shape[1], KEPT_STEPS)
+        for stream in streams.tolist():
+            yield learner, stream, {name: array[stream] for name, array in arrays.items()} | {"dones": dones}

@@ -1,0 +1,181 @@
+"""Hamming distances of policies: the share of common states on which two of them act differently (paper, App. "Teammate
+Policy Diversity Analysis").
+
+The common states of a heuristic family on a layout are those of 20 episodes of 100 steps with each of its five test
+instances, ten with a random ego and ten with the scripted ego `oracle`. A teammate's distance to a test instance is
+measured on the states of that instance's family. On asymm_both and cramped_up, which have no test tasks, the instances
+are those of the layout that their models are tested on, acting on the training layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, UInt8
+
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, SAME_BEHAVIOUR, TESTED_ON
+from icrl4aht_data.errors import unknown
+from icrl4aht_data.format.provenance import NearestTest
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.rollout import init_rollout, roll_out
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
+from icrl4aht_generation.teammates.references import player_in_some, reference_egos, stacked_families
+from icrl4aht_generation.teammates.registry import build_teammate
+
+_EPISODES = 10
+"""Episodes of each test instance with each of the two egos."""
+
+_SEED = 5
+
+
+class CommonStates(NamedTuple):
+    """States on which teammates of a layout are compared.
+
+    Attributes:
+        records: state records, uint8 (T, families x episodes, S).
+        instances: names of the test instances.
+        actions: actions of each test instance on the states of its own family, int8 (instances, T, episodes).
+    """
+
+    records: UInt8[Array, "T N S"]
+    instances: tuple[str, ...]
+    actions: np.ndarray
+
+    def family_states(self, actions: np.ndarray, instance: int) -> np.ndarray:
+        """Returns the part (..., T, episodes) of actions (..., T, N) on the states of an instance's family."""
+        episodes, family = self.actions.shape[-1], instance // INSTANCES
+        return actions[..., family * episodes : (family + 1) * episodes]
+
+
+def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
+    """Returns the nearest test instance of each policy that plays the teammate on a training layout.
+
+    Policies that share their functions share one compilation. Behaviours are numbered in the order of the policies.
+
+    Raises:
+        UnknownNameError: if the layout is not a training layout.
+    """
+    common = common_states(layout)
+    actions = act_along(layout, policies, common.records)
+    distances = distances_to_tests(common, actions)
+    nearest = distances.argmin(axis=1)
+    return [
+        NearestTest(common.instances[k], float(distances[number, k]), behaviour)
+        for number, (k, behaviour) in enumerate(zip(nearest, group_behaviours(actions), strict=True))
+    ]
+
+
+@lru_cache(maxsize=2)
+def common_states(layout: Layout) -> CommonStates:
+    """Returns the states of a training layout on which teammates are compared.
+
+    Raises:
+        UnknownNameError: if the layout is not a training layout.
+    """
+    if layout.name not in TESTED_ON:
+        raise unknown("training layout", layout.name, TESTED_ON)
+    env, egos = Environment(layout, KEPT_STEPS), reference_egos(layout)
+    tested = TESTED_ON[layout.name]
+    tests = [
+        [build_teammate(layout, {"family": family, "theta": theta}) for theta in published_thetas(tested, family)]
+        for family in TESTED_FAMILIES
+    ]
+    each = INSTANCES * 2 * _EPISODES
+    total = len(tests) * each
+    with_oracle = np.arange(total) // _EPISODES % 2 == 1
+    families = [next(stacked_families(policies))[1] for policies in tests]
+
+    @jax.jit
+    def play(own, key):
+        players = [
+            player_in_some(env, egos["random"], (), EGO, np.flatnonzero(~with_oracle), total),
+            player_in_some(env, egos["oracle"], (), EGO, np.flatnonzero(with_oracle), total),
+        ]
+        for k, (family, params) in enumerate(zip(families, own, strict=True)):
+            envs = np.arange(k * each, (k + 1) * each)
+            repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2 * _EPISODES, axis=0), params)
+            players.append(player_in_some(env, family, repeated, TEAMMATE, envs, total, own_params=True))
+        carry = init_rollout(env, players, jax.random.split(key, total))
+        return roll_out(env, players, carry, env.max_steps, key)[1].record
+
+    records = play([family.params for family in families], jax.random.key(_SEED))
+    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
+    actions = np.concatenate(
+        [act_along(layout, own, records)[:, :, k * each : (k + 1) * each] for k, own in enumerate(tests)]
+    )
+    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
+    return CommonStates(records, names, actions)
+
+
+def act_along(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
+    """Actions of policies, as the teammate, on recorded episodes; each one's memory follows the episode it observes.
+
+    Args:
+        layout: the layout.
+        policies: the policies; those that share their functions share one compilation.
+        records: state records, uint8 (T, episodes, S).
+        seed: of the policies' draws, which are functions of the episode's number.
+
+    Returns:
+        int8 (policies, T, episodes).
+    """
+    actions = np.zeros((len(policies), *records.shape[:2]), np.int8)
+    for numbers, family in stacked_families(policies):
+        actions[numbers] = np.asarray(_act_along(layout, family, records, jax.random.key(seed)))
+    return actions
+
+
+def _act_along(layout: Layout, family: Policy, records: Array, key: Key[Array, ""]) -> Array:
+    keys = jax.random.split(key, records.shape[1])
+
+    @jax.jit
+    def act(params):
+        def one(params):
+            memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
+
+            def step(memories, record):
+                view = record if family.sees == "state" else observe(layout, record, TEAMMATE)
+                actions, memories = jax.vmap(family.act, in_axes=(None, 0, 0, 0))(params, memories, view, keys)
+                return memories, actions.astype(jnp.int8)
+
+            return jax.lax.scan(step, memories, records)[1]
+
+        return jax.lax.map(one, params)
+
+    return act(family.params)
+
+
+def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:
+    """Distances of teammates to the test instances: int8 (teammates, T, N) -> float64 (teammates, instances)."""
+    return np.stack(
+        [
+            (common.family_states(actions, number) != tested).mean(axis=(1, 2))
+            for number, tested in enumerate(common.actions)
+        ],
+        axis=1,
+    )
+
+
+def group_behaviours(actions: np.ndarray) -> list[int]:
+    """Numbers the behaviours of policies, int8 (policies, ...).
+
+    A policy has the behaviour of the first one before it that opened a behaviour and acts like it, that is, whose
+    distance is below `SAME_BEHAVIOUR`; else it opens the next one.
+    """
+    first: list[np.ndarray] = []
+    found: list[int] = []
+    for own in actions:
+        same = (k for k, other in enumerate(first) if (own != other).mean() < SAME_BEHAVIOUR)
+        found.append(next(same, len(first)))
+        if found[-1] == len(first):
+            first.append(own)
+    return found

@@ -1,0 +1,320 @@
+"""Drawn heuristic teammates: which ones training and validation tasks may have.
+
+`draws.jsonl` has one line per draw, measured by `icrl4aht-data research draws`, so that tasks are known without any
+simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws from the
+published training ranges act alike, and on some layouts all draws of a family act like one of its test instances. Those
+are not admissible: no task has them.
+
+Diverse draws vary all of these parameters (`Heuristic.diverse`), for models that learn by playing. They must be
+farther from every test instance.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
+from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+
+DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
+"""Table of all draws."""
+
+DRAWS_PER_SEED = {0: 32, 1: 8, 2: 32, 3: 8}
+"""base_seed -> number of draws in the table, for each layout and family: 0 and 1 from the published training ranges,
+for training and validation; 2 and 3 diverse ones, for training and validation."""
+
+_OF_SEED = {0: "drawn training", 1: "drawn validation", 2: "diverse training", 3: "diverse validation"}
+
+_VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
+
+_DIVERSE_SEEDS = {"train": 2, "validation": 3}
+
+_DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # of each layout and family, at most
+
+_DIVERSE_DISTANCE = 0.1  # least distance of a diverse draw to every test instance, of all families
+
+
+def ranges_of(base_seed: int) -> str:
+    """Returns which ranges the draws of a seed come from: "train" or "diverse", see `sample_teammate`."""
+    return "diverse" if base_seed in _DIVERSE_SEEDS.values() else "train"
+
+
+def _least_distance(base_seed: int) -> float:
+    return _DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
+
+
+class Draw(NamedTuple):
+    """One draw on one layout: `sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)`.
+
+    Attributes:
+        layout: short name of a training layout.
+        family: kind of the heuristic, such as "utility_greedy".
+        base_seed: see `DRAWS_PER_SEED`.
+        theta_id: number of the draw, from 0.
+        nearest: test instance of its family that acts most like it, such as "H3/t1".
+        distance: Hamming distance to that instance, 0..1; see `icrl4aht_generation.teammates.distances`.
+        behaviour: number that the layout's draws of one family, of all seeds, share if they act alike.
+        stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
+        random: mean return of the ego `random`.
+        oracle: mean return of the ego `oracle`.
+        other: test instance of the other families that acts most like it. It excludes no draw of the published ranges,
+            but such draws are chosen last.
+        other_distance: Hamming distance to that instance.
+    """
+
+    layout: str
+    family: str
+    base_seed: int
+    theta_id: int
+    nearest: str
+    distance: float
+    behaviour: int
+    stay: float
+    random: float
+    oracle: float
+    other: str = ""
+    other_distance: float = 1.0
+
+    @property
+    def admissible(self) -> bool:
+        """Whether it acts unlike every test instance of its family; if it is diverse, of all families, and more so."""
+        return self.counted_distance >= _least_distance(self.base_seed)
+
+    @property
+    def counted_distance(self) -> float:
+        """Distance to the test instances that decides whether it is admissible."""
+        return self.other_distance if self._other_counts else self.distance
+
+    @property
+    def nearest_counted(self) -> str:
+        """Test instance at that distance."""
+        return self.other if self._other_counts else self.nearest
+
+    @property
+    def _other_counts(self) -> bool:
+        return self.base_seed in _DIVERSE_SEEDS.values() and self.other_distance < self.distance
+
+    @property
+    def like_another_family(self) -> bool:
+        """Whether it acts like a test instance of another family."""
+        return self.other_distance < SAME_BEHAVIOUR
+
+    @property
+    def spread(self) -> float:
+        """Difference of the best and the worst reference ego's return."""
+        returns = (self.stay, self.random, self.oracle)
+        return max(returns) - min(returns)
+
+    @property
+    def headroom(self) -> bool:
+        """Whether the ego matters."""
+        return self.spread >= LEAST_HEADROOM
+
+
+def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
+    """Returns the draws of a family on a training layout, by theta_id.
+
+    Raises:
+        UnknownNameError: for an unknown layout, family or seed, and for a layout without training tasks.
+    """
+    name = get_layout(layout).name
+    if name not in TESTED_ON:
+        raise unknown("training layout", layout, TESTED_ON)
+    if family not in HEURISTIC_FAMILIES:
+        raise unknown("teammate family", family, HEURISTIC_FAMILIES)
+    if base_seed not in DRAWS_PER_SEED:
+        raise unknown("base_seed of draws", base_seed, map(str, DRAWS_PER_SEED))
+    return list(_bundled_draws().get((name, family, base_seed), ()))
+
+
+def drawn_teammates(
+    layout: str, families: Sequence[str], count: int, base_seed: int = 0
+) -> list[tuple[dict[str, Any], Draw]]:
+    """Chooses drawn teammates of a layout, without any simulation.
+
+    The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
+    layout, of any family, has headroom. Each family first gives the draws that act unlike all test instances, of these
+    one of every behaviour, then the others, by how much the ego matters with them and by theta_id.
+
+    Args:
+        layout: a training layout.
+        families: kinds of heuristics, in the order of their turns.
+        count: number of teammates.
+        base_seed: see `DRAWS_PER_SEED`.
+
+    Returns:
+        Teammate entries, as `sample_teammate` returns them, with their draws.
+
+    Raises:
+        OptionError: for an unknown family, a family without admissible draws on the layout, and a larger count than
+            the families have draws.
+        UnknownNameError: for an unknown layout or seed, and for a layout without training tasks.
+    """
+    name = get_layout(layout).name
+    for family in families:
+        if family not in HEURISTIC_FAMILIES:
+            raise OptionError(str(unknown("teammate family", family, HEURISTIC_FAMILIES)))
+    queues = [_queue(name, family, base_seed) for family in dict.fromkeys(families)]
+    available = sum(map(len, queues))
+    if count > available:
+        raise OptionError(
+            f"{name}: {count} {_OF_SEED[base_seed]} teammates requested of {', '.join(families) or 'no family'}, with "
+            f"only {available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
+        )
+    turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
+    ranges = ranges_of(base_seed)
+    return [(sample_teammate(draw.family, draw.theta_id, ranges, base_seed), draw) for draw in turns[:count]]
+
+
+def validation_tasks(track: str) -> list[Task]:
+    """Tasks of the split `validation`, for choosing models: up to four teammates of each training layout, of seed 1.
+
+    Layouts on which every draw of that seed acts like a test instance have none.
+    """
+    tasks = []
+    for layout in (layout for layout in TRACKS[track]["validation"] if layout in TESTED_ON):
+        families = hosted_families(layout, _VALIDATION_SEED)
+        count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
+        chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)
+        tasks += [make_task(track, "validation", layout, teammate, seed=0) for teammate, _ in chosen]
+    return tasks
+
+
+def diverse_tasks(track: str, split: str) -> list[Task]:
+    """Tasks with diverse teammates on the training layouts of a track, for models that learn by playing.
+
+    Up to twelve of each layout and family for training, three for validation, each of another behaviour.
+
+    Args:
+        track: the track.
+        split: "train" or "validation".
+    """
+    seed, most = _DIVERSE_SEEDS[split], _DIVERSE_TEAMMATES[split]
+    tasks = []
+    for layout in (layout for layout in TRACKS[track]["train"] if layout in TESTED_ON):
+        for family in hosted_families(layout, seed):
+            behaviours = {draw.behaviour for draw in _usable(layout, family, seed)}
+            chosen = drawn_teammates(layout, [family], min(most, len(behaviours)), seed)
+            tasks += [make_task(track, split, layout, teammate, seed=0) for teammate, _ in chosen]
+    return tasks
+
+
+def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
+    """Returns the draw of the table that a teammate entry is, or None."""
+    family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
+    if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
+        return None
+    draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
+    same = draws and _equal(_sampled(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
+    return draws[0] if same else None
+
+
+def _equal(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Whether two parameter sets are equal up to the last digit, in which compilations of a draw may differ."""
+    return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
+
+
+@cache
+def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
+    return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
+
+
+def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
+    """Returns the families with draws that tasks of a training layout may have, in the order of the paper."""
+    return [family for family in HEURISTIC_FAMILIES if _usable(get_layout(layout).name, family, base_seed)]
+
+
+def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
+    """The draws of a family that may be chosen, in the order in which they are; at least one.
+
+    Those that act like a test instance of another family come last.
+    """
+    draws = _usable(layout, family, base_seed)
+    if not draws:
+        raise OptionError(
+            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {_reason(layout, family, base_seed)}; "
+            f"name other families ({_hosted_text(layout, base_seed)})"
+        )
+    first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
+
+    def order(draw: Draw) -> tuple[bool, bool, float, int]:
+        like = draw.like_another_family
+        return like, first[like, draw.behaviour] != draw, -draw.spread, draw.theta_id
+
+    return sorted(draws, key=order)
+
+
+def _usable(layout: str, family: str, base_seed: int) -> list[Draw]:
+    draws = [draw for draw in read_draws(layout, family, base_seed) if draw.admissible]
+    return [draw for draw in draws if draw.headroom] if _has_headroom(layout, base_seed) else draws
+
+
+def _has_headroom(layout: str, base_seed: int) -> bool:
+    """Whether any admissible draw of the layout has headroom."""
+    draws = (draw for family in HEURISTIC_FAMILIES for draw in read_draws(layout, family, base_seed))
+    return any(draw.admissible and draw.headroom for draw in draws)
+
+
+def _reason(layout: str, family: str, base_seed: int) -> str:
+    """Why no draw of a family may be used on a layout."""
+    draws = read_draws(layout, family, base_seed)
+    if not draws:
+        return "it has no draws there; `icrl4aht-data research draws` measures them"
+    if not any(draw.admissible for draw in draws):
+        farthest = max(draws, key=lambda draw: draw.counted_distance)
+        return (
+            f"all {len(draws)} draws act like a test instance (Hamming distance at most "
+            f"{farthest.counted_distance:.3f}, to {farthest.nearest_counted}; expected at least "
+            f"{_least_distance(base_seed)})"
+        )
+    return f"the ego matters with none of its admissible draws (returns differ by less than {LEAST_HEADROOM:g})"
+
+
+def _hosted_text(layout: str, base_seed: int) -> str:
+    counts = {family: len(_usable(layout, family, base_seed)) for family in hosted_families(layout, base_seed)}
+    return "available: " + (", ".join(f"{count} of {family}" for family, count in counts.items()) or "none")
+
+
+@lru_cache(maxsize=1)
+def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
+    draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
+    for draw in read_draws_table(DRAWS_TABLE):
+        draws[draw.layout, draw.family, draw.base_seed].append(draw)
+    return {key: tuple(found) for key, found in draws.items()}
+
+
+def read_draws_table(path: Path) -> list[Draw]:
+    """The draws of a table, in its order.
+
+    Raises:
+        TaskFormatError: names the file and the line.
+    """
+    draws = []
+    for number, line in enumerate(read_lines(path), start=1):
+        try:
+            draws.append(Draw(**parse_json(line)))
+        except (TypeError, Icrl4ahtError) as error:
+            raise TaskFormatError(f"{path}, line {number}: expected the fields {', '.join(Draw._fields)}") from error
+    return draws
+
+
+def write_draws_table(path: Path, draws: Iterable[Draw]) -> None:
+    """Write draws, one JSON line each, by layout, family, seed and theta_id."""
+    layouts, families = list(TESTED_ON), list(HEURISTIC_FAMILIES)
+
+    def order(draw: Draw) -> tuple[int, ...]:
+        return layouts.index(draw.layout), families.index(draw.family), draw.base_seed, draw.theta_id
+
+    lines = (json.dumps(draw._asdict(), separators=(",", ":")) for draw in sorted(draws, key=order))
+    with atomic_write(path) as partial:
+        partial.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

@@ -1,0 +1,215 @@
+"""H3 `assembly_line`: runs ingredients, or plates and delivers, with slips of many kinds (paper, App. B.2, tab. H3)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, Key
+
+from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
+from icrl4aht_generation.paths import Rule, Scene, is_ingredient
+from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
+
+RUNNER, PLATER, FLEX = range(3)
+AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
+
+_MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
+
+
+class AssemblyMemory(NamedTuple):
+    """Memory of an H3 teammate.
+
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+    """
+
+    key: Key[Array, ""]
+
+
+def begin_assembly_line(key: Key[Array, ""]) -> AssemblyMemory:
+    """Memory at the start of an episode."""
+    return AssemblyMemory(key)
+
+
+def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int[Array, ""], AssemblyMemory]:
+    """One step of an H3 teammate."""
+    following, u = draw(memory.key)
+    idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
+    makes_room = _makes_room(scene)
+    final, action = _decide(scene, params, abandons=u[2] < params["task_abandon_prob"])
+    slips = ~(idles | makes_room | final)
+    action, following = _slip(scene, params, action, slips, u[1], following)
+    action = jnp.where(makes_room, _step_aside(scene), action)
+    return jnp.where(idles, STAY, action), AssemblyMemory(following)
+
+
+def _off_beat(scene: Scene) -> Array:
+    """float32 scalar, 0 to 0.9: factor of the chance to hesitate, a fixed pattern over the cells."""
+    y, x = np.divmod(np.arange(scene.paths.layout.cells), scene.paths.layout.width)
+    return jnp.asarray(((7 * x + 13 * y) % 10 / 10).astype(np.float32))[scene.me]
+
+
+def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Returns whether the action is exempt from slips, and the action; rules are in order of priority."""
+    empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
+    soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
+    final = scene.holds_dish | (ingredient & soup)
+    ingredient &= ~soup
+    plates_now = soup | (cooking & (params["plate_urgency"] > 0.5))
+    plater = (params["role_mode"] == PLATER) | ((params["role_mode"] == FLEX) & plates_now)
+    runner = ~plater
+    chosen = scene.first(
+        [
+            Rule(scene.holds_dish, scene.goals),
+            Rule(scene.holds_ingredient & soup, scene.empty_counters),
+            Rule((plate | ingredient) & abandons, scene.empty_counters),
+            Rule((runner & plate) | (plater & ingredient), scene.empty_counters),
+            Rule(runner & ingredient, scene.nonfull),
+            Rule(runner & ingredient, _handoff_counters(scene, params)),
+            Rule(runner & empty, _needed_piles(scene)),
+            Rule(plater & plate, scene.cooked),
+            Rule(plater & empty, scene.plate_piles),
+            Rule(plater & (plate | empty), scene.pots_in_use, waits=True),
+            Rule((runner & empty) | (plater & plate), scene.pots, waits=True),
+            Rule(empty | (plater & plate), scene.buttons, waits=True),
+            Rule(empty, scene.indicators, waits=True),
+        ]
+    )
+    action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target))
+    return final, jnp.where(chosen.found, action, scene.wander())
+
+
+def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
+    """The step towards a target; agent 1 stays if it leads onto the partner's cell or an adjacent one."""
+    step, _ = scene.approach(target)
+    if scene.slot == 0:
+        return step
+    distance = jnp.asarray(scene.paths.distance)[scene.partner, scene.destination(step)]
+    return jnp.where((step < STAY) & (distance <= 1), STAY, step)
+
+
+def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
+    """Piles of the recipe's missing ingredients over all pots; one in the partner's hand counts as if in the pot."""
+    carried = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
+    return scene.piles_of(scene.needed - carried > 0)
+
+
+def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
+    """Empty counters for an ingredient that no pot takes, by style; every empty one if the style has none."""
+    layout = scene.paths.layout
+    y, x = np.divmod(np.arange(layout.cells), layout.width)
+    middle_x, middle_y = int(x[layout.walkable].mean()), int(y[layout.walkable].mean())
+    central = np.abs(x - middle_x) + np.abs(y - middle_y) <= 3
+    near_partner = jnp.asarray(scene.paths.manhattan)[scene.partner] <= 2
+    free = scene.empty_counters
+    at_pots = free & scene.paths.near_pot
+    near_partner = _or_else(free & near_partner, at_pots)
+    style = params["handoff_style"]
+    preferred = jnp.where(style == AT_POTS, at_pots, jnp.where(style == CENTRAL, free & central, near_partner))
+    return _or_else(preferred, free)
+
+
+def _or_else(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
+    return jnp.where(jnp.any(mask), mask, other)
+
+
+def _makes_room(scene: Scene) -> Bool[Array, ""]:
+    """Returns whether agent 1 is empty-handed and adjacent to a partner who carries something."""
+    if scene.slot == 0:
+        return jnp.asarray(False)
+    adjacent = jnp.asarray(scene.paths.manhattan)[scene.me, scene.partner] == 1
+    return scene.holds_nothing & (scene.partner_hand > 0) & adjacent
+
+
+def _step_aside(scene: Scene) -> Int[Array, ""]:
+    """Straight away from the adjacent partner; else sideways, right before left, down before up; else stay."""
+    from_partner = jnp.asarray(scene.paths.neighbours)[scene.me] == scene.partner  # above, below, left, right
+    across = from_partner[2] | from_partner[3]
+    # Scores of right, down, left, up.
+    sideways_in_row = jnp.array([2, 0, 1, 0])
+    sideways_in_column = jnp.array([0, 2, 0, 1])
+    away = 3 * from_partner[jnp.array([2, 0, 3, 1])]
+    score = away + jnp.where(across, sideways_in_column, sideways_in_row)
+    return scene.best_way(scene.free & (score > 0), score)
+
+
+def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
+    """The action after a wrong move or a walk home, and the key chain after their draws."""
+    errs = slips & (u < params["wrong_action_prob"])
+    key, own = extra_split(key, errs)
+    wrong = jax.random.bits(jax.random.split(own)[1]) & 3
+    action = jnp.where(errs, jnp.asarray(_MOVES_BY_DRAW)[wrong.astype(jnp.int32)], action)
+
+    may_return = slips & scene.holds_nothing & (params["stubbornness"] > 0)
+    key, own = extra_split(key, may_return)
+    layout = scene.paths.layout
+    # The published formula of a teammate's home cell; on some layouts it is a wall, and nobody walks home.
+    home = (3 * scene.slot % layout.height) * layout.width + 5 * scene.slot % layout.width
+    far = jnp.asarray(scene.paths.manhattan)[scene.me, home] > 2
+    goes = may_return & far & (jax.random.uniform(own) < params["stubbornness"]) & bool(layout.walkable[home])
+    return jnp.where(goes, jnp.asarray(scene.paths.first_step)[scene.me, home], action), key
+
+
+ASSEMBLY_LINE = Heuristic(
+    kind="assembly_line",
+    begin=begin_assembly_line,
+    act=act_assembly_line,
+    defaults={
+        "role_mode": FLEX,
+        "handoff_style": AT_POTS,
+        "plate_urgency": 0.5,
+        "prestage_bias": 0.3,  # without effect: read by no rule
+        "start_cook_bias": 0.7,  # without effect: pots start by themselves
+        "hesitation_prob": 0.0,
+        "wrong_action_prob": 0.0,
+        "task_abandon_prob": 0.0,
+        "stubbornness": 0.0,
+        "timing_mismatch": 0.0,
+    },
+    presets={
+        "default": {},
+        "ingredient_runner": {
+            "role_mode": RUNNER,
+            "plate_urgency": 0.0,
+            "prestage_bias": 0.5,
+            "start_cook_bias": 0.8,
+        },
+        "plater_deliverer": {
+            "role_mode": PLATER,
+            "plate_urgency": 0.8,
+            "prestage_bias": 0.0,
+            "start_cook_bias": 0.3,
+        },
+    },
+    train=Sampling(
+        ("default", "ingredient_runner"),
+        {"role_mode": [0, 2], "plate_urgency": (0.0, 0.6), "prestage_bias": (0.2, 0.6)},
+    ),
+    test=Sampling(
+        ("plater_deliverer",),
+        {"role_mode": [1], "plate_urgency": (0.6, 1.0), "prestage_bias": (0.0, 0.3)},
+    ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "role_mode": [RUNNER, PLATER, FLEX],
+            "handoff_style": [0, 1, 2],
+            "plate_urgency": (0.0, 1.0),
+            "hesitation_prob": SHARES,
+            "wrong_action_prob": SHARES,
+            "task_abandon_prob": SHARES,
+            "stubbornness": SHARES,
+            "timing_mismatch": SHARES,
+        },
+    ),
+    spans={
+        "plate_urgency": (0.0, 1.0),
+        "prestage_bias": (0.0, 1.0),
+        "start_cook_bias": (0.0, 1.0),
+    },
+    choices={"role_mode": 3, "handoff_style": 3},
+)
+"""The family H3; its parameters' order is that of the published manifests."""

@@ -1,0 +1,138 @@
+"""Heuristic families: the specification of their parameters, and the chain of keys that their noise is drawn from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from numbers import Real
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_generation.paths import Paths, Scene
+from icrl4aht_generation.policy import Noise, Policy
+
+SHARES = [0.0, 0.0, 0.25, 0.5, 0.75]
+"""Values of a chance of not doing one's part, for `Heuristic.diverse`: none for two teammates in five."""
+
+
+class Sampling(NamedTuple):
+    """Distribution of a split's parameters, for teammates that are not published.
+
+    Attributes:
+        presets: names of presets, of which one is drawn.
+        ranges: parameter -> (low, high) of a uniform draw, or a list of values of which one is drawn.
+    """
+
+    presets: tuple[str, ...]
+    ranges: Mapping[str, tuple[float, float] | list[float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Heuristic:
+    """A family of heuristic teammates: how it plays, and which parameters it has.
+
+    Attributes:
+        kind: name of the family.
+        begin: episode key -> memory at the start of an episode.
+        act: (params, memory, scene) -> action, int32 scalar, and the memory after the step.
+        defaults: parameter -> default, in order of declaration; integer parameters have integer defaults.
+        presets: preset -> parameters that differ from the defaults.
+        train: distribution of sampled parameters for training tasks (paper, App. B.2).
+        test: the one for test tasks.
+        spans: parameter -> full range; sampling moves these by up to a fifth of their range from the preset.
+        choices: parameter -> n, for parameters that are one of 0..n-1.
+        unbounded: parameters without an upper limit; all others are in 0..1, or choices.
+        diverse: distribution of all parameters that decide how a teammate acts, most of which the published ranges
+            leave at their defaults. It is not the paper's; None for a family without diverse
+            teammates.
+    """
+
+    kind: str
+    begin: Callable[[Key[Array, ""]], Any]
+    act: Callable[[Mapping[str, Array], Any, Scene], tuple[Int[Array, ""], Any]]
+    defaults: dict[str, float]
+    presets: dict[str, dict[str, float]]
+    train: Sampling
+    test: Sampling
+    spans: dict[str, tuple[float, float]]
+    choices: dict[str, int] = field(default_factory=dict)
+    unbounded: frozenset[str] = frozenset()
+    diverse: Sampling | None = None
+
+    def build(
+        self, layout: Layout, theta: Mapping[str, float], slot: int = TEAMMATE, noise: Noise = "seeded"
+    ) -> Policy:
+        """Returns a teammate of this family.
+
+        Policies of one layout, slot and noise share their functions, and so their compilations.
+
+        Args:
+            layout: the layout.
+            theta: a value for every parameter.
+            slot: 0 or 1, the agent it plays.
+            noise: source of its randomness.
+        """
+        init, act = _functions(self, layout, slot, noise)
+        params = {
+            name: (jnp.int32 if isinstance(default, int) else jnp.float32)(theta[name])
+            for name, default in self.defaults.items()
+        }
+        return Policy(params, init, act, "state")
+
+    def is_valid(self, name: str, value: Any) -> bool:
+        """Returns whether a parameter may have this value."""
+        if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+            return False
+        integral = isinstance(self.defaults[name], float) or float(value).is_integer()
+        return integral and 0 <= float(value) <= self._highest(name)
+
+    def describe(self, name: str) -> str:
+        """The valid values of a parameter in words, such as "a number in 0..1"."""
+        kind = "an integer" if isinstance(self.defaults[name], int) else "a number"
+        highest = self._highest(name)
+        return f"{kind} from 0" if math.isinf(highest) else f"{kind} in 0..{highest:g}"
+
+    def _highest(self, name: str) -> float:
+        if name in self.choices:
+            return self.choices[name] - 1
+        return math.inf if name in self.unbounded else 1.0
+
+
+@lru_cache(maxsize=64)
+def _functions(heuristic: Heuristic, layout: Layout, slot: int, noise: Noise):
+    """`init` and `act` of a policy."""
+    paths = Paths(layout)
+
+    def init(params, key: Key[Array, ""]) -> Any:
+        return heuristic.begin(jax.random.key(slot) if noise == "fixed" else key)
+
+    def act(params, memory: Any, record: UInt8[Array, " S"], key: Key[Array, ""]):
+        # The roll-out's key is not used: the published teammates carry a chain of keys in their memory.
+        action, memory = heuristic.act(params, memory, Scene(paths, record, slot))
+        return action.astype(jnp.int32), memory
+
+    return init, act
+
+
+def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
+    """Returns the next key of the chain."""
+    return jax.random.split(key)[0]
+
+
+def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
+    """Returns the next key of the chain and the step's uniform draws u1..u4, float32 in [0, 1)."""
+    keys = jax.random.split(key, 5)
+    return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
+
+
+def extra_split(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
+    """Splits the chain once more where a branch draws more: the chain's key after it, and the key to draw from."""
+    following, own = jax.random.split(key)
+    return jnp.where(where, following, key), own

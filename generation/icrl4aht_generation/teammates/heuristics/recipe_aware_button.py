@@ -1,0 +1,372 @@
+"""H1 `recipe_aware_button`: cooks by the recipe, and presses the button if it does not know the recipe (paper, App.
+B.2, table H1)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, Key, UInt8
+
+from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.overcooked.layouts import GOAL, INDICATOR, PLATE, PLATES, POT, Layout
+from icrl4aht_data.overcooked.state import POT_STEPS
+from icrl4aht_generation.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
+from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
+
+_CRAMPED_CELLS = 8
+"""Largest number of floor cells of a cramped layout."""
+
+_NONE = -1
+_NEVER = -1000
+_URGENCY = np.float32(1) - np.arange(POT_STEPS + 1, dtype=np.float32) / np.float32(POT_STEPS)
+
+
+class ButtonMemory(NamedTuple):
+    """Memory of an H1 teammate.
+
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+        clock: int32 scalar, steps taken in the episode.
+        recipe: uint8 scalar, item byte of the last recipe that it knew; 0 for none.
+        seen: int32 scalar, the step at which it knew it.
+    """
+
+    key: Key[Array, ""]
+    clock: Int[Array, ""]
+    recipe: UInt8[Array, ""]
+    seen: Int[Array, ""]
+
+
+class Role(NamedTuple):
+    """Restrictions of a specialist: agent 0 only cooks, agent 1 only delivers.
+
+    Attributes:
+        cooks_only: bool scalar.
+        delivers_only: bool scalar.
+    """
+
+    cooks_only: Bool[Array, ""]
+    delivers_only: Bool[Array, ""]
+
+
+class Noises(NamedTuple):
+    """Decisions of the step's draws, bool scalars.
+
+    Attributes:
+        idles: it does nothing.
+        presses: it presses the button, if it considers that.
+        errs: it fetches the wrong ingredient.
+        blocks: it walks to a busy cell instead of fetching an ingredient.
+    """
+
+    idles: Bool[Array, ""]
+    presses: Bool[Array, ""]
+    errs: Bool[Array, ""]
+    blocks: Bool[Array, ""]
+
+
+def begin_recipe_aware_button(key: Key[Array, ""]) -> ButtonMemory:
+    """Memory at the start of an episode."""
+    return ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER))
+
+
+def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
+    """One step of an H1 teammate."""
+    memory = _look(scene, memory)
+    following, u = draw(memory.key)
+    unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
+    # The roll for the button splits the step's own key once more, which draws u1 again.
+    presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
+    noises = Noises(
+        u[0] < params["idle_prob"], presses, u[1] < params["wrong_ingredient_prob"], u[2] < params["path_blocking"]
+    )
+    action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, noises)
+    # Published quirk: where the roll for the button fails, the key stays.
+    key = jnp.where(considered & ~pressed & ~noises.idles, memory.key, following)
+    key, _ = extra_split(key, erred & ~noises.idles)
+    action = jnp.where(noises.idles, STAY, action)
+    return action, memory._replace(key=key, clock=memory.clock + 1)
+
+
+def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
+    """The memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
+    shown = jnp.any(jnp.asarray(scene.paths.static(INDICATOR))) | scene.button_lit
+    return memory._replace(
+        recipe=jnp.where(shown, scene.state.recipe, memory.recipe),
+        seen=jnp.where(shown, memory.clock, memory.seen),
+    )
+
+
+def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], noises: Noises):
+    """The action of a step without idling; whether pressing the button was considered, whether it was chosen, and
+    whether the branch of the wrong ingredient was entered: all three decide how the key chain proceeds."""
+    specialist = params["task_specialization"] > 0.5
+    role = Role(specialist & (scene.slot == 0), specialist & (scene.slot == 1))
+    empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
+    cramped = is_cramped(scene.paths.layout)
+
+    considered = empty & unsure & ~scene.button_lit & jnp.any(scene.buttons)
+    fetches_plate = empty & _wants_plate(scene, params, role)
+    if cramped and scene.slot == 1:
+        fetches_plate &= ~_leaves_plates(scene)
+    cooks = empty & ~role.delivers_only
+    errs = cooks & noises.errs & (scene.paths.layout.ingredient_types > 1)
+    right = _right_ingredient(scene, params, recipe, cramped)
+    types = scene.paths.layout.ingredient_types
+    first_rules = [
+        Rule(dish & role.cooks_only, scene.empty_counters),
+        Rule(dish & ~role.cooks_only, scene.goals),
+        Rule(plate, scene.cooked),
+        Rule(plate, scene.pots_in_use, waits=True),
+        Rule(ingredient, _pots_for(scene, recipe)),
+        Rule(ingredient, scene.empty_counters),
+        Rule(considered & noises.presses, scene.buttons),
+        Rule(fetches_plate, scene.plate_piles),
+    ]
+    pot_rule, press_rule = 4, 6
+    chosen = scene.first(
+        [
+            *first_rules,
+            Rule(errs, _piles(scene, (right + 1) % types)),
+            Rule(cooks, _piles(scene, right)),
+            Rule(empty, scene.pots, waits=True),
+        ]
+    )
+    settled = chosen.found & (chosen.number < len(first_rules))
+    action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target, cramped))
+    if cramped and scene.slot == 1:
+        gives_way, aside = _yield_pot(scene, chosen.target)
+        action = jnp.where(chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
+    action = jnp.where(chosen.found, action, scene.wander())
+    blocks, step = _block(scene)
+    blocks &= cooks & noises.blocks & ~settled
+    action = jnp.where(blocks, step, action)
+    if cramped:
+        clears = plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
+        action = jnp.where(clears, _clear_the_way(scene), action)
+    pressed = chosen.found & (chosen.number == press_rule)
+    return action, considered, pressed, errs & ~settled & ~blocks
+
+
+def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
+    timers = scene.state.pot_timers
+    cooking = jnp.max(jnp.where(timers > 0, jnp.asarray(_URGENCY)[timers.astype(jnp.int32)], 0))
+    urgency = jnp.where(jnp.any(scene.cooked), 1, cooking)
+    return ((urgency >= 1 - params["plate_timing"]) & ~role.cooks_only) | role.delivers_only
+
+
+def _decoded(scene: Scene) -> np.ndarray:
+    """bool (types,): the piled types that H1 recognises in an item; not the fourth, id 3 (published quirk)."""
+    return np.array(scene.paths.layout.ingredients) < 3
+
+
+def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P types"]:
+    """Ingredients of the recipe that are missing in each pot; 0 for pots that take no more."""
+    missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
+    takes = scene.nonfull[np.array(scene.paths.layout.pots)]
+    return missing * takes[:, None] * _decoded(scene)
+
+
+def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
+    """Pots in which the ingredient in the hand is missing; if there is none, every pot that takes an ingredient."""
+    held = scene.counts(scene.hand)
+    wanting = (
+        jnp.zeros_like(scene.nonfull).at[np.array(scene.paths.layout.pots)].set(_missing(scene, recipe) @ held > 0)
+    )
+    wanted_everywhere = jnp.any((held > 0) & ~_decoded(scene))
+    return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.nonfull)
+
+
+def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], cramped: bool) -> Int[Array, ""]:
+    """Id of the ingredient to fetch, -1 for none. In a cramped layout, the agents fetch different ones."""
+    ids = jnp.asarray(scene.paths.layout.ingredients)
+    missing = _missing(scene, recipe).sum(axis=0) > 0
+    second = cramped and scene.slot == 1
+    nth = jnp.cumsum(missing)
+    wanted = jnp.where(jnp.sum(missing) > 1, nth == 2, nth == 1) if second else nth == 1
+    known = jnp.where(jnp.any(missing), ids[jnp.argmax(wanted)], _NONE)
+    guessed = jnp.where(params["strict_recipe"] < 0.5, int(second), _NONE)
+    return jnp.where(recipe > 0, known, guessed)
+
+
+def _piles(scene: Scene, ingredient: Int[Array, ""]) -> Bool[Array, " cells"]:
+    return scene.piles_of(jnp.asarray(scene.paths.layout.ingredients) == ingredient)
+
+
+def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Returns whether a cell adjacent to a pot or a goal can be reached, and the step to the nearest, or stay on it."""
+    critical = _access_cells(scene.paths, POT) | _access_cells(scene.paths, GOAL)
+    distance = jnp.where(critical, jnp.asarray(scene.paths.distance)[scene.me], UNREACHABLE)
+    nearest = jnp.argmin(distance)
+    return distance[nearest] < UNREACHABLE, jnp.asarray(scene.paths.first_step)[scene.me, nearest]
+
+
+def _access_cells(paths: Paths, kind: int) -> np.ndarray:
+    """bool (cells,): floor cells adjacent to cells of a kind."""
+    return (paths.manhattan[:, paths.static(kind)] == 1).any(axis=1) & paths.layout.walkable
+
+
+# Cramped layouts only.
+
+
+def is_cramped(layout: Layout) -> bool:
+    """Returns whether a layout is so small that H1 teammates give way to their partner."""
+    return int(layout.walkable.sum()) <= _CRAMPED_CELLS
+
+
+def _step(scene: Scene, target: Int[Array, ""], cramped: bool) -> Int[Array, ""]:
+    """The step towards a target. In a cramped layout, agents prefer opposite corners and walk around each other."""
+    if not cramped:
+        return scene.approach(target)[0]
+    layout = scene.paths.layout
+    y, x = np.divmod(np.arange(layout.cells), layout.width)
+    corner = y + x if scene.slot == 0 else (layout.height - y) + (layout.width - x)
+    step, _ = scene.approach(target, (np.float32(0.1) * corner).astype(np.float32))
+    if scene.slot == 1:
+        around = scene.sidestep(STAY)
+    else:
+        pushes = ~scene.holds_dish
+        around = scene.sidestep(jnp.where(pushes, step, STAY))
+        around = jnp.where(scene.holds_ingredient & (jnp.sum(scene.free) < 2), step, around)
+    return jnp.where(scene.destination(step) == scene.partner, around, step)
+
+
+def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Returns whether the partner has an ingredient and is about as near to the pot, and the step away from it."""
+    manhattan = jnp.asarray(scene.paths.manhattan)
+    access = jnp.asarray(scene.paths.only_access)[pot]
+    as_near = manhattan[scene.partner, access] <= manhattan[scene.me, access] + 1
+    gives_way = is_ingredient(scene.partner_hand) & (access >= 0) & as_near
+    return gives_way, scene.best_way(scene.free, manhattan[scene.ways, access])
+
+
+def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
+    """Returns whether to leave the plates to a partner without one: they are accessible from a single cell."""
+    piles = scene.paths.static(PLATES).nonzero()[0]
+    single = bool(len(piles)) and bool(scene.paths.only_access[piles[0]] >= 0)
+    carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
+    return ~carries & single
+
+
+def _clear_the_way(scene: Scene) -> Int[Array, ""]:
+    """The step off the shortest paths between the partner, who carries a dish, and the goals."""
+    paths = scene.paths
+    manhattan = jnp.asarray(paths.manhattan)
+    exits = np.flatnonzero(_access_cells(paths, GOAL))
+    walkable = jnp.asarray(paths.layout.walkable)
+    if not len(exits):
+        return jnp.int32(STAY)
+    detour = manhattan[scene.partner, :, None] + manhattan[:, exits]
+    between = jnp.any(detour == manhattan[scene.partner, exits], axis=1)
+    in_the_way = walkable & (between | (manhattan[scene.partner] == 1))
+    from_exits = jnp.asarray(paths.manhattan[:, exits].min(axis=1))
+    leaves = scene.free & ~in_the_way[scene.ways]
+    refuge = jnp.argmax(jnp.where(walkable & ~in_the_way, from_exits, -1))
+    to_refuge = manhattan[scene.ways, refuge]
+    nearer = scene.free & (to_refuge < manhattan[scene.me, refuge]) & jnp.any(walkable & ~in_the_way)
+    step = scene.best_way(leaves, from_exits[scene.ways], scene.best_way(nearer, -to_refuge))
+    return jnp.where(in_the_way[scene.me], step, STAY)
+
+
+RECIPE_AWARE_BUTTON = Heuristic(
+    kind="recipe_aware_button",
+    begin=begin_recipe_aware_button,
+    act=act_recipe_aware_button,
+    defaults={
+        "press_L_when_unknown": 0.8,
+        "refresh_interval": 100,
+        "cost_sensitivity": 0.2,
+        "strict_recipe": 0.9,
+        "exploration_bias": 0.1,  # without effect: read by no rule
+        "plate_timing": 0.5,
+        "dist_weight": 0.3,  # without effect: the nearest target wins, unweighted
+        "inertia": 0.4,  # without effect: no rule looks at the last intent
+        "task_specialization": 0.0,
+        "stubbornness": 0.0,  # without effect: read, then unused
+        "wrong_ingredient_prob": 0.0,
+        "idle_prob": 0.0,
+        "path_blocking": 0.0,
+    },
+    presets={
+        "default": {},
+        "high_L_priority": {
+            "press_L_when_unknown": 1.0,
+            "refresh_interval": 50,
+            "cost_sensitivity": 0.0,
+            "strict_recipe": 1.0,
+            "exploration_bias": 0.0,
+            "plate_timing": 0.6,
+            "dist_weight": 0.3,
+            "inertia": 0.3,
+        },
+        "lazy_learner": {
+            "press_L_when_unknown": 0.3,
+            "refresh_interval": 200,
+            "cost_sensitivity": 0.8,
+            "strict_recipe": 0.3,
+            "exploration_bias": 0.5,
+            "plate_timing": 0.4,
+            "dist_weight": 0.4,
+            "inertia": 0.5,
+        },
+        "strict_adherent": {
+            "press_L_when_unknown": 0.9,
+            "refresh_interval": 80,
+            "cost_sensitivity": 0.1,
+            "strict_recipe": 1.0,
+            "exploration_bias": 0.0,
+            "plate_timing": 0.7,
+            "dist_weight": 0.25,
+            "inertia": 0.5,
+        },
+    },
+    train=Sampling(
+        ("default", "high_L_priority"),
+        {
+            "press_L_when_unknown": (0.6, 1.0),
+            "cost_sensitivity": (0.0, 0.4),
+            "strict_recipe": (0.7, 1.0),
+            "refresh_interval": [50, 80, 100],
+        },
+    ),
+    test=Sampling(
+        ("lazy_learner", "strict_adherent"),
+        {
+            "press_L_when_unknown": (0.2, 0.6),
+            "cost_sensitivity": (0.4, 0.9),
+            "strict_recipe": (0.2, 0.6),
+            "refresh_interval": [100, 150, 200],
+        },
+    ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "press_L_when_unknown": (0.0, 1.0),
+            "cost_sensitivity": (0.0, 1.0),
+            "strict_recipe": (0.0, 1.0),
+            "refresh_interval": [50, 100, 200],
+            "plate_timing": (0.0, 1.0),
+            "task_specialization": [0.0, 0.0, 1.0],
+            "wrong_ingredient_prob": SHARES,
+            "idle_prob": SHARES,
+            "path_blocking": SHARES,
+        },
+    ),
+    spans={
+        "press_L_when_unknown": (0.0, 1.0),
+        "cost_sensitivity": (0.0, 1.0),
+        "strict_recipe": (0.0, 1.0),
+        "exploration_bias": (0.0, 1.0),
+        "plate_timing": (0.0, 1.0),
+        "dist_weight": (0.1, 1.0),
+        "inertia": (0.0, 1.0),
+    },
+    unbounded=frozenset({"refresh_interval"}),
+)
+"""The family H1; its parameters' order is that of the published manifests.
+
+The first four parameters matter only while the recipe is unknown or stale, which cannot happen on a layout with a
+recipe indicator.
+"""

@@ -1,0 +1,241 @@
+"""H2 `territory`: prefers targets in its part of the layout; five of its modes do not cooperate (paper, App. B.2,
+table H2)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked.layouts import GOAL, PILE, PLATES, POT
+from icrl4aht_generation.paths import Paths, Rule, Scene
+from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
+
+VERTICAL, HORIZONTAL, STATIONS = range(3)
+NORMAL, BLOCKER, HOARDER, LAZY, COUNTER, INVADER = range(6)
+
+_STUCK = 3
+_NOWHERE = -1
+
+
+class TerritoryMemory(NamedTuple):
+    """Memory of an H2 teammate.
+
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+        cell: int32 scalar, its cell at the last step; -1 before the first.
+        stuck: int32 scalar, steps since it last moved.
+    """
+
+    key: Key[Array, ""]
+    cell: Int[Array, ""]
+    stuck: Int[Array, ""]
+
+
+class Areas(NamedTuple):
+    """Parts of the layout, as masks over cells.
+
+    Attributes:
+        strict: bool (cells,), the teammate's own territory.
+        relaxed: bool (cells,), the territory and the margin that it shares.
+    """
+
+    strict: Bool[Array, " cells"]
+    relaxed: Bool[Array, " cells"]
+
+
+def begin_territory(key: Key[Array, ""]) -> TerritoryMemory:
+    """Memory at the start of an episode."""
+    return TerritoryMemory(key, jnp.int32(_NOWHERE), jnp.int32(0))
+
+
+def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Array, ""], TerritoryMemory]:
+    """One step of an H2 teammate."""
+    following, u = draw(memory.key)
+    mode = params["behavior_mode"]
+    action = _work(scene, params, u[0], memory.stuck >= _STUCK)
+    # One draw decides all: the published code reuses u1 for every mode.
+    blocked = jnp.where(u[0] < 0.7, STAY, _to_the_middle(scene))
+    action = jnp.where(mode == BLOCKER, blocked, action)
+    action = jnp.where((mode == LAZY) & (u[0] > params["action_probability"]), STAY, action)
+    stuck = jnp.where(scene.me == memory.cell, memory.stuck + 1, 0)
+    return action, TerritoryMemory(following, scene.me, stuck)
+
+
+def _to_the_middle(scene: Scene) -> Int[Array, ""]:
+    """The step towards the middle: across first, then along the middle column; stay in front of a wall."""
+    layout = scene.paths.layout
+    y, x = np.divmod(np.arange(layout.cells), layout.width)
+    across = np.where(x < layout.width // 2, RIGHT, LEFT)
+    along = np.where(y < layout.height // 2, DOWN, np.where(y > layout.height // 2, UP, STAY))
+    action = np.where(x == layout.width // 2, along, across)
+    blocked = layout.moves[np.arange(layout.cells), action] == np.arange(layout.cells)
+    return jnp.asarray(np.where(blocked, STAY, action))[scene.me]
+
+
+def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
+    """The action of the modes other than BLOCKER: rules in order of priority."""
+    empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
+    hoards, counters = params["behavior_mode"] == HOARDER, params["behavior_mode"] == COUNTER
+    soup, cooking, room = (jnp.any(mask) for mask in (scene.cooked, scene.cooking, scene.nonfull))
+    keeps_dish = dish & (hoards | counters)
+    sabotage = [  # rules of the modes that withhold dishes and ingredients
+        Rule(keeps_dish | (ingredient & hoards & (u < 0.8)), scene.empty_counters),
+        Rule(empty & counters & soup, scene.needed_piles),
+    ]
+    goals, nonfull, put_down, cooked, heating, plates, staged, needed = _filter(
+        scene,
+        params,
+        [
+            (scene.goals, True),
+            (scene.nonfull, True),
+            (scene.empty_counters, True),
+            (scene.cooked, False),
+            (scene.cooking, False),
+            (scene.plate_piles, False),
+            (scene.staged, False),
+            (scene.needed_piles, True),
+        ],
+    )
+    fetches = empty & (room | ~cooking)
+    chosen = scene.first(
+        [
+            *sabotage,
+            Rule(dish, goals),
+            Rule(ingredient, nonfull),
+            Rule(plate, cooked),
+            Rule(plate, heating, waits=True),
+            Rule(ingredient | plate, put_down),
+            Rule(empty & soup, plates),
+            Rule(fetches, staged),
+            Rule(fetches, needed),
+            Rule(empty, plates),
+        ]
+    )
+    sabotages = chosen.found & (chosen.number < len(sabotage))
+    wanders = ~chosen.found | (stuck & ~sabotages) | (plate & hoards & (u < 0.7))
+    worked = scene.go_to(chosen.target, chosen.waits, _step(scene, params, chosen.target))
+    action = jnp.where(wanders, scene.wander(stay_score=150), worked)
+    return jnp.where(keeps_dish & ~sabotages, STAY, action)
+
+
+def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
+    """The step towards a target. Agent 1 waits for a partner at the target's only access; both agents walk around."""
+    # A stored 0.1 or 0.3 is the float32 just above it; in the published code it reaches the threshold.
+    step, cost = scene.approach(target)
+    goes_around = scene.destination(step) == scene.partner
+    if scene.slot == 0:
+        goes_around &= params["yield_bias"] >= np.float32(0.3)
+    step = jnp.where(goes_around, scene.sidestep(STAY), step)
+    if scene.slot == 0:
+        return step
+    access = jnp.asarray(scene.paths.only_access)[target]
+    near = jnp.asarray(scene.paths.distance)[scene.partner, access] <= 1
+    waits = (access >= 0) & near & (cost <= 2) & (params["yield_bias"] >= np.float32(0.1))
+    return jnp.where(waits, STAY, step)
+
+
+def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
+    """The reachable cells of each mask within the own territory; if there is none, within the shared one; if there is
+    none either, all reachable ones of the masks with a fallback."""
+    urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
+    anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
+    mine = areas(scene, params)
+    reach = scene.reach(jnp.stack([mask for mask, _ in masks]))
+    strict, relaxed = reach & mine.strict, reach & mine.relaxed
+    fallback = jnp.asarray(np.array([[fallback] for _, fallback in masks]))
+    found = jnp.where(
+        jnp.any(strict, axis=1, keepdims=True),
+        strict,
+        jnp.where(jnp.any(relaxed, axis=1, keepdims=True), relaxed, reach & fallback),
+    )
+    return jnp.where(anywhere, reach, found)
+
+
+def areas(scene: Scene, params) -> Areas:
+    """The areas of the scene's agent, or of its partner for the mode INVADER."""
+    beyond, stations = _borders(scene.paths)
+    kind = jnp.where((params["split_mode"] == STATIONS) & (not stations), VERTICAL, params["split_mode"])
+    beyond = jnp.asarray(beyond)[kind]
+    margin = params["shared_margin"] * jnp.where(kind == STATIONS, jnp.float32(1.5), jnp.float32(1))
+    second = (scene.slot == 1) ^ (params["behavior_mode"] == INVADER)
+    strict = jnp.where(second, beyond >= 0, beyond < 0)
+    near = beyond + margin
+    shared = jnp.where(kind == STATIONS, near > 0, near >= 0)
+    return Areas(strict, jnp.where(second, shared, beyond < margin))
+
+
+def _borders(paths: Paths) -> tuple[np.ndarray, bool]:
+    """float32 (3, cells): signed distance of each cell from the border, by split mode, positive on agent 1's side; and
+    whether the split into stations gives both agents floor cells."""
+    layout = paths.layout
+    y, x = np.divmod(np.arange(layout.cells), layout.width)
+
+    def distance_to(*kinds: int) -> np.ndarray:
+        of = np.isin(layout.kinds, kinds)
+        return np.abs(x - x[of].mean()) + np.abs(y - y[of].mean())
+
+    stations = distance_to(POT, PILE) - distance_to(GOAL, PLATES)
+    floor = stations[layout.walkable]
+    beyond = np.stack([x - layout.width // 2, y - layout.height // 2, stations]).astype(np.float32)
+    return beyond, bool((floor < 0).any() and (floor >= 0).any())
+
+
+TERRITORY = Heuristic(
+    kind="territory",
+    begin=begin_territory,
+    act=act_territory,
+    defaults={
+        "split_mode": VERTICAL,
+        "strictness": 0.7,
+        "shared_margin": 1,
+        "rescue_threshold": 0.6,
+        "yield_bias": 0.3,
+        "behavior_mode": NORMAL,
+        "action_probability": 1.0,
+    },
+    presets={
+        "default": {},
+        "strict_vertical": {"strictness": 1.0, "shared_margin": 0, "rescue_threshold": 0.8, "yield_bias": 0.5},
+        "strict_horizontal": {
+            "split_mode": HORIZONTAL,
+            "strictness": 1.0,
+            "shared_margin": 0,
+            "rescue_threshold": 0.8,
+            "yield_bias": 0.5,
+        },
+        "object_stations": {"split_mode": STATIONS, "strictness": 0.8, "rescue_threshold": 0.5, "yield_bias": 0.4},
+        "flexible": {"strictness": 0.3, "shared_margin": 2, "rescue_threshold": 0.3, "yield_bias": 0.2},
+    },
+    train=Sampling(
+        ("default", "flexible"),
+        {"split_mode": [0, 1], "strictness": (0.0, 0.3), "shared_margin": [1, 2, 3], "rescue_threshold": (0.2, 0.4)},
+    ),
+    test=Sampling(
+        ("flexible", "object_stations"),
+        {"split_mode": [1, 2], "strictness": (0.0, 0.3), "shared_margin": [1, 2, 3], "rescue_threshold": (0.2, 0.4)},
+    ),
+    diverse=Sampling(
+        ("default",),
+        {
+            "split_mode": [VERTICAL, HORIZONTAL, STATIONS],
+            "strictness": (0.0, 1.0),
+            "shared_margin": [0, 1, 2, 3],
+            "rescue_threshold": (0.0, 1.0),
+            "yield_bias": (0.0, 1.0),
+            "behavior_mode": [NORMAL, BLOCKER, HOARDER, LAZY, COUNTER, INVADER],
+            "action_probability": [1.0, 1.0, 0.75, 0.5, 0.25],
+        },
+    ),
+    spans={
+        "strictness": (0.0, 1.0),
+        "rescue_threshold": (0.0, 1.0),
+        "yield_bias": (0.0, 1.0),
+    },
+    choices={"split_mode": 3, "behavior_mode": 6},
+    unbounded=frozenset({"shared_margin"}),
+)
+"""The family H2; its parameters' order is that of the published manifests."""

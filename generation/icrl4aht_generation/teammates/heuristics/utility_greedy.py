@@ -1,0 +1,226 @@
+"""H4 `utility_greedy`: scores eight intents by weight and distance, pursues the best (paper, App. B.2, table H4)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.overcooked.state import ingredient_count
+from icrl4aht_generation.paths import UNREACHABLE, Scene
+from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, next_key
+
+DELIVER, PICK_UP, PLATE_UP, ADD, FETCH, STAGE, START, PRESS = range(8)
+
+
+class GreedyMemory(NamedTuple):
+    """Memory of an H4 teammate.
+
+    Attributes:
+        key: typed key, scalar, the next of its chain.
+        intent: int32 scalar, the last intent, 0..7; -1 for none.
+        wait: int32 scalar, steps that it still waits for its partner.
+    """
+
+    key: Key[Array, ""]
+    intent: Int[Array, ""]
+    wait: Int[Array, ""]
+
+
+def begin_utility_greedy(key: Key[Array, ""]) -> GreedyMemory:
+    """Memory at the start of an episode."""
+    return GreedyMemory(key, jnp.int32(-1), jnp.int32(0))
+
+
+def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
+    """One step of an H4 teammate."""
+    intent, action = _decide(scene, params, memory.intent)
+    action, wait = _yield(scene, memory, action)
+    waiting = memory.wait > 0
+    after = GreedyMemory(
+        next_key(memory.key),
+        jnp.where(waiting, memory.intent, intent),
+        jnp.where(waiting, memory.wait - 1, wait),
+    )
+    return jnp.where(waiting, STAY, action), after
+
+
+def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The best intent (-1 if none is feasible) and its action."""
+    cooked, cooking, nonfull = scene.reach(scene.cooked), scene.reach(scene.cooking), scene.reach(scene.nonfull)
+    waits = scene.holds_plate & ~jnp.any(cooked) & jnp.any(cooking)
+    needed = scene.reach(scene.needed_piles)
+    stageable = scene.empty_counters & jnp.asarray(scene.paths.near_pot)
+    prefers_pots = jnp.any(stageable) & (params["counter_preference"] > 0.5)
+    targets = jnp.stack(
+        [
+            scene.goals,
+            jnp.where(waits, cooking, cooked),
+            scene.plate_piles,
+            nonfull,
+            jnp.where(jnp.any(needed), needed, scene.recipe_piles),
+            jnp.where(prefers_pots, stageable, scene.empty_counters),
+            jnp.zeros_like(scene.goals),
+            scene.buttons,
+        ]
+    )
+    values, allowed = _values(scene, params, waits, jnp.any(needed))
+    distance = jax.vmap(scene.nearest_distance)(targets)
+    feasible = allowed & (distance < UNREACHABLE)
+    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # keeps it from wavering between two intents
+    scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
+    best = jnp.argmax(scores)
+    target = scene.closest(targets[best])
+    action = jnp.where(waits & (best == PICK_UP), scene.hover(target), scene.go_to(target))
+    some = jnp.any(feasible)
+    return jnp.where(some, best, -1), jnp.where(some, action, scene.wander())
+
+
+def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
+    """float32 (8,): weight x value of each intent; bool (8,): whether its conditions other than reach are met."""
+    cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.nonfull))
+    can_add = jnp.any(scene.reach(scene.nonfull))
+    can_put_down = jnp.any(scene.reach(scene.empty_counters))
+    plate = jnp.where(cooking + cooked > 0, 1 + 0.3 * cooking + 0.5 * cooked, jnp.where(nonfull == 0, 0.8, 0.2))
+    fetch = jnp.where(
+        needed_reachable,
+        jnp.where(can_add, 1 + 0.2 * nonfull, 0.8),
+        jnp.where(can_add, 0.4 + 0.05 * nonfull, 0.15),
+    )
+    fullest = jnp.max(ingredient_count(scene.state.pot_items)).astype(jnp.int32)
+    finished = 1 + 0.5 * cooked
+    no_pot_in_use = cooking + cooked + nonfull == 0
+    rows = [
+        (params["w_deliver"] * finished, scene.holds_dish),
+        (params["w_pickup_cooked"] * jnp.where(waits, 1.5, finished), scene.holds_plate),
+        (params["w_get_plate"] * plate, scene.holds_nothing),
+        (params["w_add_ingredient"] * (1 + 0.2 * (3 - fullest)), scene.holds_ingredient),
+        (
+            params["w_fetch_ingredient"] * fetch,
+            scene.holds_nothing & (can_add | can_put_down) & jnp.any(scene.needed_piles),
+        ),
+        (
+            params["w_stage_on_counter"] * (0.5 + 0.1 * nonfull),
+            (scene.holds_ingredient & ~can_add) | (scene.holds_plate & no_pot_in_use),
+        ),
+        (jnp.float32(0), jnp.asarray(False)),  # START: pots start by themselves
+        (params["w_press_L"], (params["w_press_L"] > 0) & scene.holds_nothing & ~scene.button_lit),
+    ]
+    values, allowed = zip(*rows, strict=True)
+    return jnp.stack([jnp.asarray(v, jnp.float32) for v in values]), jnp.stack(allowed)
+
+
+def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
+    """Sometimes waits when the next cell is adjacent to the partner: the action and the wait that follows."""
+    distance = jnp.asarray(scene.paths.manhattan)[scene.destination(action), scene.partner]
+    # As published, the roll is the key's first word itself, not a draw from the key.
+    roll = jax.random.key_data(memory.key)[0] % 100
+    yields = (action < STAY) & (distance <= 1) & (roll < 20 + 20 * scene.slot)
+    return jnp.where(yields, STAY, action), jnp.where(yields, 1 + (roll % 2).astype(jnp.int32), 0)
+
+
+_SPANS = {
+    "w_deliver": (5.0, 20.0),
+    "w_pickup_cooked": (3.0, 15.0),
+    "w_get_plate": (2.0, 10.0),
+    "w_add_ingredient": (3.0, 12.0),
+    "w_fetch_ingredient": (2.0, 10.0),
+    "w_stage_on_counter": (0.5, 5.0),
+    "w_start_cooking": (3.0, 15.0),
+    "w_press_L": (1.0, 8.0),
+    "dist_weight": (0.1, 1.5),
+    "inertia": (0.0, 1.0),
+    "counter_preference": (0.0, 1.0),
+}
+
+UTILITY_GREEDY = Heuristic(
+    kind="utility_greedy",
+    begin=begin_utility_greedy,
+    act=act_utility_greedy,
+    defaults={
+        "w_deliver": 10.0,
+        "w_pickup_cooked": 8.0,
+        "w_get_plate": 5.0,
+        "w_add_ingredient": 6.0,
+        "w_fetch_ingredient": 4.0,
+        "w_stage_on_counter": 2.0,
+        "w_start_cooking": 7.0,  # without effect: pots start by themselves
+        "w_press_L": 3.0,
+        "dist_weight": 0.5,
+        "inertia": 0.3,
+        "counter_preference": 0.5,
+    },
+    presets={
+        "default": {},
+        "delivery_focused": {
+            "w_deliver": 15.0,
+            "w_pickup_cooked": 12.0,
+            "w_get_plate": 8.0,
+            "w_add_ingredient": 3.0,
+            "w_fetch_ingredient": 2.0,
+            "w_stage_on_counter": 1.0,
+            "w_start_cooking": 4.0,
+            "w_press_L": 2.0,
+            "dist_weight": 0.3,
+            "inertia": 0.4,
+            "counter_preference": 0.3,
+        },
+        "prep_focused": {
+            "w_deliver": 8.0,
+            "w_pickup_cooked": 5.0,
+            "w_get_plate": 3.0,
+            "w_add_ingredient": 10.0,
+            "w_fetch_ingredient": 8.0,
+            "w_stage_on_counter": 4.0,
+            "w_start_cooking": 12.0,
+            "w_press_L": 5.0,
+            "dist_weight": 0.4,
+            "inertia": 0.5,
+            "counter_preference": 0.7,
+        },
+        "high_inertia": {"dist_weight": 0.5, "inertia": 0.7, "counter_preference": 0.5},
+        "distance_sensitive": {"dist_weight": 1.0, "inertia": 0.3, "counter_preference": 0.5},
+    },
+    train=Sampling(
+        ("default", "delivery_focused"),
+        {
+            "w_deliver": (8.0, 18.0),
+            "w_pickup_cooked": (6.0, 14.0),
+            "w_add_ingredient": (3.0, 8.0),
+            "dist_weight": (0.2, 0.7),
+            "inertia": (0.1, 0.5),
+        },
+    ),
+    test=Sampling(
+        ("prep_focused", "high_inertia", "distance_sensitive"),
+        {
+            "w_deliver": (5.0, 12.0),
+            "w_pickup_cooked": (3.0, 8.0),
+            "w_add_ingredient": (7.0, 12.0),
+            "dist_weight": (0.6, 1.2),
+            "inertia": (0.5, 0.9),
+        },
+    ),
+    diverse=Sampling(
+        ("default",),
+        {name: span for name, span in _SPANS.items() if name != "w_start_cooking"} | {"w_press_L": (0.0, 8.0)},
+    ),
+    spans=_SPANS,
+    unbounded=frozenset(
+        {
+            "w_deliver",
+            "w_pickup_cooked",
+            "w_get_plate",
+            "w_add_ingredient",
+            "w_fetch_ingredient",
+            "w_stage_on_counter",
+            "w_start_cooking",
+            "w_press_L",
+            "dist_weight",
+        }
+    ),
+)
+"""The family H4; its parameters' order is that of the published manifests."""

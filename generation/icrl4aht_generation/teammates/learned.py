@@ -1,0 +1,116 @@
+"""Learned teammates: frozen checkpoints of the actor-critic (paper, App. B.1)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from flax.traverse_util import flatten_dict
+from jaxtyping import Array, Key, UInt8
+
+from icrl4aht_data.errors import OptionError, TaskFormatError
+from icrl4aht_data.format.checkpoints import checkpoint_folder
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
+from icrl4aht_generation.learners.config import Widths
+from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.policy import Policy
+
+Action = Literal["greedy", "sampled"]
+"""Ways of acting of a checkpoint: its most probable action, as in the dataset, or a draw from its distribution."""
+
+_CRITIC = ("critic", "critic_hidden")
+
+
+def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
+    """A checkpoint as a policy for either agent; its recurrent state is reset at each episode.
+
+    Args:
+        layout: the layout.
+        folder: the checkpoint, see `learners.checkpoint`.
+        action: how it acts.
+
+    Raises:
+        OptionError: if it is not a checkpoint, or its shapes do not fit the layout's observations.
+    """
+    network, params, _ = load_policy(folder)
+    weights = {name: part for name, part in params["params"].items() if name not in _CRITIC}
+    acting = ActorCritic(network.widths, critic=False)
+    expected = _shapes(acting, layout)
+    found = jax.tree.map(lambda leaf: leaf.shape, weights)
+    if found != expected:
+        raise OptionError(
+            f"{folder}: does not fit {layout.name} (observations 5 x 5 x {layout.channels}): its weights have shapes "
+            f"{_differing(found, expected)}, expected {_differing(expected, found)}"
+        )
+    init, act = _functions(network.widths, action)
+    return Policy({"params": jax.tree.map(jnp.asarray, weights)}, init, act, "observation")
+
+
+def build_untrained(layout: Layout, widths: Widths) -> Policy:
+    """A policy with initial parameters, for measuring speed."""
+    init, act = _functions(widths, "greedy")
+    params = ActorCritic(widths, critic=False).untrained(jax.random.key(0), layout.channels)
+    return Policy(params, init, act, "observation")
+
+
+def build_learned_entry(
+    layout: Layout, teammate: dict[str, Any], suite: Path | None, action: Action = "greedy"
+) -> Policy:
+    """The policy of a task's teammate entry of kind "rl".
+
+    Args:
+        layout: the layout.
+        teammate: the entry.
+        suite: a suite's folder, or the folder TEAMMATES of a release.
+        action: how it acts.
+
+    Raises:
+        OptionError: without a suite, or if the checkpoint is missing or does not fit.
+        TaskFormatError: if the SHA-256 of its weights is not the entry's.
+    """
+    if suite is None:
+        raise OptionError(
+            f"teammate {teammate['theta']['checkpoint']} is a checkpoint: give the folder of the suite of teammates"
+        )
+    folder = checkpoint_folder(suite, teammate)
+    policy = build_learned(layout, folder, action)
+    digest = file_hash(folder / POLICY_WEIGHTS)
+    if digest != teammate["theta"]["sha256"]:
+        raise TaskFormatError(
+            f"{folder / POLICY_WEIGHTS}: sha256 {digest}, expected {teammate['theta']['sha256']} as in the task; "
+            f"restore the checkpoint, or write the manifest again"
+        )
+    return policy
+
+
+@lru_cache(maxsize=16)
+def _functions(widths: Widths, action: Action):
+    """`init` and `act`, one pair for all checkpoints of one shape, so that they share compilations."""
+    network = ActorCritic(widths, critic=False)
+
+    def init(params, key: Key[Array, ""]) -> Array:
+        return network.initial_hidden(1)[0]
+
+    def act(params, hidden, obs: UInt8[Array, "5 5 C"], key: Key[Array, ""]):
+        result: Any = network.apply(params, hidden[None], obs[None, None], jnp.zeros((1, 1), bool))
+        hidden, logits = result[0][0], result[1][0, 0]
+        chosen = jnp.argmax(logits) if action == "greedy" else jax.random.categorical(key, logits)
+        return chosen.astype(jnp.int32), hidden
+
+    return init, act
+
+
+def _shapes(network: ActorCritic, layout: Layout) -> dict[str, Any]:
+    tree = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
+    return jax.tree.map(lambda leaf: leaf.shape, tree["params"])
+
+
+def _differing(one: Any, other: Any) -> dict[str, Any]:
+    """The shapes in one tree that differ from the other's, by path."""
+    others = flatten_dict(other, sep="/")
+    return {name: shape for name, shape in flatten_dict(one, sep="/").items() if others.get(name) != shape}

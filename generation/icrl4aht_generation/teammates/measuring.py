@@ -1,0 +1,87 @@
+"""Measurement of the draws of `icrl4aht_generation.teammates.draws`: distances to the test instances, behaviours, returns."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
+from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, Draw, ranges_of, read_draws_table, write_draws_table
+from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES
+from icrl4aht_generation.teammates.references import reference_returns
+from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
+
+_DIGITS = 4
+"""Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
+
+DRAW_NUMBERS = [
+    (family, base_seed, theta_id)
+    for family in HEURISTIC_FAMILIES
+    for base_seed, count in DRAWS_PER_SEED.items()
+    for theta_id in range(count)
+]
+"""Family, base_seed and theta_id of each draw of a layout."""
+
+
+def fill_draws_table(
+    path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool
+) -> None:
+    """Measure the layouts whose draws a table does not have yet, and write it after each of them.
+
+    Args:
+        path: the table; a missing one is started.
+        layouts: short names of training layouts.
+        on_layout: called with the number of finished layouts and the name of the next one.
+        overwrite: also measure the layouts that the table has.
+    """
+    draws = read_draws_table(path) if path.is_file() else []
+    measured = Counter(draw.layout for draw in draws)
+    for number, name in enumerate(layouts):
+        on_layout(number, name)
+        if overwrite or measured[name] != len(DRAW_NUMBERS):
+            draws = [draw for draw in draws if draw.layout != name]
+            draws += measure_draws(get_layout(name))
+            write_draws_table(path, draws)
+    on_layout(len(layouts), "")
+
+
+def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW_NUMBERS) -> list[Draw]:
+    """Measures draws on a training layout. Behaviours are numbered within these draws.
+
+    Args:
+        layout: the layout.
+        numbers: family, base_seed and theta_id of each draw.
+    """
+    policies = [
+        build_teammate(layout, sample_teammate(family, theta_id, ranges_of(seed), seed))
+        for family, seed, theta_id in numbers
+    ]
+    common = common_states(layout)
+    actions = act_along(layout, policies, common.records)
+    distances = distances_to_tests(common, actions)
+    families = np.array([family for family, _, _ in numbers])
+    own = families[:, None] == np.repeat(TESTED_FAMILIES, INSTANCES)
+    nearest, others = (np.where(mask, distances, np.inf).argmin(axis=1) for mask in (own, ~own))
+    behaviours = np.zeros(len(numbers), int)
+    for family in np.unique(families):
+        behaviours[families == family] = group_behaviours(actions[families == family])
+    returns = reference_returns(layout, policies)
+    return [
+        Draw(
+            layout.name,
+            family,
+            base_seed,
+            theta_id,
+            common.instances[nearest[k]],
+            round(float(distances[k, nearest[k]]), _DIGITS),
+            int(behaviours[k]),
+            *(round(float(returns[ego][k]), _DIGITS) for ego in ("stay", "random", "oracle")),
+            other=common.instances[others[k]],
+            other_distance=round(float(distances[k, others[k]]), _DIGITS),
+        )
+        for k, (family, base_seed, theta_id) in enumerate(numbers)
+    ]

@@ -1,0 +1,116 @@
+"""Mean returns of reference egos with a teammate: whether the ego matters with it, and how much it can gain."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out
+from icrl4aht_generation.policy import Policy, stacked
+
+REFERENCE_EPISODES = 20
+"""Episodes over which the return of a reference ego is measured."""
+
+_SEED = 11
+
+
+def reference_returns(
+    layout: Layout, teammates: Sequence[Policy], episodes: int = REFERENCE_EPISODES
+) -> dict[str, np.ndarray]:
+    """Measures the reference egos with teammates, in episodes of 100 steps.
+
+    All pairs play from the same starts, and a teammate's returns do not depend on the other teammates. There is one
+    compilation, in which policies with the same functions are one.
+
+    Args:
+        layout: the layout.
+        teammates: policies that play agent 1; at least one.
+        episodes: number of episodes of each ego with each teammate.
+
+    Returns:
+        "stay", "random" and "oracle" -> mean return with each teammate, float64 (teammates,).
+    """
+    env, egos = Environment(layout, KEPT_STEPS), reference_egos(layout)
+    families = list(stacked_families(teammates))
+    each = len(teammates) * episodes
+    total = len(egos) * each  # environments are ordered by ego, teammate and episode
+    mate_of = np.arange(total) // episodes % len(teammates)
+    starts = jax.random.split(jax.random.key(_SEED), episodes)
+
+    @jax.jit
+    def play(params):
+        players = [
+            player_in_some(env, ego, (), EGO, np.arange(k * each, (k + 1) * each), total)
+            for k, ego in enumerate(egos.values())
+        ]
+        for (numbers, family), all_params in zip(families, params, strict=True):
+            envs = np.flatnonzero(np.isin(mate_of, numbers))
+            own = _rows(all_params, np.searchsorted(numbers, mate_of[envs]))
+            players.append(player_in_some(env, family, own, TEAMMATE, envs, total, own_params=True))
+        carry = init_rollout(env, players, jnp.tile(starts, total // episodes))
+        return roll_out(env, players, carry, env.max_steps, starts[0])[1].reward.sum(axis=0)
+
+    earned = np.asarray(play([family.params for _, family in families]), np.float64)
+    means = earned.reshape(len(egos), len(teammates), episodes).mean(axis=-1)
+    return dict(zip(egos, means, strict=True))
+
+
+def _rows(tree: Any, rows: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: leaf[rows], tree)
+
+
+def reference_egos(layout: Layout) -> dict[str, Policy]:
+    """Returns the egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
+
+    def act_randomly(params, key, view, _):
+        key, own = jax.random.split(key)
+        return jax.random.randint(own, (), 0, len(ACTIONS)), key
+
+    still = Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(STAY), memory), "state")
+    return {
+        "stay": still,
+        "random": Policy((), lambda params, key: key, act_randomly, "state"),
+        "oracle": oracle(layout),
+    }
+
+
+def player_in_some(
+    env: Environment, policy: Policy, params: Any, agent: int, envs: np.ndarray, total: int, *, own_params: bool = False
+) -> Player:
+    """A player that does not learn, as one agent of some of the environments.
+
+    Args:
+        env: the environment.
+        policy: the policy's functions.
+        params: parameters for all of `envs`; with `own_params`, stacked on a leading axis, one for each.
+        agent: 0 or 1.
+        envs: int (M,), numbers of the environments.
+        total: number of all environments.
+        own_params: whether each has parameters of its own.
+    """
+    player = policy_player(env, policy, params, agent, len(envs), own_params=own_params)
+
+    return Player(
+        agent * total + envs,
+        lambda state: player.init(_rows(state, envs)),
+        lambda memory, state, key: player.act(memory, _rows(state, envs), key),
+    )
+
+
+def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
+    """Yields policies that share their functions: their numbers, and one policy with stacked parameters."""
+    groups: dict[tuple[Callable, Callable, str], list[int]] = defaultdict(list)
+    for number, policy in enumerate(policies):
+        groups[policy.init, policy.act, policy.sees].append(number)
+    for numbers in groups.values():
+        yield numbers, policies[numbers[0]]._replace(params=stacked(policies[n].params for n in numbers))
