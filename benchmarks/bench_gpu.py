@@ -60,7 +60,7 @@ from benchmarks.isolated import run_isolated
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.system import usable_cores
 
 _LAYOUT = "demo_wide"
 _OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"

@@ -34,7 +34,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.sampling.ad import ADSampler
-from icrl4aht_data.utils.threads import in_slices
+from icrl4aht_data.utils.system import in_slices
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
 

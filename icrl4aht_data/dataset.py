@@ -33,11 +33,10 @@ from icrl4aht_data.sampling.base import Sampler, SamplerOptions, warn_of_mixed_s
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
 from icrl4aht_data.utils.forks import cached_property
-from icrl4aht_data.utils.html import facts_html
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.signatures import show_method_types, show_types
-from icrl4aht_data.utils.threads import usable_cores
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.system import usable_cores
+from icrl4aht_data.utils.text import counted_histories, counted_noun, facts_html
 
 if TYPE_CHECKING:
     import gymnasium

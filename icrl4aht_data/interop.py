@@ -29,8 +29,8 @@ from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.sampling.base import Sampler
 from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.memory import new_array
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.utils.system import new_array
 
 if TYPE_CHECKING:
     import datasets

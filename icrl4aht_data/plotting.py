@@ -32,7 +32,7 @@ from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK
-from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.text import counted_noun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -50,7 +50,7 @@ from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import MINI, load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.utils.files import parse_json, read_text
-from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.writing.combine import combine_releases
 
 Data = Literal["tasks", "noise", "ppo", "both", "student", "rising"]

@@ -31,8 +31,7 @@ from icrl4aht_data.benchmark.facts import (
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.files import json_hash, parse_json, read_lines
-from icrl4aht_data.utils.paths import is_inside
+from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
 
 _FIELDS = {"task_id": str, "track": str, "split": str, "layout_name": str, "seed": int, "teammate": dict}
 _HASHED = ("kind", "family", "theta_id", "base_seed", "theta")

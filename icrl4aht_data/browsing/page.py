@@ -22,7 +22,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
 from icrl4aht_data.overcooked.layouts import WINDOW, get_layout
 from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.nouns import counted_histories
+from icrl4aht_data.utils.text import counted_histories
 
 PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
 """First bytes of a page, by which it is recognised before it is replaced."""

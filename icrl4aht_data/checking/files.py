@@ -17,9 +17,8 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.remote.remote_release import ReleaseLocation
-from icrl4aht_data.utils.files import plain_size
+from icrl4aht_data.utils.files import LARGEST, files_below, plain_size, resolve_inside
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
 """Files that the Hub and its client add to a repository's."""

@@ -26,7 +26,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
-from icrl4aht_data.utils.memory import free_memory
+from icrl4aht_data.utils.system import free_memory
 
 _COPIES = 4  # of a history's arrays that checking it holds in memory
 

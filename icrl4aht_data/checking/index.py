@@ -15,8 +15,7 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import LayoutStatistics, ReleaseInfo, describe
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, TASKS, Entry
-from icrl4aht_data.utils.files import parse_json, read_text
-from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
 from icrl4aht_data.writing.statistics import layout_statistics
 
 _NAMED = 100  # missing shards of one set that are reported

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import Any, Literal
 
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 Level = Literal["quick", "full", "deep"]
 """Depth of a verification, see `verify_release`."""

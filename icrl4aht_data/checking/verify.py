@@ -38,7 +38,7 @@ from icrl4aht_data.remote.addresses import check_credentials, without_credential
 from icrl4aht_data.remote.download import chosen_files
 from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
 from icrl4aht_data.remote.store import Traffic
-from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.files import resolve_inside
 from icrl4aht_data.utils.signatures import show_types
 
 _WITHOUT_HASHES = (

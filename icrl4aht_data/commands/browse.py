@@ -32,7 +32,7 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.utils.new_file import check_new_file
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 _FILE = "browse.html"
 

@@ -55,7 +55,7 @@ from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.download import repair as repair_files
 from icrl4aht_data.utils.new_file import check_new_file
-from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.minari import from_minari, is_minari_dataset, to_minari

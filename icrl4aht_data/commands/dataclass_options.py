@@ -5,7 +5,7 @@
     def run(train: dict[str, Any]) -> None:
         options = replace_given(TrainOptions(), train)
 
-One option per field that `icrl4aht_data.utils.option_fields.option_field` made: `learning_rate` becomes
+One option per field that `icrl4aht_data.utils.options.option_field` made: `learning_rate` becomes
 `--learning-rate`. Only values that were given on the command line are passed on, so that a command may start from other
 values than the dataclass's defaults (a profile, a size) without repeating any of them.
 """
@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import click
 
-from icrl4aht_data.utils.option_fields import FieldBounds, OptionField, option_fields
+from icrl4aht_data.utils.options import FieldBounds, OptionField, option_fields
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Options = TypeVar("Options")

@@ -31,12 +31,18 @@ from icrl4aht_data.remote.addresses import check_credentials, without_credential
 from icrl4aht_data.remote.download import default_remote
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.remote.store import offline_switches
-from icrl4aht_data.utils.cache import CACHE_VARIABLES, DATA_VARIABLES, cache_folder, cache_limit, data_folder
 from icrl4aht_data.utils.installation import PACKAGE, install_command, installation_source, restore_command
-from icrl4aht_data.utils.memory import free_memory
 from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
 from icrl4aht_data.utils.requirements import Dependency, dependencies, installed_version
-from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.system import (
+    CACHE_VARIABLES,
+    DATA_VARIABLES,
+    cache_folder,
+    cache_limit,
+    data_folder,
+    free_memory,
+    usable_cores,
+)
 
 _LEAST_FREE = 2**30
 """Bytes; a disk with less free space is nearly full."""

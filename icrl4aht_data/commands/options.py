@@ -24,7 +24,7 @@ from icrl4aht_data.benchmark.facts import SPLITS, TRACKS, all_families
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names
 from icrl4aht_data.remote.remote_release import is_address
-from icrl4aht_data.utils.disk import FULL, describe_disk
+from icrl4aht_data.utils.files import FULL, describe_disk
 from icrl4aht_data.utils.installation import PACKAGE
 from icrl4aht_data.utils.progress import LineProgress
 from icrl4aht_data.utils.requirements import missing_library

@@ -14,7 +14,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.info import describe
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 _IDS_SHOWN = 11  # characters of a task's ids of histories, which the table has room for
 

@@ -8,8 +8,7 @@ from typing import Any
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.schema import EXPERTS, TEAMMATES
-from icrl4aht_data.utils.files import plain_size
-from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.files import plain_size, resolve_inside
 
 CHECKPOINT_BYTES = 64 * 2**20
 """Most bytes of each file of a checkpoint, sixty times the paper's network."""

@@ -17,8 +17,7 @@ from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.cached_arrays import cached_arrays
-from icrl4aht_data.utils.files import LINE_BYTES, plain_size, wrap_read_errors
-from icrl4aht_data.utils.paths import LARGEST
+from icrl4aht_data.utils.files import LARGEST, LINE_BYTES, plain_size, wrap_read_errors
 from icrl4aht_data.utils.remembered import remembered_hash
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")

@@ -15,9 +15,9 @@ from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.nouns import counted_histories
-from icrl4aht_data.utils.paths import resolve_inside
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.files import resolve_inside
+from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.utils.text import counted_histories
 
 ALIASES = {"algorithm": "teammate_kind"}
 """Other names of filters: the kind of a learned teammate is the algorithm that trained it."""

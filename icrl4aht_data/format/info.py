@@ -25,10 +25,9 @@ from icrl4aht_data.errors import (
 from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
 from icrl4aht_data.utils.installation import upgrade_advice
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
-from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 _NUMBER = r"(0|[1-9]\d*)"
 _PRERELEASE = r"(0|[1-9]\d*|\d*[A-Za-z-][0-9A-Za-z-]*)"

@@ -24,9 +24,18 @@ from icrl4aht_data.format.schema import (
     TASKS,
     TEAMMATES,
 )
-from icrl4aht_data.utils.files import atomic_write, final_name, plain_size, read_text, wrap_read_errors
+from icrl4aht_data.utils.files import (
+    LARGEST,
+    atomic_write,
+    files_below,
+    final_name,
+    is_inside,
+    plain_size,
+    read_text,
+    resolve_inside,
+    wrap_read_errors,
+)
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.paths import LARGEST, files_below, is_inside, resolve_inside
 from icrl4aht_data.utils.remembered import remembered_hash
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")

@@ -14,7 +14,7 @@ from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.schema import check_name
 from icrl4aht_data.utils.files import parse_json, read_text
-from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.text import counted_noun
 
 _Streams = Annotated[int, Meta(ge=0, lt=2**31)]
 _Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]

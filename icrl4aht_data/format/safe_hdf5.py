@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 
 from icrl4aht_data.format.chunks import DEFLATE_RATIO, decode_chunk
-from icrl4aht_data.utils.memory import new_array
+from icrl4aht_data.utils.system import new_array
 
 _low: Any = h5py  # its types do not declare the low-level interface
 h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import CENTRE, NOWHERE, VISIBLE, Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
-from icrl4aht_data.utils.threads import in_slices
+from icrl4aht_data.utils.system import in_slices
 
 _SLAB = 8192  # steps rendered at a time: fewer cost more in calls than they save in cache misses
 _IMPOSSIBLE = -(2**40)  # makes every sum of lookups negative

@@ -22,10 +22,9 @@ from icrl4aht_data.format.schema import INFO, MANIFEST, PARQUET_EPISODES, TEAMMA
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
-from icrl4aht_data.utils.files import parse_json, read_text, write_json
+from icrl4aht_data.utils.files import files_below, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.paths import files_below
 from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.card_content import PARQUET_INDEX
 from icrl4aht_data.writing.dataset_card import (

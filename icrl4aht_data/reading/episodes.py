@@ -10,9 +10,9 @@ import numpy as np
 from icrl4aht_data.format.schema import Entry, episode_returns
 from icrl4aht_data.plotting import curve_svg
 from icrl4aht_data.reading.lazy_array import LazyArray
-from icrl4aht_data.utils.html import facts_html
+from icrl4aht_data.utils.options import check_position
 from icrl4aht_data.utils.signatures import show_method_types
-from icrl4aht_data.utils.validation import check_position
+from icrl4aht_data.utils.text import facts_html
 
 ReadField = Callable[[str], LazyArray]
 """Function from the name of a history's field to its lazy array."""

@@ -18,10 +18,9 @@ from icrl4aht_data.reading.episodes import Episodes
 from icrl4aht_data.reading.lazy_array import LazyArray
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.forks import cached_property
-from icrl4aht_data.utils.html import facts_html
-from icrl4aht_data.utils.memory import new_array
-from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.signatures import show_method_types
+from icrl4aht_data.utils.system import new_array
+from icrl4aht_data.utils.text import counted_noun, facts_html
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")

@@ -32,9 +32,9 @@ from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
-from icrl4aht_data.utils.threads import usable_cores
-from icrl4aht_data.utils.validation import check_int, check_position
+from icrl4aht_data.utils.options import check_int, check_position
+from icrl4aht_data.utils.system import usable_cores
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 if TYPE_CHECKING:
     import pandas

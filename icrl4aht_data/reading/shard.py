@@ -34,8 +34,8 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
 from icrl4aht_data.remote.partial_file import PartialFile, fetch_chunks
 from icrl4aht_data.remote.remote_release import ReleaseLocation
-from icrl4aht_data.utils.memory import new_array
-from icrl4aht_data.utils.paths import resolve_inside
+from icrl4aht_data.utils.files import resolve_inside
+from icrl4aht_data.utils.system import new_array
 
 
 class Shard:

@@ -21,9 +21,8 @@ from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
 from icrl4aht_data.utils.cached_arrays import cache_room, cached_arrays, new_mapped_array
-from icrl4aht_data.utils.memory import free_memory, gigabytes
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
-from icrl4aht_data.utils.threads import in_slices
+from icrl4aht_data.utils.system import free_memory, gigabytes, in_slices
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 CacheMode = Literal["auto", "ram", "mmap", "stream"]
 CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.utils.cache import data_folder
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.system import data_folder
 
 
 @dataclass(frozen=True)

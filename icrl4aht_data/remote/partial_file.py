@@ -21,11 +21,10 @@ from icrl4aht_data.errors import ChunkTableError, RemoteError
 from icrl4aht_data.format.chunks import check_chunk
 from icrl4aht_data.format.schema import CHUNK_DTYPE
 from icrl4aht_data.remote.store import Store
-from icrl4aht_data.utils.cache import cache_limit, data_folder
-from icrl4aht_data.utils.files import add_filename
+from icrl4aht_data.utils.files import add_filename, in_new_folder
 from icrl4aht_data.utils.forks import ForkSafeLock
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.locks import in_new_folder
+from icrl4aht_data.utils.system import cache_limit, data_folder
 
 T = TypeVar("T")
 R = TypeVar("R")

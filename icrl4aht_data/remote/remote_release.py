@@ -43,13 +43,23 @@ from icrl4aht_data.remote.download_note import read_note
 from icrl4aht_data.remote.hub import HubStore
 from icrl4aht_data.remote.partial_file import PartialFile, complete_file, map_parallel
 from icrl4aht_data.remote.store import RetryPolicy, Store, offline
-from icrl4aht_data.utils.cache import data_folder
-from icrl4aht_data.utils.files import TEXT_BYTES, atomic_write, has_content, plain_size, read_text
+from icrl4aht_data.utils.files import (
+    LARGEST,
+    TEXT_BYTES,
+    atomic_write,
+    files_below,
+    has_content,
+    lock_path,
+    plain_size,
+    process_lock,
+    read_text,
+    remove_empty_folders,
+    resolve_inside,
+)
 from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.hashes import file_hash, git_hash
-from icrl4aht_data.utils.locks import lock_path, process_lock, remove_empty_folders
-from icrl4aht_data.utils.paths import LARGEST, files_below, resolve_inside
 from icrl4aht_data.utils.remembered import remembered_hash
+from icrl4aht_data.utils.system import data_folder
 
 _CLIENT_FOLDER = ".cache/huggingface"
 """Where the Hub's client keeps notes on a folder that it downloads to."""

@@ -17,7 +17,7 @@ from urllib.parse import urljoin
 
 from icrl4aht_data.errors import Icrl4ahtError, OfflineError, OptionError, RemoteError
 from icrl4aht_data.remote.addresses import address_of, check_credentials, check_redirect, without_credentials
-from icrl4aht_data.utils.disk import NO_ROOM
+from icrl4aht_data.utils.files import NO_ROOM
 from icrl4aht_data.utils.forks import ForkSafeLock
 from icrl4aht_data.utils.installation import install_command
 

@@ -15,8 +15,8 @@ from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.forks import cached_property
+from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.signatures import show_types
-from icrl4aht_data.utils.validation import check_int
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class

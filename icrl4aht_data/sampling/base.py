@@ -16,9 +16,9 @@ from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, EpisodeRange, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
 from icrl4aht_data.utils.forks import cached_property
-from icrl4aht_data.utils.memory import array_bytes, fits, free_memory, gigabytes
-from icrl4aht_data.utils.nouns import counted_histories, counted_noun
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.utils.system import array_bytes, fits, free_memory, gigabytes
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 B = TypeVar("B", bound=tuple)
 """A batch: a named tuple of NumPy arrays, some of which may be None."""

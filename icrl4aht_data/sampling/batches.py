@@ -11,8 +11,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.signatures import show_method_types
-from icrl4aht_data.utils.validation import check_int
 
 B = TypeVar("B")
 

@@ -14,7 +14,7 @@ from numpy.random import Philox  # np.random is imported when it is used, which 
 
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.options import check_int
 
 Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
 WEIGHTS = ("uniform", "length")

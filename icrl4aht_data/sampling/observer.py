@@ -13,7 +13,7 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.threads import in_slices
+from icrl4aht_data.utils.system import in_slices
 
 _STEPS = 8192  # steps of several layouts rendered at a time, so that the copies in between stay small
 

@@ -21,11 +21,9 @@ import numpy as np
 from filelock import Timeout
 
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
-from icrl4aht_data.utils.cache import CACHE_VARIABLES, cache_folder, cache_limit
-from icrl4aht_data.utils.disk import NO_ROOM
-from icrl4aht_data.utils.files import add_filename, allocate, sync
-from icrl4aht_data.utils.locks import process_lock
+from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, process_lock, sync
 from icrl4aht_data.utils.remembered import read_checked_json, remembered_block_hashes, write_checked_json
+from icrl4aht_data.utils.system import CACHE_VARIABLES, cache_folder, cache_limit
 
 _CONTENTS = "contents.json"
 _KEY = re.compile(r"[a-z]+(-\d+)?-[0-9a-f]{32,64}")  # nothing else in the cache folder is removed to make room

@@ -1,4 +1,4 @@
-"""Reading and writing text and JSON files, with errors that name the file.
+"""Files and folders: text and JSON, atomic writes, locks between processes, safe paths, full disks.
 
 Sizes are checked before a file is read: it may be a pipe, which never ends, or a sparse file of a terabyte.
 """
@@ -10,13 +10,16 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
-from icrl4aht_data.errors import IndexFormatError
+from filelock import FileLock
+
+from icrl4aht_data.errors import DiskFullError, IndexFormatError, UnsafePathError
 
 TEXT_BYTES = 64 * 2**20
 """Most bytes of a file that is read at once: six times the largest, the provenance of ten thousand tasks."""
@@ -185,3 +188,165 @@ def atomic_write(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+T = TypeVar("T")
+
+_ATTEMPTS = 100  # to make a file in a folder that other processes remove just then
+
+
+@contextmanager
+def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold a lock between processes and threads. Its file is made, with the folder for it, and removed at the end.
+
+    The file is removed while the lock is still held. A process that has opened it before and now gets its lock would
+    hold the lock of a file that nobody else can find: FileLock (3.24 and later) notices that and opens the path again.
+
+    Args:
+        path: the lock's file.
+        wait: until another process releases the lock, instead of raising.
+
+    Raises:
+        filelock.Timeout: if another process holds the lock and `wait` is False.
+        OSError: if the file cannot be made.
+    """
+    lock = FileLock(path, timeout=-1 if wait else 0)
+    in_new_folder(path, lock.acquire)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # Windows removes no open file; there `release` removes it
+            path.unlink()
+        lock.release()
+
+
+def lock_path(folder: Path) -> Path:
+    """Path of a folder's lock: next to the folder, so that the folder can be renamed or removed meanwhile."""
+    return folder.with_name(f".{folder.name}.lock")
+
+
+def in_new_folder(path: Path, create: Callable[[], T]) -> T:
+    """Call a function that creates a file, after making the file's folder; again, if another process has removed the
+    folder in between because it was empty.
+
+    Raises:
+        OSError: if the folder or the file cannot be made.
+    """
+    for _ in range(_ATTEMPTS):
+        with suppress(FileNotFoundError, FileExistsError):  # the second one if the folder was there, and then was not
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return create()
+    path.parent.mkdir(parents=True, exist_ok=True)  # something else is wrong, and is raised
+    return create()
+
+
+def remove_empty_folders(folder: Path) -> None:
+    """Remove a folder and those below it, as far as they are empty. Symbolic links are not followed."""
+    if folder.is_symlink():
+        return
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if path.is_dir():
+                remove_empty_folders(path)
+        folder.rmdir()
+
+
+LARGEST = 4 * 2**30
+"""Most bytes of a release's file that is not a shard."""
+
+_WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+_RESERVED = re.compile(r'[\\:*?"<>|]')
+_PART_BYTES = 200  # between two slashes; leaves room for the longer names of temporary files
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """Names of everything in a folder, at any depth, except folders; symbolic links are not followed."""
+    folders = [""]
+    while folders:
+        prefix = folders.pop()
+        try:
+            with os.scandir(folder / prefix) as found:
+                entries = [(prefix + entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
+        except OSError:
+            if prefix:  # a folder that cannot be listed is itself reported
+                yield prefix
+            continue
+        for name, is_folder in entries:
+            if is_folder:
+                folders.append(f"{name}/")
+            else:
+                yield name
+
+
+def is_inside(name: str) -> bool:
+    """Whether a relative path names a file below its root on every system: no "..", drive, backslash, control code."""
+    if len(name) >= 1024 or not name.isprintable() or _RESERVED.search(name):
+        return False
+    return all(
+        0 < len(part.encode()) <= _PART_BYTES and part[-1] not in ". " and not _WINDOWS_DEVICE.fullmatch(part)
+        for part in name.split("/")
+    )
+
+
+def resolve_inside(folder: Path, name: str) -> Path:
+    """The path of a release's file, checked to stay in the release and to be a file or folder if it exists.
+
+    A snapshot folder of the Hub's cache contains links to blobs outside of it; these are allowed.
+
+    Raises:
+        UnsafePathError: names the folder and the file.
+        IndexFormatError: if a folder on the way cannot be read.
+    """
+    path = folder / name
+    if not is_inside(name):
+        raise UnsafePathError(f"{folder}: {name[:200]!r} leads out of the release; do not use this release")
+    allowed = [folder.resolve()]
+    if folder.parent.name == "snapshots" and (folder.parent.parent / "blobs").is_dir():
+        allowed.append((folder.parent.parent / "blobs").resolve())
+    try:
+        found = path.resolve()
+        if not any(found.is_relative_to(root) for root in allowed):
+            raise UnsafePathError(f"{path}: leads out of the release, to {found}; do not use this release")
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return path
+    except PermissionError as error:
+        reason = f"cannot be read: {error.strerror}; check the permissions of its folder"
+        raise IndexFormatError(f"{path}: {reason}") from error
+    except (OSError, RuntimeError) as error:  # circular links, or names that this disk does not accept
+        raise UnsafePathError(f"{path}: cannot be followed: {error}") from error
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise UnsafePathError(f"{path}: neither a file nor a folder; do not use this release")
+    return path
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a full disk, and of a used-up quota."""
+
+NO_ROOM = (*FULL, errno.EFBIG)
+"""Error numbers of a full disk, of a used-up quota, and of a limit on the size of files."""
+
+
+def describe_disk(path: Path) -> str:
+    """The disk that a path is on, which need not exist, and its free space, in words."""
+    folder = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists()).resolve()
+    disk = next(parent for parent in (folder, *folder.parents) if parent.is_mount() or parent == parent.parent)
+    usage = shutil.disk_usage(folder)
+    return f"{usage.free:,} of {usage.total:,} bytes are free on the disk of {disk}"
+
+
+@contextmanager
+def explain_full_disk(target: Path) -> Iterator[None]:
+    """Raise errors of a full disk as ones that name the file or folder which is written, and the disk.
+
+    Raises:
+        DiskFullError: instead of an OSError that says so.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, DiskFullError) or error.errno not in FULL:
+            raise
+        raise DiskFullError(
+            f"{target}: the disk is full: {describe_disk(target)}; free some space, or write to another disk"
+        ) from error

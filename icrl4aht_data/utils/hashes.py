@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from icrl4aht_data.utils.threads import in_slices, usable_cores
+from icrl4aht_data.utils.system import in_slices, usable_cores
 
 _BLOCK = 2**24  # bytes hashed at a time by one thread
 

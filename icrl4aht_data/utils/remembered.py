@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.utils.cache import cache_folder
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.hashes import block_hash, file_hash
+from icrl4aht_data.utils.system import cache_folder
 
 _TICK_NS = 10**8  # a file changed this recently may change again within one tick of its clock
 _COARSE_TICK_NS = 2 * 10**9  # the tick of file systems whose times have no parts of a millisecond

@@ -16,7 +16,7 @@ from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import PARQUET_EPISODES, PROVENANCE, TASKS, Entry
-from icrl4aht_data.utils.paths import files_below
+from icrl4aht_data.utils.files import files_below
 
 PARQUET_INDEX = "index"
 """Folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""

@@ -21,8 +21,8 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import Entry, are_labels_weak
-from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import markdown_table
+from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.card_content import CardContent, share_risen
 from icrl4aht_data.writing.card_texts import sentence
 

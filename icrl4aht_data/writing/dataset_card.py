@@ -25,8 +25,8 @@ from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headr
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import FIELDS, KINDS, PARQUET_EPISODES, Entry, are_labels_weak
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
+from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.card_content import PARQUET_INDEX, CardContent, mean_rise, read_content
 from icrl4aht_data.writing.card_tables import (
     curves_table,

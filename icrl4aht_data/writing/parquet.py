@@ -11,8 +11,7 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.reading.arrow_tables import episode_schema, episode_table, import_pyarrow, index_schema
-from icrl4aht_data.utils.disk import explain_full_disk
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import atomic_write, explain_full_disk
 from icrl4aht_data.utils.new_file import MARK, check_new_file
 
 if TYPE_CHECKING:

@@ -42,9 +42,8 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import write_json
-from icrl4aht_data.utils.paths import resolve_inside
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.files import resolve_inside, write_json
+from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.writing.hdf5_sink import new_hdf5
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short

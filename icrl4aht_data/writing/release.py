@@ -39,8 +39,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.files import write_json
-from icrl4aht_data.utils.paths import files_below
+from icrl4aht_data.utils.files import files_below, write_json
 from icrl4aht_data.writing.card_content import CardContent
 from icrl4aht_data.writing.dataset_card import RELEASE_CARD, SOURCE_CARD, render_card
 from icrl4aht_data.writing.release_folder import atomic_folder

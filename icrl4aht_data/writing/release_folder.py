@@ -17,11 +17,16 @@ from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import is_known_file, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from icrl4aht_data.remote.remote_release import is_address
-from icrl4aht_data.utils.disk import explain_full_disk
-from icrl4aht_data.utils.files import final_name, read_text
+from icrl4aht_data.utils.files import (
+    explain_full_disk,
+    files_below,
+    final_name,
+    lock_path,
+    process_lock,
+    read_text,
+    resolve_inside,
+)
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.locks import lock_path, process_lock
-from icrl4aht_data.utils.paths import files_below, resolve_inside
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
 """File names of the published code."""

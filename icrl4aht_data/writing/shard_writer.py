@@ -23,7 +23,7 @@ from icrl4aht_data.format.chunks import (
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import add_filename
-from icrl4aht_data.utils.threads import in_slices, usable_cores
+from icrl4aht_data.utils.system import in_slices, usable_cores
 
 _BLOCK = 2000  # steps: one chunk of scalars, two of records
 

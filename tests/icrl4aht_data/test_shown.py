@@ -23,7 +23,7 @@ from icrl4aht_data.plotting import curve_svg, return_limits
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.sampling.batches import Batches
-from icrl4aht_data.utils.html import facts_html
+from icrl4aht_data.utils.text import facts_html
 from tests.helpers.paths import ROOT
 
 

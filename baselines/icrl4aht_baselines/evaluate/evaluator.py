@@ -30,7 +30,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.system import usable_cores
 
 MakeEgo = Callable[[Layout], Policy | HostPolicy]
 """Function from a layout to the ego that plays on it."""

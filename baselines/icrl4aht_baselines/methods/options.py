@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 from icrl4aht_generation.learners.config import EncoderKind
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 
 Positions = Literal["none", "rope"]
 """Position embedding of tokens: none, as published, or rotary (Su et al. 2021)."""

@@ -29,8 +29,8 @@ from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import new_figure, save_figure
-from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import fill_template, markdown_table
+from icrl4aht_data.utils.text import counted_noun
 
 RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
 """Files of the page -> their first bytes, by which they are recognised before they are replaced."""

@@ -21,7 +21,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.system import usable_cores
 
 _PROGRESS = "episodes of the report"
 

@@ -21,7 +21,7 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.reference_returns import Cell, has_headroom, read_headroom
-from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.text import counted_noun
 
 PAPER_METHODS = ("AD", "DPT")
 """The paper's methods that agents are compared with which the paper does not have."""

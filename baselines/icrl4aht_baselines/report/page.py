@@ -52,7 +52,7 @@ from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, Ce
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import MOST_PANELS
 from icrl4aht_data.utils.files import atomic_write, json_hash
-from icrl4aht_data.utils.nouns import counted_noun
+from icrl4aht_data.utils.text import counted_noun
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}

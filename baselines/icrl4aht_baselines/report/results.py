@@ -28,8 +28,8 @@ from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_head
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
-from icrl4aht_data.utils.nouns import counted_noun
 from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.text import counted_noun
 
 TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
 """Layouts that the benchmark tests on, in the paper's order."""

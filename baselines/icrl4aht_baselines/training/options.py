@@ -9,7 +9,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.sampling.dpt import ContextOrder
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 
 MOST_REARRANGED = 256
 """Most rearranged versions of a layout to train on; the next ones are for validation."""

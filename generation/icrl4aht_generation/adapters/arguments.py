@@ -11,7 +11,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
-from icrl4aht_data.utils.validation import check_int
+from icrl4aht_data.utils.options import check_int
 
 
 def check_action(name: str, action: SupportsIndex) -> int:

@@ -6,9 +6,7 @@ import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from icrl4aht_data.utils.disk import NO_ROOM
-from icrl4aht_data.utils.files import atomic_write, read_text
-from icrl4aht_data.utils.locks import process_lock
+from icrl4aht_data.utils.files import NO_ROOM, atomic_write, process_lock, read_text
 from icrl4aht_generation.collection.job import TaskOutcome
 
 FAILED = "failed.jsonl"

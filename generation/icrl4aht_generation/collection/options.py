@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import Literal
 
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import jax
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.utils.disk import NO_ROOM
+from icrl4aht_data.utils.files import NO_ROOM
 from icrl4aht_generation.collection.task_folder import (
     LEARNER,
     ArtefactWriter,

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.rules import WRONG_DELIVERY_REWARD
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 
 EncoderKind = Literal["paper", "words", "mlp"]
 """How a network encodes observations.

@@ -28,8 +28,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.locks import lock_path, process_lock
+from icrl4aht_data.utils.files import atomic_write, lock_path, process_lock
 
 METRICS, TIMING = "metrics.jsonl", "timing.jsonl"
 

@@ -20,7 +20,7 @@ from icrl4aht_data.checking.report import NamedProgress
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.format.schema import KINDS, TASKS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.threads import usable_cores
+from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_generation.collection.noise import noise_bytes
 from icrl4aht_generation.collection.noise_rollout import EPISODES_AT_ONCE, play_noisy_episodes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 
 Range = tuple[float, float]
 """Smallest and largest value; every history draws its own, uniformly."""

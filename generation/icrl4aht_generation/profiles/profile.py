@@ -18,7 +18,7 @@ from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.commands.dataclass_options import replace_given
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.work import Work

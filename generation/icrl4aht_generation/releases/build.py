@@ -14,7 +14,7 @@ from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.locks import process_lock
+from icrl4aht_data.utils.files import process_lock
 from icrl4aht_data.writing.card_content import read_content
 from icrl4aht_data.writing.card_tables import print_learning, teammate_name
 from icrl4aht_data.writing.statistics import print_statistics

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.utils.option_fields import check_fields, option_field
+from icrl4aht_data.utils.options import check_fields, option_field
 
 
 @dataclass(frozen=True)

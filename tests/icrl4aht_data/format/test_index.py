@@ -18,7 +18,7 @@ from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownN
 from icrl4aht_data.format import columns
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
-from icrl4aht_data.utils import cache
+from icrl4aht_data.utils import system as cache
 from tests.helpers.damages import DAMAGES, contents
 from tests.helpers.random_releases import long_index
 

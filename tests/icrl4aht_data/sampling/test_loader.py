@@ -13,7 +13,7 @@ from icrl4aht_data.errors import OptionError, ShardCorruptError, UnknownNameErro
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.sources import choose_cache
-from icrl4aht_data.utils.threads import in_slices
+from icrl4aht_data.utils.system import in_slices
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal, samplers
 from tests.helpers.random_releases import SHARD, random_release

@@ -288,8 +288,8 @@ class TestMemory:
 
     @pytest.mark.parametrize("kind", ["ad", "dpt"])
     def test_the_advice_fits(self, lite, kind, monkeypatch):
-        monkeypatch.setattr("icrl4aht_data.utils.memory._PLENTY", 0)
-        monkeypatch.setattr("icrl4aht_data.utils.memory.free_memory", lambda: 2**20)
+        monkeypatch.setattr("icrl4aht_data.utils.system._PLENTY", 0)
+        monkeypatch.setattr("icrl4aht_data.utils.system.free_memory", lambda: 2**20)
         monkeypatch.setattr("icrl4aht_data.sampling.base.free_memory", lambda: 2**20)
         dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8", cache="stream")
         with pytest.raises(OptionError, match=r"take batch_size = \d+ or less$") as caught:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from filelock import Timeout
 
-from icrl4aht_data.utils.locks import process_lock, remove_empty_folders
+from icrl4aht_data.utils.files import process_lock, remove_empty_folders
 
 COUNT = """
 import sys
