@@ -37,7 +37,6 @@ from icrl4aht_baselines.training.trainer import format_loss, train
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.options import bars, counted
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -45,6 +44,7 @@ from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.progress import counted, progress_bars
 
 DEMO_LAYOUT = "demo_wide"
 _MODEL = ModelOptions(**SIZES["tiny"].model)
@@ -168,7 +168,7 @@ def _verify(root: Path) -> str:
 def _train_demo(folder: Path, settings: DemoSettings) -> None:
     histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=settings.sources, labels=settings.labels)
     job = prepare("ad", settings.model, settings.training, histories)
-    with bars(edges=True, unit="steps") as show:
+    with progress_bars(unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
             show("AD", step, job.options.steps, format_loss(loss))
@@ -189,7 +189,7 @@ def _evaluate_all(out: Path, tasks: Sequence[Task], settings: DemoSettings) -> _
     for name in (*AGENTS, *references, str(out / "ad")):
         agent = find_agent(name)
         folder = out / "results" / agent.name
-        with bars(edges=True, unit="episodes") as show:
+        with progress_bars(unit="episodes") as show:
             results[agent.name] = evaluate(
                 agent.name,
                 agent.make,

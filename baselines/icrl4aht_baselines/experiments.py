@@ -34,7 +34,6 @@ from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, Histo
 from icrl4aht_baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
@@ -42,6 +41,7 @@ from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.progress import counted
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""

@@ -46,10 +46,10 @@ from icrl4aht_baselines.training.trainer import format_loss, train
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
-from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import MINI, load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.writing.combine import combine_releases
 

@@ -23,7 +23,6 @@ from icrl4aht_data.commands.options import (
     Folder,
     Names,
     Sections,
-    bars,
     examples,
     json_option,
     overwrite_option,
@@ -34,9 +33,9 @@ from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
 from icrl4aht_generation.learners.config import PPOConfig, Widths
-from icrl4aht_generation.progress import progress_bars
 from icrl4aht_generation.teammates.instances import published_tasks
 
 if TYPE_CHECKING:
@@ -192,9 +191,9 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
     """
     from icrl4aht_generation.planning.plan import estimate_cost
 
-    with bars() as show:
+    with progress_bars() as show:
         profile = _profile_with_threads(profile_name, None).with_ego(ego)
-        cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, f": {what}"))
+        cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, what))
     if as_json:
         click.echo(json.dumps(cost.to_json(), indent=2))
     else:
@@ -308,9 +307,8 @@ def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
         if name not in TESTED_ON:
             raise unknown("training layout", name, TESTED_ON)
     path = out or DRAWS_TABLE
-    with progress_bars(console) as bars:
-        bar = bars.add_task("draws", total=len(names), note="", unit="layouts")
-        fill_draws_table(path, names, lambda done, name: bars.update(bar, completed=done, note=name), overwrite)
+    with progress_bars(unit="layouts") as show:
+        fill_draws_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite)
     console.print(f"wrote {path}")
 
 

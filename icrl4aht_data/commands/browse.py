@@ -22,7 +22,6 @@ from icrl4aht_data.commands.options import (
     COUNT_OR_NONE,
     NewFile,
     Root,
-    bars,
     examples,
     filter_options,
     json_option,
@@ -32,6 +31,7 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 _FILE = "browse.html"
@@ -95,7 +95,7 @@ def browse(
     matching = load_icrl4aht(root, **wanted_filters(filters))
     check_drawable(matching)
     chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
-    with bars(quiet) as show:
+    with progress_bars(quiet) as show:
         page = make_browser_page(
             chosen, megabytes=megabytes, advance=lambda done, total: show("histories", done, total)
         )

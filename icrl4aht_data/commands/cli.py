@@ -23,8 +23,6 @@ from icrl4aht_data.commands.options import (
     NewFile,
     Root,
     Sections,
-    bars,
-    counted,
     examples,
     family_map_option,
     filter_options,
@@ -55,6 +53,7 @@ from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.download import repair as repair_files
 from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
@@ -219,7 +218,7 @@ def download(
     """
     if root is None:
         raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
-    with bars(quiet, of_bytes=True) as show:
+    with progress_bars(quiet, of_bytes=True) as show:
         plan = plan_download(str(root), to=to, advance=show, **wanted_filters(filters))
         facts = plan.to_json()
         if not dry_run:
@@ -270,7 +269,7 @@ def verify(
     if origin and not repair:
         raise click.UsageError("--from is the source of a repair: give --repair with it")
     wanted = wanted_filters(filters)
-    with bars(quiet) as advance:
+    with progress_bars(quiet) as advance:
         report = verify_release(root, level=level, advance=advance, **wanted)
         if repair and not report.ok:
             if root is None and origin is None:
@@ -345,7 +344,7 @@ def convert(
     they have no state records, observations; a release of an older format version keeps its kind by default, and
     becomes one of the current version.
     """
-    with bars(quiet) as show:
+    with progress_bars(quiet) as show:
         advance = partial(show, "histories")
         advance(0, None)  # the total is not known yet
         if isinstance(root, Path) and (root / HISTORIES_H5).exists():
@@ -435,7 +434,7 @@ def build(source: Path | None, out: Path, overwrite: bool, link: bool, quiet: bo
     viewers, croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras
     plot and hf.
     """
-    with bars(quiet) as advance:
+    with progress_bars(quiet) as advance:
         build_release(source, out, link=link, overwrite=overwrite, advance=advance)
     files = list(read_manifest(out))
     size = sum((out / name).stat().st_size for name in files)
@@ -460,7 +459,7 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
     content is compared with the manifest, and only then tagged with the data version. A tag never moves: other data
     need another version. `hf auth login` stores the token.
     """
-    with bars(quiet) as advance:
+    with progress_bars(quiet) as advance:
         done = upload_release(
             folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
         )

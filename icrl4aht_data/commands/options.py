@@ -9,16 +9,12 @@ from __future__ import annotations
 import errno
 import os
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
-from rich.console import Console
-from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 
 from icrl4aht_data.benchmark.facts import SPLITS, TRACKS, all_families
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
@@ -26,7 +22,6 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout
 from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.files import FULL, describe_disk
 from icrl4aht_data.utils.installation import PACKAGE
-from icrl4aht_data.utils.progress import LineProgress
 from icrl4aht_data.utils.requirements import missing_library
 
 SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
@@ -229,46 +224,6 @@ def is_terminal() -> bool:
 def examples(*lines: str) -> str:
     """Return a help epilog that shows command lines."""
     return "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)])
-
-
-@contextmanager
-def bars(
-    quiet: bool = False, of_bytes: bool = False, edges: bool = False, unit: str = ""
-) -> Iterator[Callable[..., None]]:
-    """Show progress bars on a terminal; yields a function `show(name, done, total, note="")`, one bar for each name.
-
-    Where stderr is not a terminal, a plain line a minute is printed instead, see `LineProgress`.
-
-    Args:
-        quiet: show nothing.
-        of_bytes: the numbers are bytes: show sizes and speed.
-        edges: print plain lines also at the start and at the end.
-        unit: what plain lines count, such as "steps".
-    """
-    console, running = Console(stderr=True), {}
-    columns = (*Progress.get_default_columns(), *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()))
-    with LineProgress(*columns, console=console, quiet=quiet, of_bytes=of_bytes, edges=edges, transient=True) as shown:
-
-        def show(name: str, done: int, total: int | None, note: str = "") -> None:
-            if name not in running:
-                running[name] = shown.add_task(name, total=total, unit=unit)
-            shown.update(running[name], completed=done, total=total, description=f"{name}{note}")
-
-        yield show
-
-
-def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
-    """Return a function that advances the bar `name` of `bars` by a number; any thread may call it."""
-    done, lock = 0, threading.Lock()
-
-    def advance(number: int) -> None:
-        nonlocal done
-        with lock:
-            done += number
-            show(name, done, total)
-
-    advance(0)
-    return advance
 
 
 def run(command: click.Command, extra: str | None = None) -> None:

@@ -22,7 +22,7 @@ ORDER = {
     "": "icrl4aht_data generation baselines benchmarks tests",
     "icrl4aht_data": "errors utils overcooked benchmark format plotting remote reading sampling environments dataset "
     "interop writing checking publishing browsing commands",
-    "generation": "progress plotting env policy paths learners experts teammates profiles collection adapters "
+    "generation": "plotting env policy paths learners experts teammates profiles collection adapters "
     "populations releases planning cli",
     "baselines": "plotting methods training agents evaluate online control report experiments reference demo commands",
 }

@@ -54,8 +54,6 @@ from icrl4aht_data.commands.options import (
     Folder,
     NewFile,
     Sections,
-    bars,
-    counted,
     examples,
     overwrite_option,
     run,
@@ -66,6 +64,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
+from icrl4aht_data.utils.progress import counted, progress_bars
 
 _console = Console(soft_wrap=True)
 
@@ -176,7 +175,7 @@ def evaluate_command(
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
     played = get_protocol(protocol, episodes)
-    with bars(edges=True, unit="episodes") as show:
+    with progress_bars(unit="episodes") as show:
         evaluate(
             ego.name,
             ego.make,
@@ -232,7 +231,7 @@ def report_command(
         check_new_file(html, overwrite)
     paths = write_report(loaded, folder)
     if html:
-        with bars(edges=True) as show:
+        with progress_bars() as show:
             paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
     paths += write_model_cards(loaded, paths[0].parent)
     click.echo(markdown(loaded))
@@ -343,7 +342,7 @@ def train_command(
     else:
         job, options, description = prepare_method(method, size, model, train, play, choice, manifests)
     _console.print(description, highlight=False)
-    with bars(edges=True, unit="steps") as show:
+    with progress_bars(unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
             show(method, step, options.steps, format_loss(loss))

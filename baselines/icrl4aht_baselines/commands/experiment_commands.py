@@ -21,9 +21,10 @@ from icrl4aht_baselines.commands.options import (
     variant_names,
 )
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
-from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, bars, examples
+from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, examples
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 
 _console = Console(soft_wrap=True)
@@ -101,7 +102,7 @@ def _run_experiment(
     size = size or "small"
     sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
     plan = ExperimentPlan(root=root and str(root), suite=suite, **sizes, **histories, **options)
-    with bars(edges=True) as show:
+    with progress_bars() as show:
         found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
     for note in found.notes:
         click.echo(note)
@@ -120,7 +121,7 @@ def control_command(out: Path) -> None:
     from icrl4aht_baselines.control.control import format_checks, run_control
     from icrl4aht_baselines.training.trainer import format_loss
 
-    with bars(edges=True, unit="steps") as show:
+    with progress_bars(unit="steps") as show:
 
         def done(name: str, total: int, step: int, loss: float | None) -> None:
             show(name, step, total, format_loss(loss))
@@ -152,7 +153,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
-    with bars(edges=True, unit="tasks") as show:
+    with progress_bars(unit="tasks") as show:
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
         _console.print(f"wrote {path}")
@@ -183,7 +184,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     name = get_layout(layout or trained.layouts[0]).name
     check_fits(trained, get_layout(name), run)
     tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
-    with bars(edges=True, unit="episodes") as show:
+    with progress_bars(unit="episodes") as show:
         found = []
         model = trained.method, trained.params, trained.context
         for episode in measure_drift(*model, tasks, played, trained.channels):
@@ -258,10 +259,10 @@ def unseen_command(
     for ego in egos:
         for task in {task.layout.name: task for task in tasks}.values():
             ego.make(task.layout)  # a model that does not fit fails before any work
-    with bars(edges=True, unit="episodes") as show:
+    with progress_bars(unit="episodes") as show:
 
         def played(what: str, done: int, total: int) -> None:
-            show("unseen layouts", done, total, f": {what}")
+            show("unseen layouts", done, total, what)
 
         found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
     click.echo(unseen_table(add_unseen(StoredResults({}, {}), found)))

@@ -30,7 +30,6 @@ from icrl4aht_data.commands.options import (
     LAYOUT,
     TRACK,
     Folder,
-    bars,
     examples,
     overwrite_option,
 )
@@ -38,6 +37,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.progress import progress_bars
 
 _console = Console(soft_wrap=True)
 
@@ -122,7 +122,7 @@ def collect_command(
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks(manifest)]
     teammates = release_teammates(dataset, number, tasks)
-    with bars(edges=True, unit="episodes") as show:
+    with progress_bars(unit="episodes") as show:
         options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
         collect_release(ego, teammates, config, out, **options)
     _console.print(f"wrote {out}; `icrl4aht-data show {out}` describes it")
@@ -199,7 +199,7 @@ def reference_command(
         for name in names:
             check_taught(name)
     outcomes = []
-    with bars(edges=True) as show:
+    with progress_bars() as show:
         for name, of_track in product(names, track):
             outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
         others = [make_reference(names[0], one, out, show, finished=run) for one, run in kept.items()]

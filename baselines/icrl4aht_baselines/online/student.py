@@ -35,7 +35,6 @@ from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.online.teammates import check_heuristics
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks
-from icrl4aht_data.commands.options import counted
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files
@@ -44,6 +43,7 @@ from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, episode_en
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import check_target
 

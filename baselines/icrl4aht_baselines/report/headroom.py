@@ -14,7 +14,7 @@ from icrl4aht_baselines.report.summary import headroom_markdown
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
-from icrl4aht_data.commands.options import counted
+from icrl4aht_data.utils.progress import counted
 
 HEADROOM_BEGINS: dict[str, bytes | tuple[bytes, ...]] = {
     "headroom.json": tuple(f'{{\n "{name}": {{\n  "'.encode() for name in PROTOCOLS),

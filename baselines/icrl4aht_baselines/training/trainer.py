@@ -43,7 +43,7 @@ StepProgress = Callable[[int, float | None], None]
 
 def format_loss(loss: float | None) -> str:
     """Returns the loss as a note for a progress bar; empty for None."""
-    return "" if loss is None else f", loss {loss:.3f}"
+    return "" if loss is None else f"loss {loss:.3f}"
 
 
 class TrainingData(NamedTuple):

@@ -15,12 +15,12 @@ from rich.text import Text
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.installation import install_command
+from icrl4aht_generation.collection.board import TaskBoard
 from icrl4aht_generation.collection.job import CollectionJob, TaskOutcome
 from icrl4aht_generation.collection.options import CollectOptions, request_determinism
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.resume import limit_xla_threads
 from icrl4aht_generation.profiles.work import Work
-from icrl4aht_generation.progress import ProgressBoard
 
 _POLL_SECONDS = 1.0
 _CONNECT_SECONDS = 10.0
@@ -28,7 +28,7 @@ _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the d
 
 
 def run_on_ray(
-    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+    job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs tasks as workers are free. The artefacts' folder must be shared by all machines.
 
@@ -58,7 +58,7 @@ def run_on_ray(
                 ray.cancel(reference, force=True)
 
 
-def _show_progress(job: CollectionJob, tasks: Iterable[Work], board: ProgressBoard) -> None:
+def _show_progress(job: CollectionJob, tasks: Iterable[Work], board: TaskBoard) -> None:
     for work in tasks:  # workers report through their artefacts' timing files
         timing = last_timing(job.folder(work))
         if timing:

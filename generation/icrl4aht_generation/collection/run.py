@@ -11,6 +11,8 @@ from typing import Protocol
 
 from rich.console import Console
 
+from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_generation.collection.board import TaskBoard
 from icrl4aht_generation.collection.failures import FAILED, FailureLog
 from icrl4aht_generation.collection.job import CollectionError, CollectionJob, TaskOutcome
 from icrl4aht_generation.collection.options import CollectOptions
@@ -18,26 +20,25 @@ from icrl4aht_generation.collection.ray_executor import run_on_ray
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
-from icrl4aht_generation.progress import ProgressBoard
 
 
 class Executor(Protocol):
     """Runs tasks in any order; closing the generator cancels those that are not done."""
 
     def __call__(
-        self, job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+        self, job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
     ) -> Generator[TaskOutcome]: ...
 
 
 def run_in_process(
-    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+    job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs one task after the other."""
     for work in tasks:
         yield _attempt(job, work, board, options.retries + 1)
 
 
-def _attempt(job: CollectionJob, work: Work, board: ProgressBoard, attempts: int) -> TaskOutcome:
+def _attempt(job: CollectionJob, work: Work, board: TaskBoard, attempts: int) -> TaskOutcome:
     def on_update(update: int, metrics: dict[str, float]) -> None:
         board.show_running(work.name, update + 1, metrics["steps_per_second"])
 
@@ -66,7 +67,7 @@ def collect_tasks(
         tasks: the units of work.
         profile: their profile.
         out: folder of the rebuild.
-        console: where progress is printed.
+        console: where results are printed.
         options: how to collect.
         suite: folder of the learned teammates, if the tasks have any.
 
@@ -81,10 +82,11 @@ def collect_tasks(
         else:
             todo.append(work)
     missing = {work.name for work in todo}
+    updates = {work.name: profile.updates(work) for work in todo}
     failures, last_error = FailureLog(out / FAILED), ""
     with (
-        ProgressBoard(console, {work.name: profile.updates(work) for work in todo}) as board,
-        closing(_run_all(job, todo, board, options)) as outcomes,
+        progress_bars(unit="updates") as show,
+        closing(_run_all(job, todo, board := TaskBoard(show, updates), options)) as outcomes,
     ):
         for outcome in outcomes:
             label = _label(outcome.work, tasks)
@@ -113,7 +115,7 @@ def collect_tasks(
 
 
 def _run_all(
-    job: CollectionJob, tasks: Sequence[Work], board: ProgressBoard, options: CollectOptions
+    job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs every task, then again, waiting, those that another collector worked on."""
     execute = _executor(options)

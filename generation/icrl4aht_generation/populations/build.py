@@ -23,6 +23,7 @@ from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.learners.resume import BusyError
 from icrl4aht_generation.plotting import plot_matrix
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
@@ -36,7 +37,6 @@ from icrl4aht_generation.populations.train import (
     train_population,
 )
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.progress import progress_bars
 from icrl4aht_generation.teammates.instances import published_thetas
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -113,13 +113,13 @@ def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bo
     """Returns whether the population is finished now; False if another process trains it."""
     label = f"{run.algorithm} on {run.layout.name}"
     last: dict[str, float] = {}
-    with progress_bars(console) as bars:
-        bar = bars.add_task(label, total=run.updates, note="compiling")
+    with progress_bars(unit="updates") as show:
+        show(label, 0, run.updates, "compiling")
 
         def on_update(update: int, updates: int, metrics: dict[str, float]) -> None:
             last.update(metrics)
             note = f"{metrics['steps_per_second']:,.0f} steps/s, self-play {last.get('self_play', 0.0):.1f}"
-            bars.update(bar, completed=update, note=note)
+            show(label, update, updates, note)
 
         try:
             if not train_population(run, folder, on_update, wait=wait):

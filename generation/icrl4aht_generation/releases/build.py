@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import process_lock
+from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card_content import read_content
 from icrl4aht_data.writing.card_tables import print_learning, teammate_name
 from icrl4aht_data.writing.statistics import print_statistics
@@ -26,7 +26,6 @@ from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
-from icrl4aht_generation.progress import progress_bars
 from icrl4aht_generation.releases.measures import teammate_facts
 from icrl4aht_generation.releases.package import check_release_folder, package_release
 
@@ -80,23 +79,23 @@ def build_releases(
     with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
-            with _packing_bars(kind, len(tasks), console) as advance:
+            with progress_bars(unit="tasks") as show:
+                steps = [counted(show, f"{step} {kind}", len(tasks)) for step in ("choosing labellers for", "packing")]
                 package_release(
-                    artefacts, release, works, profile, suite, kind, advance, facts=facts, left_out=left_out
+                    artefacts,
+                    release,
+                    works,
+                    profile,
+                    suite,
+                    kind,
+                    lambda step, steps=steps: steps[step](1),
+                    facts=facts,
+                    left_out=left_out,
                 )
         for release in releases:
             print_statistics(read_info(release), console)
             print_learning(read_content(release), console)
     return releases
-
-
-@contextmanager
-def _packing_bars(kind: Kind, tasks: int, console: Console) -> Iterator[Callable[[int], None]]:
-    """Show the two steps of packing; yields a function that is called with the number of a task's finished step."""
-    with progress_bars(console) as bars:
-        steps = [f"choosing labellers for {kind}", f"packing {kind}"]
-        rows = [bars.add_task(step, total=tasks, note="", unit="tasks") for step in steps]
-        yield lambda step: bars.advance(rows[step])
 
 
 def train_teammates(

@@ -266,8 +266,6 @@ def test_commands(tmp_path):
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert result.exit_code == 0, result.output
     assert "1 result in" in result.output
-    assert "stay, published: started, 4 episodes\n" in result.output  # no terminal: plain lines
-    assert "stay, published: 4 of 4 episodes after" in result.output
     (path,) = (tmp_path / "run" / "tasks").iterdir()
     assert read_result(path).returns == [[40.0] * 4]
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])

@@ -15,13 +15,13 @@ import psutil
 import pytest
 from icrl4aht_generation.cli import main
 from icrl4aht_generation.collection import job
+from icrl4aht_generation.collection.board import TaskBoard
 from icrl4aht_generation.collection.job import CollectionError
 from icrl4aht_generation.collection.options import CollectOptions
 from icrl4aht_generation.collection.run import collect_tasks
 from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder
 from icrl4aht_generation.learners.resume import BusyError, run_lock
 from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.progress import ProgressBoard
 from icrl4aht_generation.releases import build
 from icrl4aht_generation.releases.check import compare_rebuilds
 from rich.console import Console
@@ -217,16 +217,18 @@ def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
         collect(tasks, tmp_path, executor="ray", address="there:6379", workers=2)
 
 
-def test_the_board_counts_tasks_speed_and_time_left():
-    output = StringIO()
-    console = Console(file=output, force_terminal=True, width=160)
-    with ProgressBoard(console, {"one": 10, "two": 10}) as board:
-        board.show_running("one", 5, 1_000.0)
-        board.show_running("two", 2, 500.0)
-        board.show_ended("one")
-    text = output.getvalue()
-    assert "1/2 tasks, 500 steps/s" in text
-    assert "12/20" in text
+def test_the_board_counts_tasks_updates_and_speed():
+    shown = []
+    board = TaskBoard(lambda *bar: shown.append(bar), {"one": 10, "two": 10})
+    board.show_running("one", 5, 1_000.0)
+    board.show_running("two", 2, 500.0)
+    board.show_ended("one")
+    assert shown == [
+        ("all tasks", 0, 20, "0/2 tasks"),
+        ("all tasks", 5, 20, "0/2 tasks, 1,000 steps/s"),
+        ("all tasks", 7, 20, "0/2 tasks, 1,500 steps/s"),
+        ("all tasks", 12, 20, "1/2 tasks, 500 steps/s"),
+    ]
 
 
 def test_statistics_are_printed_and_kept(built):

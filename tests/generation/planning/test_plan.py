@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from typing import Any, cast
 
 import jax
@@ -18,7 +17,6 @@ from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.progress import LineProgress
 from tests.helpers.tiny import LEARNED, NOISE, artefact
 
 SIZES = {"lite": 1.85, "full": 9.25}
@@ -71,19 +69,6 @@ def test_the_command(measured):
         assert expected in result.output
     found = json.loads(CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--json"]).output)
     assert (found["profile"], found["tasks"], found["devices"]) == ("smoke", 2, 8)
-
-
-def test_a_long_measurement_prints_lines_on_stderr(measured, monkeypatch):
-    def slow(config, make):
-        time.sleep(0.2)
-        return plan.LearnerSpeed(100_000.0, 36.0)
-
-    monkeypatch.setitem(LineProgress.__init__.__kwdefaults__, "interval", 0.05)
-    monkeypatch.setattr(plan, "calibrate", slow)
-    result = CliRunner().invoke(cli, ["plan", "--profile", "smoke", "--json"])
-    assert json.loads(result.stdout)["tasks"] == 2
-    line = "planning: measuring how fast egos learn: 0 of 4 (0 %) after 0 s, time left unknown"
-    assert line in result.stderr.splitlines()
 
 
 def test_the_command_counts_learned_teammates(measured):
