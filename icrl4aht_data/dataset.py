@@ -98,7 +98,7 @@ def load_icrl4aht(
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
         EmptySelectionError: if nothing matches; says what exists.
         OptionError: for impossible options, such as obs="state" for a release of observations.
-        NotStoredError: for `min_expert_return`, if the release does not have the returns, as in format version 2.
+        NotStoredError: for `min_expert_return`, if the release does not have the returns.
         ReleaseError: if the release cannot be read.
     """
     options = ReadOptions(obs, cache, usable_cores() if threads is None else threads, channels)

@@ -81,10 +81,6 @@ class PublishedFormatError(ReleaseError):
     """Files in the published format are missing or malformed, or do not contain what a release needs."""
 
 
-class MinariFormatError(ReleaseError):
-    """A Minari dataset cannot be read, or does not have what a release needs."""
-
-
 class FormatTooNewError(ReleaseError):
     """The release was written in a newer format than this package reads."""
 

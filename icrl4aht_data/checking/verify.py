@@ -41,10 +41,6 @@ from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.files import resolve_inside
 from icrl4aht_data.utils.signatures import show_types
 
-_WITHOUT_HASHES = (
-    "format version {version} has no chunk hashes: reading checks chunks by CRC-32 only, which a forger can satisfy; "
-    "`icrl4aht-data convert --to {kind}` writes a release with hashes"
-)
 _NOT_RECOMPUTED = {
     "oracle_actions": "oracle actions of {count} histories: only their range was checked, not the script's choices",
     "references": "returns of reference egos, of {count} tasks: taken from meta/provenance.json, not measured again",
@@ -128,8 +124,6 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         report.add("meta", str(unreadable))
         return
     index, tasks = read_index(origin.folder), read_tasks(resolve_inside(origin.folder, TASKS))
-    if not index.info.has_chunk_hashes:
-        report.notes.append(_WITHOUT_HASHES.format(version=index.info.format_version, kind=index.info.kind))
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")

@@ -46,7 +46,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import ALL_KINDS, FORMAT_VERSION, KINDS, OBSERVATIONS
+from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
@@ -57,7 +57,7 @@ from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
-from icrl4aht_data.writing.minari import from_minari, is_minari_dataset, to_minari
+from icrl4aht_data.writing.minari import to_minari
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.published_index import parse_family_map
@@ -335,14 +335,12 @@ def convert(
     quiet: bool,
     **filters: tuple[str, ...],
 ) -> None:
-    """Convert a release, published files, or a Minari dataset.
+    """Convert a release or published files.
 
-    SOURCE is a release, a folder with the published code's histories.h5 and histories_index.jsonl, or a Minari dataset
-    that this command wrote. Writes a release folder (full, lite, observations), a folder with the published code's two
-    files (published), a Minari dataset (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens,
-    or a Parquet file with the index (parquet). A Minari dataset becomes lite by default, published files lite or, where
-    they have no state records, observations; a release of an older format version keeps its kind by default, and
-    becomes one of the current version.
+    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. Writes a release
+    folder (full, lite, observations), a folder with the published code's two files (published), a Minari dataset
+    (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens, or a Parquet file with the index
+    (parquet). Published files become lite by default or, where they have no state records, observations.
     """
     with progress_bars(quiet) as show:
         advance = partial(show, "histories")
@@ -360,14 +358,8 @@ def convert(
                 overwrite=overwrite,
                 advance=advance,
             )
-        elif isinstance(root, Path) and is_minari_dataset(root):
-            if form not in (None, *KINDS) or tasks or family_map or kept_steps != KEPT_STEPS or any(filters.values()):
-                raise click.UsageError("a Minari dataset converts to full or lite, without other options")
-            form = from_minari(root, target, form, overwrite=overwrite, advance=advance)
         else:
             dataset = _load(root, filters)
-            if form is None and dataset.info.format_version < FORMAT_VERSION:
-                form = dataset.info.kind
             if form is None:
                 raise click.UsageError(
                     "give the form to convert to: --to full, lite, observations, published, minari, parquet"

@@ -234,6 +234,6 @@ def _bundled(problems: list[Problem]) -> dict[str, Any]:
     facts: dict[str, Any] = {"ok": report.ok}
     with suppress(Icrl4ahtError):  # what cannot be read is among the findings
         info = read_info(MINI)
-        names = ("data_version", "format_version", "has_chunk_hashes", "kind", "histories")
+        names = ("data_version", "format_version", "kind", "histories")
         facts |= {name: getattr(info, name) for name in names}
     return facts

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import ChunkTableError
-from icrl4aht_data.format.schema import CHUNK_DTYPE, CHUNK_DTYPES, Entry, Kind
+from icrl4aht_data.format.schema import CHUNK_DTYPE, Entry, Kind
 
 if TYPE_CHECKING:
     import h5py  # takes 50 ms to import, and reading does not need it
@@ -29,7 +29,7 @@ DEFLATE_RATIO = 1100
 DEFLATE_LEVEL = 8
 """Compression level of chunks."""
 
-_POSITION = struct.Struct("<QIII")  # a row of version 2; the hash follows in later versions
+_POSITION = struct.Struct("<QIII")  # the start of a row; its hash follows
 _TABLE_BYTES = 256 * 2**20  # a thousand times the chunk table of a shard of usual size
 _ROW_BYTES = 16 * 2**20  # most stored bytes that one row may cover, thirty times our largest chunk
 
@@ -49,7 +49,7 @@ def chunk_table_path(root: Path, shard: str) -> Path:
 
 
 def read_table(path: Path) -> np.ndarray:
-    """A chunk table (rows,) of one of the `CHUNK_DTYPES`, mapped from its file because it may be too large for memory.
+    """Return a chunk table (rows,) of `CHUNK_DTYPE`, mapped from its file because it may be too large for memory.
 
     Raises:
         ChunkTableError: if it is missing, or not a chunk table.
@@ -62,7 +62,7 @@ def read_table(path: Path) -> np.ndarray:
         raise ChunkTableError(f"{path}: the chunk table is missing") from error
     except Exception as error:  # NumPy's parser raises errors of any type for a damaged header
         raise ChunkTableError(f"{path}: not a chunk table: {error!r}") from error
-    if table.dtype not in CHUNK_DTYPES.values() or table.ndim != 1:
+    if table.dtype != CHUNK_DTYPE or table.ndim != 1:
         raise ChunkTableError(f"{path}: expected rows of {CHUNK_DTYPE}, found {table.dtype} of shape {table.shape}")
     if (table["size"] > _ROW_BYTES).any():
         raise ChunkTableError(f"{path}: a row covers more than {_ROW_BYTES:,} bytes")
@@ -91,7 +91,7 @@ def check_chunk(data: bytes, row: np.void) -> None:
 
     Args:
         data: the bytes read from `row["offset"]` on.
-        row: a row of `CHUNK_DTYPE`; those of version 2 have no hash, so that only an accident is noticed.
+        row: a row of `CHUNK_DTYPE`.
 
     Raises:
         ValueError: says what differs, what was expected, and what was found.
@@ -102,7 +102,7 @@ def check_chunk(data: bytes, row: np.void) -> None:
         raise ValueError(f"expected {size} bytes, found {len(data)}")
     if (found := zlib.crc32(data)) != crc32:
         raise ValueError(f"expected crc32 {crc32:08x}, found {found:08x}")
-    if (expected := stored[_POSITION.size :]) and (digest := chunk_hash(data)) != expected:
+    if (digest := chunk_hash(data)) != (expected := stored[_POSITION.size :]):
         raise ValueError(f"expected blake2b {expected.hex()}, found {digest.hex()}")
 
 

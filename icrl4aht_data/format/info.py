@@ -22,7 +22,7 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
+from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
@@ -36,6 +36,7 @@ _SEMVER = re.compile(
 )
 
 _VERSION_LENGTH = 100  # characters
+_CONVERTER = "commit 71f723c of this package, which reads versions 2, 3 and 4"
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
@@ -177,11 +178,6 @@ class ReleaseInfo:
             f"{counted_noun(len(self.left_out), 'task')} left out)"
         )
 
-    @property
-    def has_chunk_hashes(self) -> bool:
-        """Whether chunk tables have hashes, see `schema.CHUNK_DTYPES`; CRC-32 alone does not notice a forgery."""
-        return "hash" in (CHUNK_DTYPES[self.format_version].names or ())
-
     def to_json(self) -> dict[str, Any]:
         """The object to write, without `shards`, `statistics` and `left_out` where they are empty."""
         content = json.loads(msgspec.json.encode(self))
@@ -236,7 +232,9 @@ def read_info(root: Path) -> ReleaseInfo:
     found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
         raise FormatTooNewError(f"{found}: {upgrade_advice()}")
-    raise FormatTooOldError(f"{found}: rebuild or fetch the release again")
+    raise FormatTooOldError(
+        f"{found}: fetch the release again, or convert it to version 4 with `icrl4aht-data convert` of {_CONVERTER}"
+    )
 
 
 def _instead(root: Path) -> str:

@@ -31,10 +31,8 @@ from icrl4aht_data.overcooked.state import record_size
 FORMAT_VERSION = 4
 """Version of the file format that is written."""
 
-READABLE_VERSIONS = (2, 3, FORMAT_VERSION)
-"""Versions that are read; for others see `FormatTooOldError` and `FormatTooNewError`. Version 3 has no oracle actions,
-and no `learner` and `has_oracle_actions` in the index. Version 2 also has no hashes of chunks and no `source`,
-`expert_return`, `expert_return_sampled` and `expert_step` in the index."""
+READABLE_VERSIONS = (FORMAT_VERSION,)
+"""Versions that are read; others raise `FormatTooOldError` or `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
@@ -60,17 +58,12 @@ OBSERVATIONS: Kind = "observations"
 
 ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
-_POSITION = [("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4")]
-
-CHUNK_DTYPE = np.dtype([*_POSITION, ("hash", "u1", (16,))])
+CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4"), ("hash", "u1", (16,))])
 """One row of a chunk table: position and size of the stored bytes, how many of the chunk's rows belong to the history
 (the last chunk is padded), and checksum and hash of the stored bytes, see `chunks.check_chunk`. The bytes between the
 chunks follow in rows with `rows` = 0, so that the table covers every byte of a shard exactly once. Rows are ordered by
 history, then by `FIELDS`, then by chunk. In the file a history's chunks are ordered by time, so that a window of steps
 is one range of bytes, see `shard_writer.file_order`."""
-
-CHUNK_DTYPES: dict[int, np.dtype] = {2: np.dtype(_POSITION), 3: CHUNK_DTYPE, 4: CHUNK_DTYPE}
-"""Format version -> dtype of its chunk tables."""
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,7 @@ def build_release(
         advance: progress of verifying, of copying, and of writing the histories' episodes.
 
     Raises:
-        OptionError: if `target` may not be written, see `release_folder.check_target`, if `source` is of a
-            format version without chunk hashes, or if a library is not installed.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, or a library is not installed.
         ReleaseError: if `source` is not valid; names the first problems.
     """
     source = (MINI if source is None else source).resolve()
@@ -77,11 +76,6 @@ def build_release(
     if missing:
         raise OptionError(f"building a release needs {', '.join(missing)}: {install_command('plot', 'hf')}")
     check_valid(source, advance)
-    if not (info := read_info(source)).has_chunk_hashes:
-        raise OptionError(
-            f"{source}: format version {info.format_version} has no chunk hashes, published releases have them: "
-            f"convert it first"
-        )
     kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
     with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:
         for number, name in enumerate(kept, start=1):

@@ -195,13 +195,12 @@ class Selection:
     def __repr__(self) -> str:
         layouts = [layout.name for layout in self.layouts]
         tasks = len(np.unique(self.column_codes("task_id")))
-        weak = "" if self.info.has_chunk_hashes else f" of format {self.info.format_version}, without chunk hashes,"
         canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
             f"{type(self).__name__}({counted_histories(len(self))} of {counted_noun(tasks, 'task')} on "
             f"{', '.join(layouts)}; {self.named_counts('split')}; {self.named_counts('source')}; "
             f"{counted_noun(int(self.column('T').sum()), 'transition')}, obs {self.obs}{canonical}; "
-            f"{self.info.kind} release {self.info.data_version}{weak} at {self.origin})"
+            f"{self.info.kind} release {self.info.data_version} at {self.origin})"
         )
 
     def named_counts(self, name: str) -> str:
@@ -451,8 +450,8 @@ class Selection:
             known = 'ds.select(~np.isnan(ds.column("expert_return")))'
             raise NotStoredError(
                 f"min_expert_return: {self.origin} does not say what the policies behind the labels of "
-                f"{int(absent.sum())} of {len(self)} histories earn (first task: {tasks[0]}), as releases of format "
-                f"version 2 and those converted from them. Leave out min_expert_return"
+                f"{int(absent.sum())} of {len(self)} histories earn (first task: {tasks[0]}), as releases "
+                f"converted from published files. Leave out min_expert_return"
                 + ("" if absent.all() else f", or take the histories where it is known: {known}")
             )
         kept = returns >= least

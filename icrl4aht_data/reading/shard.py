@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from icrl4aht_data.errors import (
-    ChunkTableError,
     ShardCorruptError,
     ShardMismatchError,
     ShardMissingError,
@@ -22,14 +21,13 @@ from icrl4aht_data.errors import (
 from icrl4aht_data.format.chunks import (
     DEFLATE_RATIO,
     check_chunk,
-    chunk_hash,
     chunk_table_name,
     decode_chunk,
     read_table,
 )
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import CHUNK_DTYPES, FIELDS, Entry, Field, Kind
+from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
 from icrl4aht_data.remote.partial_file import PartialFile, fetch_chunks
@@ -50,7 +48,7 @@ class Shard:
 
     Attributes:
         entries: history id -> index entry.
-        table: (N,), the chunk table, see `schema.CHUNK_DTYPES`.
+        table: (N,), the chunk table, see `schema.CHUNK_DTYPE`.
         kind: the release's kind.
         format_version: the release's format version.
 
@@ -84,10 +82,6 @@ class Shard:
     def _check_table(self) -> None:
         """Check that the chunk table has the chunks and rows that the index implies, in sizes that can be true."""
         table = self.table
-        if table.dtype != CHUNK_DTYPES[self.format_version]:
-            raise ChunkTableError(
-                f"{self.path}: the chunk table is not of format version {self.format_version}; fetch meta/ again"
-            )
         members = [(entry, field) for entry in self.entries.values() for field in entry.stored_fields(self.kind)]
         chunks = [entry.chunks(field) for entry, field in members]
         *firsts, total = np.cumsum([0, *chunks]).tolist()
@@ -266,11 +260,8 @@ class Shard:
         entry = self.entries[history_id]
         stored = entry.stored_fields(self.kind)
         first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
-        rows, names = range(first, first + chunks), " ".join(field.name for field in stored).encode()
-        if "hash" in (self.table.dtype.names or ()):
-            return names + self.table["hash"][first : first + chunks].tobytes()
-        # Other content can have the same CRC-32, so the stored bytes of version 2 are hashed here.
-        return names + b"".join(chunk_hash(self.checked_bytes(row)) for row in rows)
+        names = " ".join(field.name for field in stored).encode()
+        return names + self.table["hash"][first : first + chunks].tobytes()
 
     def chunks(self) -> Iterator[tuple[int, int, Field]]:
         """Every chunk as (row in the chunk table, history id, field)."""

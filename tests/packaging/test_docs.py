@@ -35,7 +35,6 @@ from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_posi
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
-from tests.helpers.old_releases import as_version
 from tests.helpers.paths import ROOT
 from tests.helpers.plugins import installed, write_package
 from tests.helpers.random_releases import random_history, random_release
@@ -201,10 +200,9 @@ class TestFormat:
         with pytest.raises(KeyError):
             reader["read"](tmp_path / "r", 0, "expert_actions")
 
-    def test_oracle_actions_and_version_3(self, reader, lite, tmp_path):
+    def test_oracle_actions(self, reader, tmp_path):
         random_release(tmp_path / "r", layouts=("coord_simple",), oracle=True)
         self.assert_reads(reader, tmp_path / "r")
-        self.assert_reads(reader, as_version(shutil.copytree(lite[0], tmp_path / "old"), 3))
 
     def test_a_damaged_byte_is_an_error(self, reader, damaged):
         shard = damaged / load_icrl4aht(damaged).entries[0].shard

@@ -74,7 +74,6 @@ def test_no_problems(elsewhere):
         "ok": True,
         "data_version": info.data_version,
         "format_version": info.format_version,
-        "has_chunk_hashes": True,
         "kind": "lite",
         "histories": info.histories,
     }

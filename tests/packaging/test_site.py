@@ -98,7 +98,7 @@ def test_messages_of_the_faq_are_those_of_the_code():
     messages = [title for title in re.findall(r"^### (.*)$", PAGES["faq"], re.MULTILINE) if not title.endswith("?")]
     assert len(messages) > 20
     assert "Namespace icrl4aht not found" in messages
-    for error in ("PluginError", "MinariFormatError", "TaskFormatError"):
+    for error in ("PluginError", "TaskFormatError"):
         assert f"`{error}`: " in PAGES["faq"]
     for message in messages:
         for part in message.lower().split("..."):

@@ -15,10 +15,10 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import read_provenance
-from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE, TASKS
+from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import write_release
-from tests.helpers.random_releases import SHARD, random_release
+from tests.helpers.random_releases import SHARD
 from tests.robustness.limits import time_limit
 
 Change = Callable[[Any], Any]
@@ -167,11 +167,3 @@ def test_a_card_with_a_hole_of_a_terabyte(damaged):
     os.truncate(damaged / "README.md", 10**12)
     found = problems(damaged)
     assert any("README.md: expected at most 4,294,967,296 bytes, found 1,000,000,000,000" in line for line in found)
-
-
-def test_version_2_has_no_strong_hashes(learned, tmp_path):
-    random_release(tmp_path / "new", layouts=("demo_wide",), streams=1)
-    assert not verify_release(tmp_path / "new").notes
-    old = spoiled(tmp_path / "new", tmp_path / "old", INFO, lambda c: c.update(format_version=2))
-    assert any("has no chunk hashes" in note for note in verify_release(old).notes)
-    assert (old / TASKS).is_file()

@@ -15,11 +15,10 @@ from icrl4aht_data.errors import RemoteError, ShardCorruptError
 from icrl4aht_data.format import chunks
 from icrl4aht_data.format.chunks import check_chunk, chunk_hash, chunk_table_path, decode_chunk, encode_chunk
 from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.schema import CHUNK_DTYPE, CHUNK_DTYPES, FIELDS, MANIFEST
+from icrl4aht_data.format.schema import CHUNK_DTYPE, FIELDS, MANIFEST
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from tests.helpers.forged_chunks import forge_crc32, with_other_actions, with_trailing_bytes
-from tests.helpers.old_releases import as_version
 from tests.helpers.random_releases import SHARD, random_release
 
 MODES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
@@ -36,11 +35,10 @@ def stored(tmp_path_factory) -> Path:
     return root
 
 
-def row_of(data: bytes, version: int = 3) -> np.void:
-    row = np.zeros(1, CHUNK_DTYPES[version])[0]
+def row_of(data: bytes) -> np.void:
+    row = np.zeros(1, CHUNK_DTYPE)[0]
     row["size"], row["rows"], row["crc32"] = len(data), 1, zlib.crc32(data)
-    if version == 3:
-        row["hash"] = np.frombuffer(chunk_hash(data), np.uint8)
+    row["hash"] = np.frombuffer(chunk_hash(data), np.uint8)
     return row
 
 
@@ -61,7 +59,7 @@ def forge(root: Path, target: Path, form: str) -> np.ndarray:
         data = stream.read(int(row["size"]))
         forged = with_other_actions(data) if form == "other actions" else with_trailing_bytes(data, bytes(STEPS))
         assert forged != data
-        check_chunk(forged, row_of(data, version=2))
+        assert zlib.crc32(forged) == row["crc32"]
         stream.seek(int(row["offset"]))
         stream.write(forged)
     return np.frombuffer(zlib.decompressobj().decompress(forged), np.int8)
@@ -84,13 +82,11 @@ def test_bytes_behind_the_deflate_stream_are_refused(tail):
 def test_a_chunk_is_compared_with_its_row():
     data = bytes(range(100))
     check_chunk(data, row_of(data))
-    check_chunk(data, row_of(data, version=2))
     flipped, crc32 = b"\1" + data[1:], zlib.crc32(data)
-    for version in (2, 3):
-        with pytest.raises(ValueError, match="expected 100 bytes, found 99"):
-            check_chunk(data[:99], row_of(data, version))
-        with pytest.raises(ValueError, match=f"expected crc32 {crc32:08x}, found {zlib.crc32(flipped):08x}"):
-            check_chunk(flipped, row_of(data, version))
+    with pytest.raises(ValueError, match="expected 100 bytes, found 99"):
+        check_chunk(data[:99], row_of(data))
+    with pytest.raises(ValueError, match=f"expected crc32 {crc32:08x}, found {zlib.crc32(flipped):08x}"):
+        check_chunk(flipped, row_of(data))
     forged = forge_crc32(flipped, [{96 + bit // 8: 1 << bit % 8} for bit in range(32)], crc32)
     assert forged is not None
     with pytest.raises(
@@ -151,27 +147,6 @@ def test_a_forged_release_with_its_own_hashes_does_not_share_a_cache(stored, tmp
     write_manifest(tmp_path / "forged")
     np.testing.assert_array_equal(read_window(tmp_path / "forged", "mmap")[0], forged)
     np.testing.assert_array_equal(read_window(stored, "mmap")[0], load_icrl4aht(stored)[0].actions[:])
-
-
-class TestVersion2:
-    """Without hashes reading does not notice a forger who keeps to the deflate format; other releases are safe."""
-
-    @pytest.mark.parametrize("mode", MODES)
-    def test_trailing_bytes_are_refused(self, stored, tmp_path, monkeypatch, mode):
-        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-        forge(stored, tmp_path / "forged", "trailing bytes")
-        as_version(tmp_path / "forged", 2)
-        with pytest.raises(ShardCorruptError, match="bytes behind the end of the deflate stream"):
-            read_window(tmp_path / "forged", mode)
-
-    def test_the_cache_is_keyed_by_the_stored_bytes(self, stored, tmp_path, monkeypatch):
-        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-        as_version(shutil.copytree(stored, tmp_path / "old"), 2)
-        forged = forge(tmp_path / "old", tmp_path / "forged", "other actions")
-        np.testing.assert_array_equal(read_window(tmp_path / "forged", "mmap")[0], forged)
-        np.testing.assert_array_equal(read_window(tmp_path / "old", "mmap")[0], load_icrl4aht(stored)[0].actions[:])
-        report = verify_release(tmp_path / "forged")
-        assert any(SHARD in finding.file and "sha256" in finding.problem for finding in report.findings)
 
 
 def test_field_names_are_part_of_the_key(stored):
